@@ -1,1 +1,1 @@
-"""What the video of a real endoscope does beside showing tissue: found on the picture alone, with numpy and OpenCV, at a reduced size."""
+"""Preprocessing of endoscopic video by picture analysis with numpy and OpenCV at reduced size."""

@@ -1,4 +1,6 @@
-"""Where another scene begins: a cut between shots, a view that comes back elsewhere, another size or frame rate."""
+"""Scene change detection: cuts between shots, returns to an earlier scene, and changes of size or
+frame rate.
+"""
 
 from __future__ import annotations
 
@@ -15,28 +17,38 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 @dataclass(frozen=True)
 class CutSettings:
-    """What counts as the same scene; the measures are those of `likeness`. Raises InvalidSetting out of range."""
+    """Thresholds for frames of the same scene; the measures are those of `likeness`.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     same_difference: float = 0.15
-    """Up to this difference it is the same scene, and nothing else is looked at."""
+    """Difference up to which two frames show the same scene without further tests."""
     same_structure: float = 0.72
-    """From this structure on it is the same scene ..."""
+    """Structure from which two frames show the same scene."""
     same_moved: float = 0.83
-    """... or when a quarter of the picture is found again so well."""
+    """Correlation of a quarter of the picture, searched over the whole other picture, from which
+    two frames show the same scene.
+    """
     same_after_gap_difference: float = 0.2
-    """After frames that could not be used the tissue may have moved: up to this difference ..."""
+    """Difference up to which frames after a gap of unusable frames may show the same scene, if
+    their colours agree as well.
+    """
     same_after_gap_colours: float = 0.65
-    """... with so many colours in common it is still the same scene."""
+    """Overlap of colours required for frames after a gap."""
     longest_doubt_frames: int = 6
-    """A frame like no other waits for the next one to be like it; after so many frames that are like no other it is a cut anyway."""
+    """Largest number of consecutive unmatched frames before a cut is reported. Normally a cut is
+    confirmed by the next frame matching the unmatched one.
+    """
     views: int = 4
-    """Views of the present scene, and of earlier ones, that a view which comes back is compared with."""
+    """Number of views kept of the present scene; twice as many are kept of earlier ones."""
     view_every: int = 15
-    """One frame in so many is kept as such a view."""
+    """Number of frames between two kept views."""
     rate_ratio: float = 1.4
-    """Another frame rate differs by this factor ..."""
+    """Factor by which a new frame rate must differ."""
     rate_frames: int = 15
-    """... in the median of so many frames."""
+    """Number of frames over which the frame rate is observed."""
 
     def __post_init__(self) -> None:
         share, count = NumberIn(0.0, 1.0), IntegerIn(1, 10_000)
@@ -57,19 +69,23 @@ class CutSettings:
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """What a frame is beside those before it."""
+    """Classification of a frame relative to earlier ones."""
 
     new_scene: str | None = None
-    """Why another scene begins with it: "cut", "returned" (to an earlier scene), "resized" or "frame rate"."""
+    """Reason why a new scene starts with the frame: "cut", "returned" (to an earlier scene),
+    "resized" or "frame rate". None for the same scene.
+    """
     in_doubt: bool = False
-    """It is like no frame before; the next one will tell whether that was a cut. Not to be trained on."""
+    """True for an unmatched frame; the next frame decides whether it was a cut. Such a frame is not
+    trained on.
+    """
 
 
 class CutDetector:
-    """Follows a stream, one call a frame: `observe` for usable frames, `skip` for the others.
+    """Scene change detector of a stream. Call `observe` for usable frames and `skip` for others.
 
-    A cut is reported with the second frame of the new scene: the first is in doubt, because one odd frame that is followed by the old
-    scene is none. A fixed number of small pictures is kept.
+    A cut is reported with the second frame of the new scene, because a single odd frame is not a
+    cut. A bounded number of reduced pictures is kept.
     """
 
     def __init__(self, settings: CutSettings | None = None) -> None:
@@ -85,11 +101,17 @@ class CutDetector:
         self._rate = FrameRate(self.settings.rate_ratio, self.settings.rate_frames)
 
     def skip(self) -> None:
-        """A frame came that cannot be used."""
+        """Record an unusable frame."""
         self._gap = True
 
     def observe(self, image: NDArray[np.uint8], seq: int, pts_ns: int) -> SceneVerdict:
-        """What the frame with the RGB uint8 picture [H, W, 3] is; `seq` counts the frames that there were, lost ones too."""
+        """Classify the next frame.
+
+        Args:
+            image: RGB uint8 [H, W, 3].
+            seq: frame number, including lost frames.
+            pts_ns: timestamp in nanoseconds.
+        """
         view = View(image)
         other_rate = self._rate.changed(seq, pts_ns)
         if self._last is None:
@@ -109,7 +131,7 @@ class CutDetector:
         return SceneVerdict(in_doubt=True)
 
     def _related(self, view: View) -> bool:
-        """Whether the view belongs to the present scene."""
+        """Return True if the view belongs to the present scene."""
         assert self._last is not None
         if self._same(view, self._last, self._gap):
             return True
@@ -141,7 +163,9 @@ class CutDetector:
 
 
 class FrameRate:
-    """Notices a lasting change of the time between frames; frames that were lost on the way are counted by their numbers."""
+    """Detector of lasting changes of the frame rate. Lost frames are accounted for by their
+    numbers.
+    """
 
     def __init__(self, ratio: float, frames: int) -> None:
         self.ratio = ratio
@@ -150,14 +174,14 @@ class FrameRate:
         self._last: tuple[int, int] | None = None
 
     def changed(self, seq: int, pts_ns: int) -> bool:
-        """Whether the rate has become another one, with this frame."""
+        """Return True if the frame rate changed with this frame."""
         if self._last is not None and seq > self._last[0] and pts_ns > self._last[1]:
             self._recent.append((pts_ns - self._last[1]) / (seq - self._last[0]))
         self._last = (seq, pts_ns)
         if len(self._recent) < (self._recent.maxlen or 0):
             return False
         now_ns = float(np.median(self._recent))
-        # All of them, not only their median: an unsteady clock is no other rate.
+        # Require all intervals, not only their median: an unsteady clock is no other rate.
         if self._usual_ns is None:
             self._usual_ns = now_ns
             return False

@@ -1,9 +1,10 @@
-"""Exposure and white balance of each frame, beside those of the stream's first frames.
+"""Exposure and white balance of each frame relative to the first frames of the stream.
 
-A camera that changes its gain multiplies every pixel of a channel by one number, and the same tissue in an earlier picture tells which: the
-ratio of the two, where neither is dark or clipped. Pictures of the last seconds are kept as references, each with its gain, and the frame is
-compared with those that it resembles most, so that neither heartbeat nor a tool needs to be followed. What the references do not show as
-a change (a scope that comes slowly closer, bleeding) is left to the model, which learns it anyway.
+A gain change multiplies all pixels of a channel by one factor, which is the ratio to the same
+tissue in an earlier picture where neither is dark or clipped. Pictures of the last seconds are kept
+as references with their gains. A frame is compared with the references that resemble it most, so
+heartbeat and tools need no tracking. Changes that references do not reveal, such as a slow approach
+or bleeding, are left to the model.
 """
 
 from __future__ import annotations
@@ -26,42 +27,57 @@ UNCHANGED: Gains = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class ExposureSettings:
-    """When a change counts as one. Differences are natural logarithms of ratios: 0.08 is 8 %. Raises InvalidSetting out of range."""
+    """Thresholds of gain changes. Differences are natural logarithms of ratios: 0.08 is 8 %.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     dead_zone: float = 0.08
-    """A difference from the present gain up to here is ignored while the gain is held."""
+    """Difference from the present gain that is ignored while the gain is held."""
     drift_zone: float = 0.1
-    """The same for a slower change, which shows against older references: the tissue has moved since."""
+    """Threshold for slow changes against older references; larger because the tissue has moved
+    since.
+    """
     more_pixels: float = 1.5
-    """So many times as many pixels must agree with a change as with none."""
+    """Ratio of pixels that agree with a change to those that agree with no change."""
     anchor_zone: float = 0.15
-    """A gain that has settled is at most this far from what the scene's first frames say, where they can still be compared."""
+    """Largest deviation of a settled gain from the comparison with the scene's first frame, if that
+    is possible.
+    """
     release: float = 0.04
-    """A gain that has settled within this of 1 is exactly 1 again."""
+    """Distance from 1 within which a settled gain is set to exactly 1."""
     settled_change: float = 0.02
-    """The gain is held again when it changes by less than this from frame to frame ..."""
+    """Change from frame to frame below which a gain counts as settled."""
     settled_frames: int = 6
-    """... for so many frames."""
+    """Number of settled frames after which the gain is held again."""
     references: int = 12
-    """Pictures that frames are compared with."""
+    """Number of reference pictures."""
     reference_every: int = 4
-    """One frame in so many becomes a reference; 12 of 4 are 1.6 s at 30 frames/s."""
+    """Number of frames between references; 12 references every 4 frames cover 1.6 s at 30 frames/s.
+    """
     young_references: int = 4
-    """So many of the newest references wait until a slow change would have shown."""
+    """Number of newest references that are not used yet, so that they contain no part of a slow
+    change.
+    """
     least_clear_jump: float = 1.5
-    """A jump is at least this many times as large as the frame is unlike the one before ..."""
+    """Smallest ratio of a sudden change to the dissimilarity from the previous frame."""
     least_clear_drift: float = 1.0
-    """... and a slower change this many times as large as it is unlike the references."""
+    """Smallest ratio of a slow change to the dissimilarity from the references."""
     most_unlike: float = 0.25
-    """A frame that differs from every reference by more than this (median, after its gain is taken out) says nothing about the exposure."""
+    """Median difference from every reference, after removing the gain, above which a frame's
+    exposure is not measured.
+    """
     largest_gain: float = 8.0
-    """Gains stay within this and its inverse."""
+    """Bound of gains and their inverses."""
     forget_s: float = 300.0
-    """A held gain returns to 1 with this time constant, slower than the model learns: errors of single changes do not add up over days."""
+    """Time constant in seconds with which a held gain returns to 1, slower than the model learns,
+    so that errors do not accumulate over days.
+    """
     darkest: int = 14
-    """Channel values below this are not compared: noise and the offset of black."""
+    """Level below which a channel is not compared because of noise and black offset."""
     brightest: int = 225
-    """Channel values above this are not compared: clipped, or partly so."""
+    """Level above which a channel is not compared because of clipping."""
 
     def __post_init__(self) -> None:
         share = NumberIn(1e-3, 1.0)
@@ -88,19 +104,20 @@ class ExposureSettings:
 
 
 class ExposureEstimator:
-    """Follows the gains of a stream; one call a frame, in order.
+    """Gain estimator of a stream; call it for each frame in order.
 
-    While the gain is held, a jump shows against the frame before and a slower change against older references;
-    the youngest may have part of the change in them. While it changes, the frame before and the references are weighed by
-    how alike they are. A fixed number of small pictures is kept. Without a change of exposure the gains are exactly (1, 1, 1).
+    While the gain is held, sudden changes are detected against the previous frame and slow ones
+    against older references. While it changes, the previous frame and the references are averaged,
+    weighted by similarity. A bounded number of reduced pictures is kept. Without exposure changes
+    the gains are exactly (1, 1, 1).
     """
 
     def __init__(self, settings: ExposureSettings | None = None) -> None:
         self.settings = settings or ExposureSettings()
         self.following = False
-        """Whether the exposure is changing now."""
+        """True while the exposure is changing."""
         self._anchor: Reference | None = None
-        """The scene's first frame."""
+        """First frame of the scene."""
         self._references: deque[Reference] = deque(maxlen=self.settings.references)
         self._young: deque[Reference] = deque(maxlen=self.settings.young_references)
         self._previous: Reference | None = None
@@ -111,19 +128,25 @@ class ExposureEstimator:
 
     @property
     def gains(self) -> Gains:
-        """Those of the last frame: red, green, blue."""
+        """Gains of the last frame: red, green, blue."""
         red, green, blue = (float(gain) for gain in np.exp(self._log_gain))
         return red, green, blue
 
     def start_scene(self) -> None:
-        """Another scene begins: the next frame's colours are its own."""
+        """Start another scene, whose first frame defines the colours."""
         self._references.clear()
         self._young.clear()
         self._previous, self._last_pts_ns = None, None
         self._log_gain, self.following = np.zeros(3), False
 
     def observe(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None, pts_ns: int) -> Gains:
-        """Gains of the frame `image`, RGB uint8 [H, W, 3]; `kept` [H, W] is 0 where it is not tissue, and `pts_ns` its time."""
+        """Estimate the gains of a frame.
+
+        Args:
+            image: RGB uint8 [H, W, 3].
+            kept: [H, W], 0 outside the tissue, or None.
+            pts_ns: timestamp in nanoseconds.
+        """
         sample = sample_of(image, kept, self.settings.darkest, self.settings.brightest)
         if self._previous is None:
             self._anchor = Reference(sample, self._log_gain)
@@ -143,7 +166,7 @@ class ExposureEstimator:
         due = self._since_reference >= settings.reference_every
         if self._changed(sample, [self._previous], settings.dead_zone, settings.least_clear_jump):
             self._references.extend(self._young)
-        # What is slow need not be looked for in every frame.
+        # Slow changes need not be tested in every frame.
         elif not due or not self._changed(sample, self._references, settings.drift_zone, settings.least_clear_drift):
             self._forget(pts_ns)
             if due:
@@ -156,7 +179,7 @@ class ExposureEstimator:
         self.following, self._steady = True, 0
 
     def _changed(self, sample: Sample, references: Iterable[Reference], zone: float, clear: float) -> bool:
-        """Whether the references show another gain than the present one, clearly beside how unlike they are; takes it on if so."""
+        """Return True if the references show a clearly different gain, and apply it."""
         found = self._compare(sample, references)
         if found is None:
             return False
@@ -164,7 +187,7 @@ class ExposureEstimator:
         change = np.abs(measured - self._log_gain).max()
         if change <= max(zone, clear * spread):
             return False
-        # A tool that covers half of the picture moves the mean, and leaves tissue beside it as it was.
+        # A tool that covers half of the picture shifts the mean but not the tissue next to it.
         same = share_with(sample, best.sample, self._log_gain - best.log_gain)
         if share_with(sample, best.sample, measured - best.log_gain) < self.settings.more_pixels * same:
             return False
@@ -189,7 +212,9 @@ class ExposureEstimator:
             self._settle(sample)
 
     def _settle(self, sample: Sample) -> None:
-        """Changes that were too small to follow, and errors of those that were not, must not add up."""
+        """Limit the deviation from the scene's first frame, so that errors of many changes do not
+        accumulate.
+        """
         assert self._anchor is not None
         found = self._compare(sample, [self._anchor])
         if found is not None:
@@ -200,9 +225,8 @@ class ExposureEstimator:
     def _compare(
         self, sample: Sample, references: Iterable[Reference]
     ) -> tuple[NDArray[np.float64], float, Reference] | None:
-        """Logarithms of the gains by the references that look most like the frame, how unlike the best is, and that one.
-
-        None where no reference can tell.
+        """Return log gains by the most similar references, the dissimilarity of the best one, and
+        that reference; None if no reference is similar.
         """
         alike = []
         for reference in references:
@@ -223,7 +247,7 @@ class ExposureEstimator:
         if not known.any():
             return None
         measured = total / np.maximum(weights, 1e-9)
-        # A channel that is clipped or dark throughout changes as the others do.
+        # A channel that is clipped or dark everywhere changes like the others.
         others = float((measured - self._log_gain)[known].mean())
         return np.where(known, measured, self._log_gain + others), alike[0][0], alike[0][1]
 

@@ -1,7 +1,9 @@
-"""The part of the picture that a scope's optics fill: a circle, an octagon, a picture between black bars; found in the video itself.
+"""Detection of the field of view in the picture: a circle, an octagon, or a rectangle between black
+bars.
 
-The surround is dark, the same in every frame, lies at the edge of the picture, and ends sharply. A dark cavity ends slowly, or is not at the
-edge; where it is, and where a tool comes in, the outline is closed by its convex hull, or by an ellipse where most of it is one.
+The surround is dark, constant over time, adjoins the picture's edge and ends sharply. A dark cavity
+has a soft boundary or does not reach the edge. Gaps of the outline at cavities and tools are closed
+by the convex hull, or by an ellipse if most of the outline is on one.
 """
 
 from __future__ import annotations
@@ -18,37 +20,47 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 LONG_SIDE_PX = 160
 Outline = NDArray[np.float64]
-"""Corners of a convex polygon, [N, 2], as x and y in shares of the picture's width and height."""
+"""Convex polygon [N, 2] as x and y in shares of the picture's width and height."""
 
 
 @dataclass(frozen=True)
 class FieldOfViewSettings:
-    """What a surround is, and when another one is believed. Raises InvalidSetting out of range."""
+    """Thresholds of the surround and of changes of the field.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     darkest_level: int = 40
-    """The surround's level, 0 to 255, is at most this."""
+    """Largest level of the surround, 0 to 255."""
     surround_range: int = 12
-    """It varies by no more than this, over the picture and from frame to frame."""
+    """Largest variation of the surround's level over the picture and time."""
     edge_contrast: int = 18
-    """Just inside of the outline it is brighter by this ..."""
+    """Smallest brightness step from the surround to the inside of the outline."""
     edge_share: float = 0.6
-    """... along this share of it."""
+    """Share of the outline that must have this step."""
     least_surround: float = 0.015
-    """A surround covers at least this share of the picture ..."""
+    """Smallest share of the picture covered by the surround."""
     least_field: float = 0.15
-    """... and the field at least this share."""
+    """Smallest share of the picture covered by the field."""
     ellipse_share: float = 0.7
-    """An ellipse is taken where so much of the outline lies on one ..."""
+    """Share of the outline that must be on an ellipse for it to be used."""
     ellipse_distance: float = 0.015
-    """... within this, in shares of its size."""
+    """Largest distance from the ellipse, as a share of its size."""
     lit_outside: float = 0.25
-    """At most this share of the area outside of the outline may be lit: by text and logos, and where compression smears the rim."""
+    """Largest share of lit pixels outside the outline, such as text, logos and compression
+    artefacts.
+    """
     margin: float = 0.01
-    """The field ends this far inside of the outline, in shares of the picture's longer side: there it is blurred or has a bright ring."""
+    """Margin inside the outline that is excluded because it is blurred or has a bright ring, as a
+    share of the longer side.
+    """
     window_frames: int = 30
-    """The picture is examined over so many frames; the first one by itself."""
+    """Number of frames per examined window; the first frame is examined alone."""
     windows_to_change: int = 3
-    """A smaller field, or none, is believed after so many windows in a row that agree; a larger one at once."""
+    """Number of consecutive consistent windows before a smaller field, or none, is accepted; a
+    larger one is accepted at once.
+    """
 
     def __post_init__(self) -> None:
         share, level, count = NumberIn(0.0, 1.0), IntegerIn(0, 255), IntegerIn(1, 10_000)
@@ -70,14 +82,16 @@ class FieldOfViewSettings:
 
 
 class FieldOfView:
-    """Follows a stream's field of view, one call a frame."""
+    """Field-of-view detector of a stream."""
 
     def __init__(self, settings: FieldOfViewSettings | None = None) -> None:
         self.settings = settings or FieldOfViewSettings()
         self.mask: NDArray[np.uint8] | None = None
-        """uint8 [H, W]: 1 inside; None where the whole picture is the field. The same array until it changes; not to be written to."""
+        """Mask uint8 [H, W], 1 inside; None if the field is the whole picture. Read-only, and the
+        same array until the field changes.
+        """
         self.changes = 0
-        """How often another field was found."""
+        """Number of field changes."""
         self._shape: tuple[int, ...] = ()
         self._outline: Outline | None = None
         self._reduced: NDArray[np.bool_] = np.zeros((0, 0), bool)
@@ -87,7 +101,7 @@ class FieldOfView:
         self._candidates: list[Outline | None] = []
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """`mask` after this frame, RGB uint8 [H, W, 3], which must be a usable one."""
+        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask`."""
         if image.shape != self._shape:
             self._start(image.shape)
         scale = LONG_SIDE_PX / max(image.shape[:2])
@@ -106,7 +120,7 @@ class FieldOfView:
         return self.mask
 
     def _shows_more(self, grey: NDArray[np.uint8]) -> bool:
-        """Return whether a picture, reduced to levels [H, W], is lit where the field is believed to have ended."""
+        """Return True if a reduced picture [H, W] is lit outside the accepted field."""
         outside = grey[~self._reduced]
         lit = outside > self.settings.darkest_level + self.settings.surround_range
         return bool(lit.size and lit.mean() > self.settings.lit_outside)
@@ -118,7 +132,7 @@ class FieldOfView:
         self.changes = 0
 
     def _consider(self, found: Outline | None) -> None:
-        """Take what one window showed, if it is to be believed."""
+        """Accept the result of one window if it is reliable."""
         if self._frames == 1:
             self._take(found)
             return
@@ -156,7 +170,7 @@ class FieldOfView:
         inside = _inside(outline, (height, width)).astype(np.uint8)
         margin = round(self.settings.margin * max(height, width))
         if margin:
-            # The picture's own edge is none of the field's.
+            # The picture's own edge gets no margin.
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
             inside = np.asarray(cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1))
         self.mask = inside
@@ -165,7 +179,16 @@ class FieldOfView:
 def find_outline(
     brightest: NDArray[np.uint8], darkest: NDArray[np.uint8], settings: FieldOfViewSettings
 ) -> Outline | None:
-    """The field's outline in the brightest and darkest levels, uint8 [H, W], that each pixel had in a window; None: no surround."""
+    """Find the field's outline.
+
+    Args:
+        brightest: largest level of each pixel in a window, uint8 [H, W].
+        darkest: smallest level of each pixel in the window, uint8 [H, W].
+        settings: thresholds.
+
+    Returns:
+        The outline, or None without a surround.
+    """
     height, width = brightest.shape
     if min(height, width) < 16:
         return None
@@ -176,7 +199,7 @@ def find_outline(
     limit = level + settings.surround_range
     dark = (brightest <= limit) & (brightest - darkest <= settings.surround_range)
     lit = cv2.morphologyEx((~dark).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    # The largest lit part; text and logos in the surround are others.
+    # The largest lit region is the field; text and logos are separate regions.
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(lit, connectivity=4)
     if count < 2:
         return None
@@ -196,7 +219,9 @@ def find_outline(
 
 
 def _as_ellipse(hull: Outline, shape: tuple[int, int], settings: FieldOfViewSettings) -> Outline:
-    """The hull, or the ellipse on which most of it lies, cut off where the hull ends above, below, left and right."""
+    """Return the ellipse on which most of the hull is, clipped to the hull's bounding box, or the
+    hull itself.
+    """
     height, width = shape
     points = _along(hull)
     free = points[
@@ -221,14 +246,14 @@ def _as_ellipse(hull: Outline, shape: tuple[int, int], settings: FieldOfViewSett
 
 
 def _up_to_the_edge(outline: Outline, shape: tuple[int, int]) -> Outline:
-    """The outline with what is nearly at the picture's edge on it."""
+    """Extend the outline to the picture's edge where it nearly reaches it."""
     last = np.array([shape[1], shape[0]]) - 1.0
     outline = np.where(outline <= 1.0, -0.5, outline)
     return np.where(outline >= last - 1.0, last + 0.5, outline)
 
 
 def _along(hull: Outline) -> Outline:
-    """Points at distances of about a pixel along the polygon."""
+    """Return points along the polygon at distances of about a pixel."""
     parts = []
     for start, end in zip(hull, np.roll(hull, -1, axis=0), strict=True):
         steps = max(1, round(float(np.hypot(*(end - start)))))
@@ -239,7 +264,7 @@ def _along(hull: Outline) -> Outline:
 def _ends_sharply(
     inside: NDArray[np.bool_], brightest: NDArray[np.uint8], limit: float, settings: FieldOfViewSettings
 ) -> bool:
-    """Whether most of the field's rim is clearly brighter than the surround right beside it."""
+    """Return True if most of the field's rim is clearly brighter than the surround next to it."""
     three = np.ones((3, 3), np.uint8)
     field = inside.astype(np.uint8)
     inner = cv2.erode(field, three, iterations=2, borderType=cv2.BORDER_CONSTANT, borderValue=1)
@@ -256,7 +281,7 @@ def _filled(outline: Outline, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def _inside(outline: Outline | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The pixels of a picture of this size inside of an outline; all for None."""
+    """Return the mask of an outline in a picture of this size; all True for None."""
     height, width = shape[:2]
     if outline is None:
         return np.ones((height, width), bool)

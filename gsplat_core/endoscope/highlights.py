@@ -1,7 +1,8 @@
-"""Specular highlights: reflections of the lamp on wet tissue, which move with the scope and not with the tissue.
+"""Detection of specular highlights: reflections of the lamp on wet tissue, which move with the
+scope.
 
-They are near white (bright in every channel) and brighter than what surrounds them. Tissue that is merely bright, or overexposed over a large
-area, is not brighter than its surroundings.
+Highlights are nearly white (bright in every channel) and brighter than their surroundings. Bright
+or overexposed areas are not brighter than their surroundings.
 """
 
 from __future__ import annotations
@@ -18,29 +19,37 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 LONG_SIDE_PX = 800
-"""Of longer pictures only every second, third, … pixel is looked at."""
+"""Longest side in pixels above which pictures are subsampled."""
 SHRINK = 8
-"""The surroundings are averaged on a picture so many times smaller."""
+"""Reduction factor for averaging the surroundings."""
 BLACK = 28
-"""What is darker may lie outside of the field of view, and is no surrounding of tissue at its rim."""
+"""Level below which pixels are excluded from the surroundings, since they may be outside the field
+of view.
+"""
 
 
 @dataclass(frozen=True)
 class HighlightSettings:
-    """What a highlight is. Raises InvalidSetting out of range."""
+    """Thresholds of highlights.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     brightest_channel: int = 235
-    """Its brightest channel has at least this level, 0 to 255 ..."""
+    """Smallest level of a highlight's brightest channel, 0 to 255."""
     darkest_channel: int = 170
-    """... and its darkest one this: saturated colours are tissue."""
+    """Smallest level of its darkest channel; saturated colours are tissue."""
     above_surroundings: int = 30
-    """Its darkest channel is this many levels above the mean of the surroundings ..."""
+    """Smallest excess of its darkest channel over the mean of the surroundings, in levels."""
     surroundings: float = 0.12
-    """... in a square of this share of the picture's longer side."""
+    """Side of the square of surroundings, as a share of the longer side."""
     grown: float = 0.003
-    """It is grown by this share of the longer side: 2 px of 640."""
+    """Dilation of highlights as a share of the longer side, 2 px of 640."""
     most: float = 0.25
-    """A picture with a larger share of highlights has none: that is overexposure, or something white."""
+    """Largest share of highlights in a picture; more indicates overexposure or a white object, and
+    none are reported.
+    """
 
     def __post_init__(self) -> None:
         level, share = IntegerIn(0, 255), NumberIn(0.0, 1.0)
@@ -59,12 +68,14 @@ DEFAULTS = HighlightSettings()
 
 
 def without_highlights(image: NDArray[np.uint8], settings: HighlightSettings = DEFAULTS) -> NDArray[np.uint8] | None:
-    """uint8 [H, W], 0 on highlights and 1 elsewhere, of RGB uint8 [H, W, 3]; None where there are none."""
+    """Return a mask uint8 [H, W], 0 on highlights, for a picture RGB uint8 [H, W, 3]; None without
+    highlights.
+    """
     return HighlightFinder(settings).without(image)
 
 
 class HighlightFinder:
-    """Finds highlights in one picture after another; keeps the memory that it works in, of the size of the last one."""
+    """Highlight detector that reuses its buffers between pictures."""
 
     def __init__(self, settings: HighlightSettings = DEFAULTS) -> None:
         self.settings = settings
@@ -101,8 +112,9 @@ def _disc(radius_px: int) -> NDArray[np.uint8]:
 
 
 def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: HighlightSettings) -> NDArray[np.uint8]:
-    """What the darkest channel of a highlight has at least: so many levels more than its mean around, SHRINK times smaller (rounded up).
-    What is black does not count."""
+    """Return the threshold of a highlight's darkest channel, reduced by `SHRINK` (rounded up): the
+    local mean plus an offset. Black pixels are excluded.
+    """
     width, height = (-(-side // SHRINK) for side in low.shape[::-1])
     small, lit = (
         cv2.resize(sampled(plane, SHRINK // 2), (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high)

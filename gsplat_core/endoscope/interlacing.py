@@ -1,8 +1,9 @@
-"""Interlaced video: found by its combs, and taken apart.
+"""Detection and removal of interlacing.
 
-An interlaced picture's even and odd lines were taken at two times. Where something moves, neighbouring lines then differ more than lines that
-are two apart; in progressive video it is the other way around. While a stream is interlaced the even lines are kept, and pixels of the odd
-lines that stand out from both neighbours are replaced by their mean; where nothing moves nothing is replaced.
+Even and odd lines of an interlaced picture are taken at two times. Where something moves,
+neighbouring lines then differ more than lines two apart; in progressive video it is the reverse.
+While a stream is interlaced, even lines are kept, and outliers of odd lines are replaced by the
+mean of their neighbours. Static parts are unchanged.
 """
 
 from __future__ import annotations
@@ -19,27 +20,35 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 BLOCK_ROWS, BLOCK_COLUMNS, COLUMN_STEP = 16, 8, 4
-"""Of every fourth column, blocks of 16 lines and 8 of those columns."""
+"""Block size in lines and sampled columns, and the column step."""
 
 
 @dataclass(frozen=True)
 class InterlacingSettings:
-    """When video is interlaced. Raises InvalidSetting out of range."""
+    """Thresholds of interlaced video.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     comb_ratio: float = 1.2
-    """A block is combed when neighbouring lines differ by this many times as much as lines that are two apart ..."""
+    """Ratio of the difference of neighbouring lines to that of lines two apart, from which a block
+    is combed.
+    """
     comb_levels: float = 5.0
-    """... and by at least so many levels, 0 to 255."""
+    """Smallest difference of neighbouring lines of a combed block, in levels 0 to 255."""
     comb_share: float = 0.02
-    """A picture is combed when this share of its blocks is."""
+    """Share of combed blocks from which a picture is combed."""
     combed_frames: int = 4
-    """So many combed pictures ..."""
+    """Number of combed pictures among the last `of_frames` from which a stream is interlaced."""
     of_frames: int = 12
-    """... of so many make the stream interlaced ..."""
+    """Number of pictures over which combed ones are counted."""
     forgotten_frames: int = 600
-    """... until so many in a row have none."""
+    """Consecutive pictures without combs after which a stream is no longer interlaced."""
     stand_out_levels: int = 4
-    """In interlaced video, pixels of odd lines that are this much above or below both neighbours are replaced."""
+    """Excess over both neighbouring lines, in levels, from which a pixel of an odd line is
+    replaced.
+    """
 
     def __post_init__(self) -> None:
         count = IntegerIn(1, 1_000_000)
@@ -56,17 +65,19 @@ class InterlacingSettings:
 
 
 class Deinterlacer:
-    """Follows a stream, one call a frame."""
+    """Deinterlacer of a stream."""
 
     def __init__(self, settings: InterlacingSettings | None = None) -> None:
         self.settings = settings or InterlacingSettings()
         self.interlaced = False
-        """Whether the stream is interlaced."""
+        """True if the stream is interlaced."""
         self._recent: deque[bool] = deque(maxlen=self.settings.of_frames)
         self._without = 0
 
     def process(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture, RGB uint8 [H, W, 3], without combs: the very array that was given unless the stream is interlaced."""
+        """Return the picture RGB uint8 [H, W, 3] without combs. It is the given array unless the
+        stream is interlaced.
+        """
         combed = comb_share(image, self.settings) >= self.settings.comb_share
         self._recent.append(combed)
         self._without = 0 if combed else self._without + 1
@@ -78,7 +89,7 @@ class Deinterlacer:
 
 
 def comb_share(image: NDArray[np.uint8], settings: InterlacingSettings) -> float:
-    """The share of a picture's blocks that are combed; 0 for a picture that is smaller than some blocks."""
+    """Return the share of combed blocks; 0 for a picture smaller than a few blocks."""
     some = np.ascontiguousarray(image[:, ::COLUMN_STEP, 1])
     rows, columns = (some.shape[0] - 2) // BLOCK_ROWS, some.shape[1] // BLOCK_COLUMNS
     if rows < 2 or columns < 2:
@@ -94,7 +105,9 @@ def comb_share(image: NDArray[np.uint8], settings: InterlacingSettings) -> float
 
 
 def without_combs(image: NDArray[np.uint8], stand_out_levels: int) -> NDArray[np.uint8]:
-    """A copy of a picture [H, W, 3] in which pixels of odd lines that are brighter or darker than both neighbours by more than so many levels are the mean of those."""
+    """Return a copy of a picture [H, W, 3] with outliers of odd lines replaced by the mean of the
+    neighbouring lines.
+    """
     result = image.copy()
     odd = result[1:-1:2]
     count = len(odd)
@@ -106,7 +119,7 @@ def without_combs(image: NDArray[np.uint8], stand_out_levels: int) -> NDArray[np
     over = cv2.subtract(grey_odd, cv2.max(grey_above, grey_below))
     under = cv2.subtract(cv2.min(grey_above, grey_below), grey_odd)
     stands_out = (np.asarray(cv2.max(over, under)) > stand_out_levels).view(np.uint8)
-    # The rest of a comb's tooth is less clear than its middle.
+    # Include the ends of a comb's tooth, which are less distinct than its middle.
     near = cv2.dilate(stands_out, np.ones((1, 5), np.uint8))
     odd[:] = cv2.copyTo(cv2.addWeighted(above, 0.5, below, 0.5, 0), near, np.ascontiguousarray(odd))
     return result

@@ -1,9 +1,11 @@
-"""How much two pictures show the same place, whatever the exposure: for cuts, and for a view that comes back.
+"""Similarity of two pictures' content independent of exposure, for detecting cuts and returns.
 
-Three measures on 64x48 pixels. *Difference*: the median difference of the logarithms, after each channel's own gain is taken out. *Colours*:
-the overlap of the histograms of hue, likewise. *Structure*: blocks of one picture are searched near their place in the other (normalised
-correlation); the median of the blocks counts. *Moved*: a quarter of one picture is searched in all of the other, and the best of five counts. Moving
-tissue, a jump of the view, a tool and a change of exposure leave one of the last two high; between different scenes both are low.
+Measures on 64x48 pixels: *Difference* is the median difference of log levels after removing each
+channel's gain. *Colours* is the overlap of the hue histograms. *Structure* searches blocks of one
+picture near their place in the other (normalised correlation) and takes the median over blocks.
+*Moved* searches quarters of one picture in the whole other one and takes the best of five. Moving
+tissue, a jump of the view, tools and exposure changes leave one of the last two high. Between
+different scenes both are low.
 """
 
 from __future__ import annotations
@@ -20,52 +22,55 @@ from gsplat_core.endoscope.reduced import lowest_and_highest, reduced
 WIDTH_PX, HEIGHT_PX = 64, 48
 BLOCK_WIDTH_PX, BLOCK_HEIGHT_PX, SEARCH_PX = 16, 12, 8
 DARK = 28
-"""Levels below this are not compared: they are the same black surround or cavity in every scene."""
+"""Level below which pixels are not compared, since black surrounds and cavities look alike in every
+scene.
+"""
 OFFSET = 8.0
-"""Added to levels before the logarithm, so that noise in the dark is not large."""
+"""Offset of levels before the logarithm, to suppress noise in dark regions."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(OFFSET))
 RIM_PX = 2
 HUE_BINS, HUE_RANGE = 16, 0.8
 LEAST_CONTRAST = 0.02
-"""Blocks without more structure than this (standard deviation of the logarithm) are not searched."""
+"""Standard deviation of log levels below which a block is not searched."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """How alike two pictures are."""
+    """Similarity measures of two pictures."""
 
     difference: float
-    """0: the same; between scenes 0.3 and more."""
+    """0 for equal pictures; 0.3 and more between scenes."""
     colours: float
-    """1: the same colours; 0: none in common."""
+    """1 for equal colours, 0 for none in common."""
     structure: float
-    """1: every block is found again near its place; unrelated pictures have 0.3 to 0.65."""
+    """1 if every block is found near its place; 0.3 to 0.65 for unrelated pictures."""
     moved: float
-    """1: a quarter of one picture is found somewhere in the other; unrelated pictures have 0.4 to 0.8."""
+    """1 if a quarter of one picture is found in the other; 0.4 to 0.8 for unrelated pictures."""
 
 
 class View:
-    """One picture, prepared for comparisons."""
+    """Picture prepared for comparisons."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
-        """From RGB uint8 [H, W, 3] of any size."""
+        """Prepare an RGB uint8 picture [H, W, 3] of any size."""
         small = reduced(image, WIDTH_PX, HEIGHT_PX)
         self.bright: NDArray[np.bool_] = lowest_and_highest(small)[1] >= DARK
-        # Channel by channel, which is how medians are quick.
+        # Channels are contiguous, which makes medians fast.
         logs = np.ascontiguousarray(LOGS[small].transpose(2, 0, 1))
         for channel in logs:
             lit = channel[self.bright]
             channel -= median_of(lit) if len(lit) else 0.0
         self.logs: NDArray[np.float32] = logs
-        """[3, HEIGHT_PX, WIDTH_PX]"""
+        """Log levels without gain, [3, HEIGHT_PX, WIDTH_PX]."""
         self._detail: NDArray[np.float32] | None = None
         self._hues: NDArray[np.float64] | None = None
 
     @property
     def detail(self) -> NDArray[np.float32]:
-        """Structure without slow shading; 0 where it is dark."""
+        """Structure without slow shading; 0 in dark regions."""
         if self._detail is None:
-            # Less a rim, so that the edge of the field of view or of a letterbox is no structure.
+            # Exclude the rim, so that the edge of the field of view or of a letterbox is not
+            # structure.
             rim = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * RIM_PX + 1, 2 * RIM_PX + 1))
             weight = cv2.erode(self.bright.astype(np.uint8), rim, borderValue=1).astype(np.float32)
             grey = cv2.GaussianBlur(self.logs.mean(axis=0), (0, 0), 1) * weight
@@ -75,7 +80,7 @@ class View:
 
     @property
     def hues(self) -> NDArray[np.float64]:
-        """Shares of the hues, [HUE_BINS * HUE_BINS], which sum to 1."""
+        """Normalised hue histogram, [HUE_BINS * HUE_BINS]."""
         if self._hues is None:
             lit = self.logs[:, self.bright]
             away = lit - lit.mean(axis=0)
@@ -86,7 +91,7 @@ class View:
 
 
 def difference(one: View, other: View) -> float:
-    """`Likeness.difference`, which is quick to compute; 1 where one of the pictures is dark throughout."""
+    """Return `Likeness.difference`, which is fast to compute; 1 if one picture is dark everywhere."""
     either = one.bright & other.bright
     if either.sum() < either.size // 50:
         return 1.0
@@ -94,7 +99,7 @@ def difference(one: View, other: View) -> float:
 
 
 def likeness(one: View, other: View) -> Likeness:
-    """All measures; about a millisecond."""
+    """Compute all measures, in about a millisecond."""
     colours = float(np.minimum(one.hues, other.hues).sum())
     moved = max(_moved(one.detail, other.detail), _moved(other.detail, one.detail))
     return Likeness(difference(one, other), colours, _structure(one.detail, other.detail), moved)
@@ -114,7 +119,7 @@ def _structure(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
 
 
 def _moved(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    """How well one of five parts, each a quarter of the first picture, is found anywhere in the second: a view that jumped."""
+    """Return the best correlation of five quarters of the first picture anywhere in the second."""
     high, wide = HEIGHT_PX // 2, WIDTH_PX // 2
     best = 0.0
     for top, left in ((0, 0), (0, wide), (high, 0), (high, wide), (high // 2, wide // 2)):

@@ -1,4 +1,4 @@
-"""What came with a picture: a tool mask that cannot be one, depth that is none."""
+"""Plausibility checks of tool masks and depth maps that accompany pictures."""
 
 from __future__ import annotations
 
@@ -13,29 +13,37 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 STEP_PX = 4
-"""At most every fourth row and column is looked at ..."""
+"""Smallest subsampling step of rows and columns in pixels."""
 SAMPLES = 128
-"""... of larger pictures about so many of the shorter side."""
+"""Approximate number of samples along the shorter side of larger pictures."""
 
 
 @dataclass(frozen=True)
 class MaskAndDepthSettings:
-    """When mask or depth are wrong. Raises InvalidSetting out of range."""
+    """Thresholds of plausible masks and depth.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     least_tissue: float = 0.02
-    """A frame with a smaller share of tissue has nothing to learn from."""
+    """Share of tissue below which a frame is not trained on."""
     lost_tool_share: float = 0.05
-    """A tool of at least this share that is gone altogether in the next frame is a mask that was lost ..."""
+    """Share of a tool in the previous mask from which its sudden absence is a lost mask."""
     lost_frames: int = 5
-    """... for at most so many frames; then the tool has left."""
+    """Largest number of frames with a lost mask; then the tool has left."""
     farthest_mm: float = 2000.0
-    """Depth beyond this is none: no endoscope looks further."""
+    """Largest plausible depth for an endoscope, in millimetres."""
     wrong_depth_share: float = 0.2
-    """With a larger share of values that are no depth (not finite, negative, too far) all of a frame's depth is left out."""
+    """Share of invalid values (not finite, negative or too far) from which a frame's depth is
+    discarded.
+    """
     usual_depth_ratio: float = 4.0
-    """So is it when its median is this many times the median of the frames before, or less than its inverse ..."""
+    """Ratio of the median depth to that of earlier frames, in either direction, from which a
+    frame's depth is discarded.
+    """
     unusual_frames: int = 10
-    """... for at most so many frames; then that is the new distance."""
+    """Largest number of such frames; then the new distance is accepted."""
 
     def __post_init__(self) -> None:
         share, count = NumberIn(0.0, 1.0), IntegerIn(1, 10_000)
@@ -52,7 +60,7 @@ class MaskAndDepthSettings:
 
 
 class MaskCheck:
-    """Looks at each frame's tool mask beside the one before."""
+    """Consistency check of consecutive tool masks."""
 
     def __init__(self, settings: MaskAndDepthSettings | None = None) -> None:
         self.settings = settings or MaskAndDepthSettings()
@@ -60,7 +68,7 @@ class MaskCheck:
         self._lost = 0
 
     def fault(self, mask: NDArray[np.generic]) -> str | None:
-        """ "no tissue" or "tool mask lost" of the mask [H, W], 1 = tissue; None where it can be one."""
+        """Return "no tissue" or "tool mask lost" for a faulty mask [H, W] (1 = tissue), else None."""
         some = _some(mask)
         tissue = np.count_nonzero(some) / some.size
         if tissue < self.settings.least_tissue:
@@ -78,16 +86,18 @@ class MaskCheck:
 
 @dataclass(frozen=True)
 class CheckedDepth:
-    """A frame's depth, without what is none."""
+    """Depth of a frame without invalid values."""
 
     depth: NDArray[np.float32] | None
-    """float32 [H, W] in millimetres, 0 = unknown, the very array that was given where nothing is wrong with it; None: left out."""
+    """float32 [H, W] in millimetres, 0 = unknown; the given array if it is valid. None if
+    discarded.
+    """
     finding: str | None = None
-    """"depth repaired", "depth not usable" or "depth at another scale"; None: nothing was found."""
+    """Finding "depth repaired", "depth not usable" or "depth at another scale", or None."""
 
 
 class DepthCheck:
-    """Looks at each frame's depth beside those before."""
+    """Consistency check of consecutive depth maps."""
 
     def __init__(self, settings: MaskAndDepthSettings | None = None) -> None:
         self.settings = settings or MaskAndDepthSettings()
@@ -95,7 +105,7 @@ class DepthCheck:
         self._unusual = 0
 
     def checked(self, depth: NDArray[np.floating]) -> CheckedDepth:
-        """The depth [H, W] of a frame, in millimetres, 0 = unknown."""
+        """Check a depth map [H, W] in millimetres, 0 = unknown."""
         settings = self.settings
         sampled = _some(depth)
         possible = self._possible(sampled)
@@ -104,7 +114,7 @@ class DepthCheck:
         known = sampled[possible & (sampled > 0)]
         if len(known) and self._at_another_scale(float(np.median(known))):
             return CheckedDepth(None, "depth at another scale")
-        # Both are NaN where a value is.
+        # Both are NaN if any value is.
         if depth.min() >= 0 and depth.max() <= settings.farthest_mm:
             return CheckedDepth(depth)
         return CheckedDepth(np.where(self._possible(depth), depth, 0).astype(np.float32), "depth repaired")
@@ -127,6 +137,6 @@ class DepthCheck:
 
 
 def _some(plane: NDArray[Any]) -> NDArray[Any]:
-    """Some of a plane's rows and columns."""
+    """Subsample a plane."""
     step = max(STEP_PX, min(plane.shape) // SAMPLES)
     return np.ascontiguousarray(plane[::step, ::step])

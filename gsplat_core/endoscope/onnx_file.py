@@ -1,7 +1,7 @@
-"""An ONNX file, read without the onnx package: no larger than it may be, and whole in itself.
+"""Safe reading of ONNX files without the onnx package: bounded in size and self-contained.
 
-A model can keep its weights in other files, which it names by path. None is opened here: whoever runs a network that came from elsewhere
-would have it read any file of the machine. The runtime is given the bytes, never the path.
+A model can store weights in other files named by path. Loading them would let a foreign model read
+any file of the machine, so such models are rejected and the runtime gets bytes instead of a path.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from gsplat_core.io.files import read_regular
 MOST_BYTES = 512 * 2**20
 MOST_NESTING = 64
 _EXTERNAL_DATA, _DATA_LOCATION, _EXTERNAL = 13, 14, 1
-"""Fields of a tensor in onnx.proto, and the value of the second that says that its data lie in another file."""
+"""Field numbers of a tensor in onnx.proto, and the value of the second field that marks external
+data.
+"""
 _PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
@@ -25,15 +27,21 @@ _PARTS: dict[str, dict[int, str]] = {
     "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
     "sparse": {1: "tensor", 2: "tensor"},
 }
-"""Which fields of a message hold messages that hold tensors (onnx.proto, IR version 13)."""
+"""Fields of each message type that lead to tensors (onnx.proto, IR version 13)."""
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-"""Wire types of protobuf."""
+"""Protobuf wire types."""
 
 
 def read_model(path: Path, what: str) -> bytes:
-    """The bytes of an ONNX file. what: what it is to the user, "tool network".
+    """Read an ONNX file.
 
-    Raises InvalidSetting for what is no such file, is too large or has data in other files.
+    Args:
+        path: the file.
+        what: description of the model for error messages, such as "tool network".
+
+    Raises:
+        InvalidSetting: for an unreadable or invalid file, one that is too large, or one with
+            external data.
     """
     try:
         data = read_regular(path, MOST_BYTES)
@@ -52,7 +60,11 @@ def read_model(path: Path, what: str) -> bytes:
 
 
 def has_external_data(data: bytes) -> bool:
-    """Whether a tensor of a model lies in another file. Raises ValueError for bytes that are no protobuf message."""
+    """Return True if a tensor of a model has external data.
+
+    Raises:
+        ValueError: for bytes that are not a protobuf message.
+    """
     waiting: list[tuple[str, memoryview, int]] = [("model", memoryview(data), 0)]
     while waiting:
         kind, message, depth = waiting.pop()
@@ -68,7 +80,7 @@ def has_external_data(data: bytes) -> bool:
 
 
 def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """Numbers and values of a message's fields: integers, and the bytes of what has a length."""
+    """Yield number and value of a message's fields: integers, and bytes of length-delimited fields."""
     at = 0
     while at < len(message):
         tag, at = _varint(message, at)

@@ -1,4 +1,4 @@
-"""A network of the user's, an ONNX model that takes one picture: loaded, checked and run on the processor."""
+"""Loading, checking and running of a user's ONNX model that takes one picture, on the CPU."""
 
 from __future__ import annotations
 
@@ -14,20 +14,27 @@ from gsplat_core.endoscope.onnx_settings import Settings, read_settings
 from gsplat_core.errors import InvalidInput, InvalidSetting
 
 LONG_SIDE_PX = 640
-"""Pictures for a network that takes any size, and for which no size is stated, are at most this long."""
+"""Longest side in pixels for networks without a fixed or configured input size."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 class OnnxNetwork(Generic[Settings]):
-    """One input, a float picture [1, 3, h, w]; what comes out is for the caller to check.
+    """ONNX model with one input, a float picture [1, 3, h, w]. Callers check the output.
 
-    A picture is an RGB uint8 array [H, W, 3] of any size.
+    Pictures are RGB uint8 arrays [H, W, 3] of any size.
     """
 
     def __init__(self, path: Path, what: str, settings: type[Settings], *, multiple_px: int = 32) -> None:
-        """Loads the model. what: what it is to the user, "tool network". multiple_px: of which both sides are, where the model takes any size.
+        """Load a model.
 
-        Raises InvalidSetting, with a sentence, for what cannot be used.
+        Args:
+            path: the file.
+            what: description for error messages, such as "tool network".
+            settings: type of the settings.
+            multiple_px: granularity of the input size for models that accept any size.
+
+        Raises:
+            InvalidSetting: for a model that cannot be used.
         """
         self.path, self.what, self.multiple_px = path, what, multiple_px
         self._session, self.settings = self._load(settings)
@@ -35,7 +42,12 @@ class OnnxNetwork(Generic[Settings]):
         self._output = self._checked_output()
 
     def run(self, image: NDArray[np.uint8]) -> NDArray[Any]:
-        """The raw output for a picture. Raises InvalidInput for another array, InvalidSetting where the network fails on it."""
+        """Run the network on a picture and return its raw output.
+
+        Raises:
+            InvalidInput: for an array that is no picture.
+            InvalidSetting: if the network fails on it.
+        """
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
             raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
         height, width = self._size(*image.shape[:2])
@@ -54,11 +66,11 @@ class OnnxNetwork(Generic[Settings]):
         return np.asarray(output)
 
     def refused(self, why: str) -> InvalidSetting:
-        """What to raise for a network that cannot be used; `why` goes on after its name."""
+        """Return the error for an unusable network; `why` continues the sentence after its name."""
         return InvalidSetting(f"{self.what} {self.path} {why}")
 
     def _size(self, height: int, width: int) -> tuple[int, int]:
-        """What a picture is resized to."""
+        """Return the height and width to which a picture is resized."""
         fixed = self._input.shape[2:]
         if all(isinstance(side, int) and side > 0 for side in fixed):
             return fixed[0], fixed[1]
@@ -78,7 +90,7 @@ class OnnxNetwork(Generic[Settings]):
         if not fits or (isinstance(shape[1], int) and shape[1] != 3) or only.type not in _TYPES:
             raise self.refused(f"takes {only.type} {shape}; it must take one picture, float [1, 3, height, width]")
         if any(isinstance(side, int) and side > 4096 for side in shape[2:]):
-            raise self.refused(f"takes pictures of {shape[2]}x{shape[3]}; at most 4096x4096 are given")
+            raise self.refused(f"takes pictures of {shape[2]}x{shape[3]}; at most 4096x4096 are supported")
         return only
 
     def _checked_output(self) -> str:
@@ -89,7 +101,7 @@ class OnnxNetwork(Generic[Settings]):
         return str(wanted or names[0])
 
     def _load(self, kind: type[Settings]) -> tuple[Any, Settings]:
-        """A session of the runtime for the file, and its settings."""
+        """Create a runtime session and read the settings."""
         try:
             import onnxruntime
         except ImportError as error:
@@ -98,7 +110,8 @@ class OnnxNetwork(Generic[Settings]):
             ) from error
         data = read_model(self.path, self.what)
         try:
-            # The settings, the number of threads among them, may be in the model: it is opened with one thread to read them.
+            # The settings, including the number of threads, may be inside the model, so it is first
+            # opened with one thread.
             session = _session(onnxruntime, data, 1)
             settings = read_settings(self.path, session.get_modelmeta().custom_metadata_map, kind)
             if settings.threads > 1:
@@ -115,9 +128,9 @@ def _session(onnxruntime: Any, data: bytes, threads: int) -> Any:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    # Waiting threads sleep: the processor is shared with training.
+    # Waiting threads sleep, since the CPU is shared with training.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Named, because one of the providers that are there by default sends what it is given to a service.
+    # Named explicitly, because one of the default providers sends its input to a remote service.
     return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 
 

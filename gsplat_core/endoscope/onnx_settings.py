@@ -1,4 +1,4 @@
-"""How a network wants its pictures and what its output means: stated in the model, or in a file beside it."""
+"""Input and output conventions of a network, from its metadata or a JSON file next to it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.files import read_regular
 
 METADATA_KEY = "intrasplat"
-"""Of the model's metadata: its value is a JSON object with the fields of the settings."""
+"""Metadata key whose value is a JSON object with the fields of the settings."""
 MOST_BYTES = 1 << 16
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -22,44 +22,52 @@ ClassIndex = Annotated[int, Field(ge=0, lt=4096)]
 
 
 class PictureSettings(BaseModel):
-    """What cannot be seen in a network's shapes, whatever it is for."""
+    """Settings of any picture network that its tensor shapes do not reveal."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     white: Positive = 1.0
-    """Value of a white pixel before `mean` is subtracted and `std` divided by: 1 or 255 mostly."""
+    """Value of a white pixel before normalisation by `mean` and `std`, usually 1 or 255."""
     mean: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    """Per channel, red first."""
+    """Mean per channel, red first."""
     std: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     channels: Literal["rgb", "bgr"] = "rgb"
-    """Order in which the network takes them."""
+    """Channel order of the network's input."""
     size: tuple[Side, Side] | None = None
-    """Height and width in pixels of the pictures that it is given, where its input has no fixed size."""
+    """Input height and width in pixels if the network has no fixed size."""
     output: str | None = None
-    """Name of the output; None: the first one."""
+    """Name of the output; None for the first one."""
     threads: Annotated[int, Field(ge=1, le=64)] = 1
-    """Of the processor."""
+    """Number of CPU threads."""
 
 
 class ToolSettings(PictureSettings):
-    """The same of a network that finds tools."""
+    """Settings of a tool segmentation network."""
 
     values: Literal["auto", "logits", "probability"] = "auto"
-    """Of an output with one channel. auto: probability where nothing outside of 0..1 comes out for three trial pictures."""
+    """Kind of a single-channel output. `auto` is probability if three trial pictures give no value
+    outside 0..1.
+    """
     tool_classes: Annotated[tuple[ClassIndex, ...], Field(min_length=1)] | None = None
-    """Classes that are tools; None: all but 0. An output with one channel is class 1, and [0] makes it tissue's."""
+    """Tool classes; None for all but 0. A single channel is the score of class 1; [0] declares it
+    as tissue.
+    """
     threshold: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """A pixel is tool where its probability, or that of the most likely tool class beside the most likely other one, is at least this.
-    Below 0.5 fewer tools are missed and more tissue is lost."""
+    """Probability from which a pixel is tool. With several classes it compares the most likely tool
+    class with the most likely other class. Below 0.5 fewer tools are missed and more tissue is
+    lost.
+    """
 
 
 Settings = TypeVar("Settings", bound=PictureSettings)
 
 
 def read_settings(path: Path, metadata: Mapping[str, str], kind: type[Settings]) -> Settings:
-    """The settings of the network at `path`: those in `path` with `.json` added, else those in its metadata, else the defaults.
+    """Read the settings of the network at `path` from `path` + `.json`, else from its metadata,
+    else return defaults.
 
-    Raises InvalidSetting for what is no such object.
+    Raises:
+        InvalidSetting: for unreadable or invalid settings.
     """
     beside = path.with_name(path.name + ".json")
     if beside.exists():

@@ -1,4 +1,4 @@
-"""Tools found by a network of the user's, an ONNX model."""
+"""Tool segmentation by a user's ONNX model."""
 
 from __future__ import annotations
 
@@ -17,32 +17,39 @@ log = logging.getLogger(__name__)
 
 TRIAL_SIZE_PX = (256, 320)
 SMALLEST_MASK_PX = 4
-"""What is smaller is the answer of a network that says what a picture shows, not where."""
+"""Smallest side of an output mask in pixels; smaller outputs are those of a classifier."""
 
 
 class OnnxToolFinder:
-    """Runs an ONNX model on each picture, on the processor.
+    """Tool segmentation with an ONNX model on the CPU.
 
-    The model has one input, a float picture [1, 3, h, w], and an output that says where tools are: [1, 1, h', w'] logits or probabilities,
-    [1, K, h', w'] a score for each of K >= 2 classes, or [1, h', w'] or [h', w'], integers for a class each and otherwise as one channel.
-    `ToolSettings` says the rest. A picture whose output has a NaN is tool everywhere.
+    The model has one input, a float picture [1, 3, h, w]. Its output is [1, 1, h', w'] logits or
+    probabilities, [1, K, h', w'] scores of K >= 2 classes, or [1, h', w'] or [h', w'] with integer
+    classes or a single float channel. `ToolSettings` describes the conventions. A picture whose
+    output contains NaN counts as tool everywhere.
     """
 
     def __init__(self, path: Path) -> None:
-        """Loads the model and tries it out. Raises InvalidSetting, with a sentence, for what cannot be used."""
+        """Load and try the model.
+
+        Raises:
+            InvalidSetting: for a model that cannot be used.
+        """
         self._network = OnnxNetwork(path, "tool network", ToolSettings)
         self.settings = self._network.settings
         self._probability = self._tried_out()
         self.not_finite = 0
-        """Pictures for which a NaN came out."""
+        """Number of pictures with NaN in the output."""
 
     def reset(self) -> None:
-        """Nothing is remembered from picture to picture."""
+        """Do nothing, since no state is kept between pictures."""
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The mask of a picture: RGB uint8 [H, W, 3] to uint8 [H, W], 1 = tissue, 0 = tool.
+        """Segment a picture RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool.
 
-        Raises InvalidInput for another array, InvalidSetting where the network fails on it.
+        Raises:
+            InvalidInput: for an array that is no picture.
+            InvalidSetting: if the network fails on it.
         """
         score = self._score(self._network.run(image))
         height, width = image.shape[:2]
@@ -55,7 +62,7 @@ class OnnxToolFinder:
         return (large < 0).astype(np.uint8)
 
     def _score(self, output: NDArray[Any]) -> NDArray[np.float32]:
-        """[h, w], 0 or more where there is a tool; NaN where the network gave NaN."""
+        """Return a score [h, w], at least 0 on tools; NaN where the network returned NaN."""
         planes = output[0] if output.ndim == 4 else output.reshape(1, *output.shape[-2:])
         tools = self.settings.tool_classes
         if np.issubdtype(planes.dtype, np.integer):
@@ -73,13 +80,15 @@ class OnnxToolFinder:
         chosen[list(range(1, len(planes)) if tools is None else tools)] = True
         if np.isnan(planes).any():
             return np.full(planes.shape[1:], np.nan, np.float32)
-        # Infinite scores, as of a mask inside the network, would cancel to NaN.
+        # Infinite scores, for example of a mask inside the network, would cancel to NaN.
         planes = np.clip(planes, -1e30, 1e30)
         ahead = planes[chosen].max(axis=0) - planes[~chosen].max(axis=0)
         return np.asarray(ahead - np.float32(np.log(threshold / (1 - threshold))), np.float32)
 
     def _tried_out(self) -> bool:
-        """Whether an output with one channel is a probability, after three trial pictures have shown that the network gives a mask."""
+        """Try the network on three pictures, check its output shape, and return True if a single
+        channel is a probability.
+        """
         noise = np.random.default_rng(0).integers(0, 256, (*TRIAL_SIZE_PX, 3), np.uint8)
         outputs = [self._network.run(picture) for picture in (noise, np.zeros_like(noise), np.full_like(noise, 255))]
         shape = outputs[0].shape

@@ -139,7 +139,7 @@ def refused(path) -> str:
         ([1, 32, 40, 3], "it must take one picture"),
         ([2, 3, 32, 40], "it must take one picture"),
         ([3, 32, 40], "it must take one picture"),
-        ([1, 3, 5000, 40], "takes pictures of 5000x40; at most 4096x4096 are given"),
+        ([1, 3, 5000, 40], "takes pictures of 5000x40; at most 4096x4096 are supported"),
     ],
 )
 def test_inputs_of_another_shape_are_refused(tmp_path, shape, sentence):
