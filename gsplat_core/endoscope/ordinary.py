@@ -1,4 +1,6 @@
-"""Whether a picture is an ordinary next one, by a few numbers that cost next to nothing: then the closer looks can take turns."""
+"""Cheap test for ordinary pictures, for which the detailed checks can be distributed over several
+frames.
+"""
 
 from __future__ import annotations
 
@@ -12,29 +14,34 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 
 BANDS = 4
-"""Horizontal bands of a picture that are looked at apart: what is torn has changed in some of them only."""
+"""Number of horizontal bands compared separately; a torn picture changes only in some of them."""
 SAMPLES_PER_SIDE = 64
 USUAL_DECAY = 0.1
 LEAST_CHANGE = 0.2
-"""Mean change of a band, in levels of 255, below which a picture may be the same again."""
+"""Mean change of a band, in levels of 255, below which a picture may be a repetition."""
 
 
 @dataclass(frozen=True)
 class OrdinarySettings:
-    """How far an ordinary picture may be from what is usual. Raises InvalidSetting for a value out of its range."""
+    """Largest deviations of an ordinary picture from the usual values.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     look_every_s: float = 0.2
-    """Each closer look is taken so often whatever the pictures are, at every sixth of 30 a second; and so often what pictures are compared with is
-    renewed."""
+    """Interval in seconds at which each detailed check runs in any case (every sixth frame at 30
+    frames/s), and at which the reference is renewed.
+    """
     most_change: float = 2.0
-    """Change of a band from the picture before, as a multiple of its usual change."""
+    """Largest change of a band from the previous picture, as a multiple of its usual change."""
     least_change: float = 0.4
     brightness_levels: float = 2.0
-    """Shift of a channel's mean since the last comparison was renewed, in levels of 255."""
+    """Largest shift of a channel's mean from the reference, in levels of 255."""
     sharpness_share: float = 0.08
-    """Change of the mean difference of neighbouring pixels since then."""
+    """Largest relative change of the mean difference of neighbouring pixels from the reference."""
     interval_share: float = 1.7
-    """A longer time since the last frame, as a multiple of the usual one, is not ordinary."""
+    """Longest interval since the last frame, as a multiple of the usual one."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.look_every_s <= 60:
@@ -49,25 +56,29 @@ class OrdinarySettings:
 
 
 class OrdinaryPictures:
-    """Follows a stream, one call a frame. Keeps a small picture and a few numbers."""
+    """Test for ordinary pictures of a stream, called for each frame. It keeps a reduced picture and
+    a few numbers.
+    """
 
     def __init__(self, settings: OrdinarySettings | None = None) -> None:
         self.settings = settings or OrdinarySettings()
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Reset for another stream."""
         self._before: NDArray[np.uint8] | None = None
         self._shape: tuple[int, ...] = ()
         self._usual = np.zeros(BANDS)
         self._looked: tuple[NDArray[np.float64], float] | None = None
-        """Mean colour and sharpness that pictures are compared with."""
+        """Reference mean colour and sharpness."""
         self._looked_ns = 0
         self._last_ns: int | None = None
         self._interval_ns = 0.0
 
     def is_ordinary(self, image: NDArray[np.uint8], pts_ns: int) -> bool:
-        """Whether the next picture, RGB uint8 [H, W, 3] at `pts_ns`, is as the ones before it lead to expect. False: look closer."""
+        """Return True if the next picture, RGB uint8 [H, W, 3] at `pts_ns`, is as expected from
+        earlier ones; False requests detailed checks.
+        """
         small, colour, sharpness = _sampled(image)
         before, self._before = self._before, small
         in_time = self._in_time(pts_ns)
@@ -113,7 +124,9 @@ class OrdinaryPictures:
 
 
 def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
-    """Some of the pixels, their mean colour, and the mean difference of neighbours in some of the rows."""
+    """Return some of the pixels, their mean colour, and the mean difference of neighbours in some
+    of the rows.
+    """
     height, width = image.shape[:2]
     size = min(width, SAMPLES_PER_SIDE), min(height, SAMPLES_PER_SIDE)
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
@@ -126,7 +139,7 @@ def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.fl
 
 
 def _change_of_bands(small: NDArray[np.uint8], before: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Mean absolute change of each horizontal band."""
+    """Return the mean absolute change of each horizontal band."""
     difference = cv2.absdiff(small, before).reshape(len(small), -1)
     rows = cv2.reduce(difference, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
     edges = [band * len(rows) // BANDS for band in range(BANDS + 1)]

@@ -1,13 +1,15 @@
-"""Evidence that a picture was taken outside of the body, and the gate that keeps such pictures of a stream back.
+"""Detection of pictures taken outside the body, and a gate that withholds them.
 
-A picture is withheld for what it shows, not for what it lacks: tissue may be pale, yellow, stained blue, dark, overexposed or lit with
-narrow bands, and none of that is evidence. Rooms differ from it in two ways together:
+A picture is withheld only for positive evidence. Pale, yellow, blue-stained, dark, overexposed or
+narrow-band tissue is no evidence. Rooms differ from tissue in two ways together:
 
-- Much of the picture is *cool*: red hardly exceeds green and blue. Drapes, clothes, walls, paper and screens are; tissue hardly ever is.
-- The light or the shapes are those of a room. A scope is its own lamp, so that brightness falls off with distance; walls, cloth and paper
-  under room light are evenly lit and have no relief. Furniture, screens and print have straight edges at right angles.
+- Much of the picture is *cool*: red hardly exceeds green and blue. Drapes, clothes, walls, paper
+and screens are cool; tissue hardly ever is.
+- The light or the shapes are those of a room. Brightness under a scope's own lamp falls off with
+distance, while walls, cloth and paper in room light are evenly lit without relief. Furniture,
+screens and print have straight edges at right angles.
 
-Nothing here recognises people or objects. docs/checks.md lists what is found and what is not.
+People and objects are not recognised. docs/checks.md lists the pictures that are detected.
 """
 
 from __future__ import annotations
@@ -22,61 +24,78 @@ from gsplat_core.endoscope.reduced import averaged, channels, luma
 from gsplat_core.errors import InvalidInput
 
 LONG_SIDE_PX = 96
-"""Longer side of the picture whose colours and light are examined."""
+"""Longer side of the picture for colour and light measures, in pixels."""
 EDGES_SIDE_PX = 320
-"""Longer side of the picture whose edges are examined."""
+"""Longer side of the picture for edge measures, in pixels."""
 SMALLEST_PX = 16
-"""A picture with a shorter side than this holds no evidence."""
+"""Shortest side of a picture that is judged, in pixels."""
 DARKEST = 25
-"""Brightness (largest channel, 0..255) below which a pixel has no colour to judge."""
+"""Brightness (largest channel, 0..255) below which a pixel's colour is not judged."""
 DIM = 40.0
-"""Brightness that a twentieth of the lit pixels must exceed; in darker pictures rounding decides the colours."""
+"""Brightness that 5 % of the lit pixels must exceed; rounding decides the colours of darker
+pictures.
+"""
 CLIPPED = 252
-"""Two channels at this level or above: the third no longer says which colour the pixel has."""
+"""Level from which a channel counts as clipped. With two clipped channels a pixel's colour is
+unknown.
+"""
 LEAST_LIT, LEAST_JUDGED = 0.05, 0.1
-"""Smallest share of the picture that must be lit, and of the lit pixels that must not be clipped, for a judgement."""
+"""Smallest share of lit pixels in the picture, and of unclipped ones among them, for a judgement.
+"""
 NOISE = 6.0
-"""Added to each channel before ratios are taken."""
+"""Offset added to each channel before ratios are computed."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(NOISE))
 RATIOS = np.array([[1, -1, 0], [1, 0, -1]], np.float32)
-"""From logarithms of red, green and blue to those of red over green and red over blue."""
+"""Matrix from log red, green and blue to the logs of red over green and red over blue."""
 COOL = 0.12
-"""A pixel is cool where red exceeds both green and blue by less than this, as a natural logarithm of the ratio."""
+"""Log ratio of red to both green and blue below which a pixel is cool."""
 STRAIGHT, COOL_BESIDE_STRAIGHT = 0.47, 0.4
-"""Straight edges: the edges' directions agree so well, and this share of the judged pixels is cool."""
+"""Agreement of the edges' directions and share of cool pixels from which straight edges are
+evidence.
+"""
 ROOM_LIGHT, COOL_BESIDE_LIGHT = 0.8, 0.6
-"""Light of a room: `Evidence.even` and `Evidence.smooth` together reach this, and this share of the judged pixels is cool."""
+"""Sum of `Evidence.even` and `Evidence.smooth` and share of cool pixels from which even light is
+evidence.
+"""
 FLAT = 0.01
-"""Brightness that changes by less than this share of itself from pixel to pixel hardly changes."""
+"""Relative brightness change from pixel to pixel below which a surface is smooth."""
 EDGE_SHARE, EDGE_CONTRAST = 0.2, 0.12
-"""Edges are this share of the lit area, with a gradient (Sobel) of at least this share of its brightness."""
+"""Share of the lit area that counts as edges, and least gradient (Sobel) of an edge relative to the
+brightness.
+"""
 LITTLE_COOL, REDNESS = 0.3, 0.34
-"""Clear tissue: a smaller share is cool, and a quarter of the judged pixels exceed this logarithm of red over green."""
+"""Share of cool pixels below which, and log of red over green that a quarter of the pixels must
+exceed, for a picture to be clear tissue.
+"""
 FRAMES_TO_RETURN = 10
-"""Pictures of clear tissue in a row that open the gate again ..."""
+"""Consecutive pictures of clear tissue that reopen the gate."""
 FRAMES_WITHOUT_EVIDENCE = 60
-"""... and pictures of any kind without evidence of the outside that do."""
+"""Pictures without evidence of the outside that reopen the gate."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Measures of a picture's colours and light. Shares are 0..1 of the lit pixels that are not clipped unless said otherwise."""
+    """Colour and light measures of a picture. Shares are 0..1 of the lit, unclipped pixels unless
+    stated otherwise.
+    """
 
     cool: float
-    """Share in which red hardly exceeds green and blue, or is below them."""
+    """Share of pixels in which red hardly exceeds green and blue."""
     redness: float
-    """Logarithm of red over green, the value that a quarter of the pixels exceed."""
+    """Upper quartile of the log of red over green."""
     even: float
-    """Brightness that three quarters reach, over the brightness that a twentieth exceeds."""
+    """Lower quartile of brightness over its 95th percentile."""
     smooth: float
-    """Share of the lit area, without its border, in which brightness hardly changes."""
+    """Share of the lit area, without its border, with hardly any brightness change."""
     straight: float
-    """Length of the mean of the edges' directions, their angles taken four times so that right angles agree: 1 for a grid, 0 for all
-    directions alike, and where too little of the picture is cool for it to matter."""
+    """Agreement of the edges' directions: length of the mean of unit vectors with fourfold angles,
+    so that right angles agree. 1 for a grid, 0 for uniformly distributed directions or with too few
+    cool pixels.
+    """
 
     @property
     def outside(self) -> str | None:
-        """Evidence of the outside, in a few words; None for none."""
+        """Kind of evidence of the outside as a short phrase, or None."""
         if self.straight >= STRAIGHT and self.cool >= COOL_BESIDE_STRAIGHT:
             return "straight edges, little red"
         if self.even + self.smooth >= ROOM_LIGHT and self.cool >= COOL_BESIDE_LIGHT:
@@ -85,20 +104,27 @@ class Evidence:
 
     @property
     def tissue(self) -> bool:
-        """Clear tissue: little is cool, and a quarter is as red as blood makes it."""
+        """True for clear tissue: few cool pixels, and a quarter as red as blood."""
         return self.cool < LITTLE_COOL and self.redness >= REDNESS
 
 
 def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
-    """Measure a picture, RGB uint8 [H, W, 3]; None where too little can be judged: small, dark or overexposed.
+    """Measure a picture.
 
-    Raises InvalidInput for any other array.
+    Args:
+        image: RGB uint8 [H, W, 3].
+
+    Returns:
+        The measures, or None for a picture that is too small, dark or overexposed to judge.
+
+    Raises:
+        InvalidInput: for any other array.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
     if min(image.shape[:2]) < SMALLEST_PX:
         return None
-    # Averaging leaves little of noise, whose colours would look varied.
+    # Averaging suppresses noise, whose colours would look varied.
     small = averaged(image, _size(image, LONG_SIDE_PX), samples=3)
     cv2.GaussianBlur(small, (0, 0), 1.0, dst=small)
     ordered = np.sort(small, axis=2)
@@ -128,30 +154,33 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
 
 
 class BodyGate:
-    """Decides picture by picture whether a stream shows the outside of the body: at once where there is evidence of it.
+    """Gate of a stream that closes at once on evidence of the outside.
 
-    The first picture of a stream, and every one after it, passes unless it holds evidence of the outside. After one that does, the gate
-    stays closed until `FRAMES_TO_RETURN` pictures in a row show clear tissue, or `FRAMES_WITHOUT_EVIDENCE` hold no evidence. Pictures in
-    which nothing can be judged, dark ones for instance, pass through an open gate, and count for nothing while it is closed.
+    A picture passes unless it contains such evidence. After one that does, the gate stays closed
+    until `FRAMES_TO_RETURN` consecutive pictures show clear tissue, or `FRAMES_WITHOUT_EVIDENCE`
+    contain no evidence. Pictures that cannot be judged, such as dark ones, pass an open gate and
+    are not counted by a closed one.
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream: the next picture is the first one."""
+        """Reset for another stream."""
         self._inside = True
         self._tissue = self._without = 0
 
     @property
     def inside(self) -> bool:
-        """True where the gate is open."""
+        """True if the gate is open."""
         return self._inside
 
     def judge(self, image: NDArray[np.uint8]) -> str | None:
-        """Judge the stream's next picture: None where it passes, otherwise the reason against it, in a few words.
+        """Judge the stream's next picture, RGB uint8 [H, W, 3]. Returns None if it passes,
+        otherwise the reason as a short phrase.
 
-        image: RGB uint8 [H, W, 3]. Raises InvalidInput for anything else; the gate is then closed.
+        Raises:
+            InvalidInput: for any other array; the gate is then closed.
         """
         try:
             evidence = evidence_of(image)
@@ -175,7 +204,9 @@ class BodyGate:
 
 
 def _size(image: NDArray[np.uint8], long_side_px: int) -> tuple[int, int]:
-    """Width and height of the picture reduced to this longer side, 8 pixels at least each; a smaller picture stays as large as it is."""
+    """Return width and height of the picture reduced to this longer side, at least 8 pixels each;
+    smaller pictures are not enlarged.
+    """
     height, width = image.shape[:2]
     scale = min(1.0, long_side_px / max(height, width))
     return max(8, round(width * scale)), max(8, round(height * scale))
@@ -184,13 +215,17 @@ def _size(image: NDArray[np.uint8], long_side_px: int) -> tuple[int, int]:
 def _gradient(
     plane: NDArray[np.uint8], scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Derivatives along x and y, and their length, by Sobel's kernel times `scale`."""
+    """Return derivatives along x and y and the gradient's magnitude, by the Sobel kernel times
+    `scale`.
+    """
     across, down = (np.asarray(cv2.Sobel(plane, cv2.CV_32F, x, 1 - x, scale=scale), np.float32) for x in (1, 0))
     return across, down, np.asarray(cv2.magnitude(across, down), np.float32)
 
 
 def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
-    """Share of the judged area, without a border of two pixels, in which brightness hardly changes from pixel to pixel."""
+    """Return the share of the judged area, without a border of two pixels, with hardly any
+    brightness change.
+    """
     inner = np.asarray(cv2.erode(judged.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)) > 0
     *_, steepness = _gradient(grey, 1 / 8)
     area = int(np.count_nonzero(inner))
@@ -198,7 +233,9 @@ def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
 
 
 def _straight(image: NDArray[np.uint8], lit: NDArray[np.bool_]) -> float:
-    """Agreement of the edges' directions inside of the lit area [h, w]; its own border, often that of a round or square view, is left out."""
+    """Return the agreement of edge directions inside the lit area [h, w]. Its own border, often of
+    a round or square view, is excluded.
+    """
     size = _size(image, EDGES_SIDE_PX)
     grey = luma(averaged(image, size))
     cv2.GaussianBlur(grey, (0, 0), 0.8, dst=grey)

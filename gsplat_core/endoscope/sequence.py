@@ -1,4 +1,6 @@
-"""Pictures that are none, or not new: black, one colour, noise, the same again, part of the one before."""
+"""Detection of unusable or repeated pictures: black, single-coloured, noise, duplicate, frozen or
+torn.
+"""
 
 from __future__ import annotations
 
@@ -14,35 +16,51 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 SAMPLES = 128
-"""About how many rows of a picture are looked at; in each of them about as many pixels."""
+"""Approximate number of sampled rows, and of pixels per row."""
 SMALLEST_FOR_NOISE_PX = 32
-"""In narrower pictures neighbouring pixels differ without being noise."""
+"""Shortest side of a picture tested for noise, in pixels; neighbours in smaller pictures differ
+without noise.
+"""
 
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """When a picture is not usable. Differences are in levels of 0 to 255. Raises InvalidSetting out of range."""
+    """Thresholds of unusable pictures. Differences are in levels of 0 to 255.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     black_level: int = 20
-    """A picture is black when all but `odd_share` of it is darker than this."""
+    """Level below which a picture is black, except for `odd_share` of it."""
     one_colour_levels: int = 3
-    """A picture is of one colour when all but `odd_share` of it is within this of its most frequent colour."""
+    """Deviation from the most frequent colour within which a picture is single-coloured, except for
+    `odd_share` of it.
+    """
     odd_share: float = 0.03
-    """Share that may be otherwise: a line of text, a logo."""
+    """Tolerated share of other pixels, such as a line of text or a logo."""
     noise_share: float = 0.5
-    """Noise: neighbouring pixels differ by this share of what unrelated pixels would. Tissue has 0.01 to 0.04."""
+    """Difference of neighbouring pixels relative to that of unrelated ones, from which a picture is
+    noise. Tissue has 0.01 to 0.04.
+    """
     same_levels: int = 2
-    """Pixels that differ by no more are the same; a picture that is encoded again differs so much."""
+    """Largest difference of equal pixels, as caused by re-encoding."""
     same_share: float = 0.9995
-    """A picture is the same as the one before when this share of its pixels is."""
+    """Share of equal pixels from which a picture repeats the previous one."""
     frozen_s: float = 0.25
-    """Without a new picture for so long the stream is frozen; before, a frame is a duplicate."""
+    """Seconds without a new picture after which the stream is frozen; before, frames are
+    duplicates.
+    """
     frozen_frames: int = 8
-    """So many same pictures in a row are frozen as well, whatever their times."""
+    """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
     torn_share: float = 0.08
-    """A picture is torn when at least this share of its rows, up to its lower edge, is that of the picture before."""
+    """Share of rows, up to the lower edge, equal to the previous picture from which a picture is
+    torn.
+    """
     moving_share: float = 0.9
-    """Rows are compared for that only if they changed in at least this share of the frames: not a black border or a recorder's strip."""
+    """Share of frames in which a row must change to be used for that; excludes black borders and
+    recorder overlays.
+    """
 
     def __post_init__(self) -> None:
         share = NumberIn(0.0, 1.0)
@@ -62,7 +80,9 @@ class SequenceSettings:
 
 
 class SequenceCheck:
-    """Looks at each picture of a stream beside the one before; it keeps one small picture and a number for each row of it."""
+    """Check of each picture against the previous one. It keeps one reduced picture and a number per
+    row.
+    """
 
     def __init__(self, settings: SequenceSettings | None = None) -> None:
         self.settings = settings or SequenceSettings()
@@ -71,13 +91,14 @@ class SequenceCheck:
         self._new_since_ns = 0
         self._same_run = 0
         self._row_moves: NDArray[np.float64] = np.zeros(0)
-        """How often each row has changed lately, 0..1."""
+        """Recent frequency of changes of each row, 0..1."""
         self._frames_seen = 0
 
     def fault(self, image: NDArray[np.uint8], pts_ns: int) -> str | None:
-        """What is wrong with the picture, RGB uint8 [H, W, 3], shown at `pts_ns`; None if nothing is.
+        """Check the next picture, RGB uint8 [H, W, 3], shown at `pts_ns`.
 
-        One of "black", "one colour", "noise", "duplicate", "frozen" and "torn".
+        Returns:
+            None, "black", "one colour", "noise", "duplicate", "frozen" or "torn".
         """
         height, width = (max(1, side // max(1, side // SAMPLES)) for side in image.shape[:2])
         small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
@@ -88,7 +109,7 @@ class SequenceCheck:
             self._new_since_ns = pts_ns
             return self._unusable(image, small)
         _, differs = cv2.threshold(cv2.absdiff(small, previous), self.settings.same_levels, 1, cv2.THRESH_BINARY)
-        # By row; each channel counts.
+        # Fraction per row, over all channels.
         share = cv2.reduce(differs.reshape(height, -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
         if share.mean() <= 1 - self.settings.same_share:
             return self._unusable(image, small) or self._repeated(pts_ns)
@@ -96,7 +117,7 @@ class SequenceCheck:
         changed = share > 0.01
         torn = self._torn(small, changed)
         if not torn:
-            # Quick at first, then over about the last 50 frames.
+            # Fast at first, then averaged over about the last 50 frames.
             self._frames_seen += 1
             self._row_moves += (changed - self._row_moves) / min(self._frames_seen, 50)
         return self._unusable(image, small) or ("torn" if torn else None)
@@ -114,8 +135,10 @@ class SequenceCheck:
         return None
 
     def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
-        """Whether so many pixels are of one grey that they may be of one colour; quicker than to look at the colours."""
-        # A level more to either side: grey is rounded.
+        """Return True if enough pixels have one grey level for a single colour; faster than
+        comparing colours.
+        """
+        # One more level on either side, since grey is rounded.
         wide = min(2 * self.settings.one_colour_levels + 3, len(levels))
         below = np.append(0, levels.cumsum())
         return bool((below[wide:] - below[:-wide]).max() >= (1 - self.settings.odd_share) * pixels)
@@ -133,18 +156,20 @@ class SequenceCheck:
         return "frozen" if long or self._same_run >= self.settings.frozen_frames else "duplicate"
 
     def _torn(self, small: NDArray[np.uint8], changed: NDArray[np.bool_]) -> bool:
-        """Whether the lowest rows are the ones of the picture before, or of one colour, while what is above moved as usual."""
+        """Return True if the lowest rows are those of the previous picture or single-coloured,
+        while rows above changed as usual.
+        """
         if self._frames_seen < 5:
             return False
         moving = np.flatnonzero(self._row_moves >= self.settings.moving_share)
         level = 2 * self.settings.one_colour_levels
         if not len(moving) or (changed[moving[-1]] and np.ptp(small[moving[-1], ::4], axis=0).max() > level):
-            # The lowest row that moves is new and shows something, so none above is stale.
+            # The lowest changing row is new and has content, so no row above is stale.
             return False
         flat = np.ptp(small[:, ::4], axis=1).max(axis=1) <= level
         least = max(3, round(self.settings.torn_share * len(small)))
         for stale in (~changed, flat & changed):
-            # From the lowest row that moves, upwards: all rows that move must be stale.
+            # Count upwards from the lowest changing row; all changing rows must be stale.
             rows = moving[::-1]
             fresh = np.flatnonzero(~stale[rows])
             below = len(rows) if len(fresh) == 0 else int(fresh[0])
@@ -155,7 +180,9 @@ class SequenceCheck:
 
 
 def _roughness(image: NDArray[np.uint8]) -> float:
-    """Mean squared difference of neighbours in a row, over that of unrelated pixels (twice the variance): 0 smooth, 1 noise."""
+    """Return the mean squared difference of neighbours in a row over that of unrelated pixels
+    (twice the variance): 0 smooth, 1 noise.
+    """
     rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // 32), :, 1])
     variance = float(cv2.meanStdDev(rows)[1].item()) ** 2
     left, right = rows[:, :-1], rows[:, 1:]

@@ -1,4 +1,4 @@
-"""Ranges of the settings in this package: each part has one frozen dataclass of them, checked when it is made."""
+"""Range checks of the frozen settings dataclasses of this package."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from gsplat_core.value_ranges import ValueRange
 
 
 def check_settings(settings: object, **ranges: ValueRange) -> None:
-    """Raises InvalidSetting, with the name and the range, when an attribute of `settings` is not in its range."""
+    """Check attributes of `settings` against ranges.
+
+    Raises:
+        InvalidSetting: with name and range of the first attribute out of range.
+    """
     for name, allowed in ranges.items():
         try:
             allowed.checked(f"{type(settings).__name__}.{name}", getattr(settings, name))

@@ -1,12 +1,14 @@
-"""Blur and smoke: frames that are suddenly less sharp than the stream's recent frames, or much paler than its clear ones.
+"""Detection of blurred and smoky frames relative to the stream's recent frames.
 
-Sharpness is the mean difference between neighbouring pixels over that between pixels eight apart, along rows and along columns. The lower of
-the two, relative to its usual value, counts: it depends neither on the scene's contrast nor on the exposure, and motion takes it along one
-direction only. The usual value is that of the last second or so, blurred frames included. A stream that is soft throughout, or that becomes
-soft, therefore passes: the display never waits for sharp frames that do not come.
+Sharpness is the mean difference of neighbouring pixels over that of pixels eight apart, along rows
+and along columns. The lower of the two, relative to its usual value, is compared. It is independent
+of contrast and exposure, and motion blur reduces it in one direction only. The usual value is the
+median of recent frames, including blurred ones. A stream that is or becomes permanently soft
+therefore passes.
 
-Smoke takes contrast (the spread of the logarithm of brightness) and saturation, and makes brighter what is dark; a tool does not do the last.
-Smoke gathers slowly, so that the usual values are those of frames without it, until it has lasted as long.
+Smoke reduces contrast (spread of log brightness) and saturation and brightens dark regions, which a
+tool does not. Smoke gathers slowly, so the usual values are those of frames without smoke, until it
+has lasted for the same time.
 """
 
 from __future__ import annotations
@@ -24,38 +26,44 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 SIDE_PX = 320
-"""About the longer side of the picture in which sharpness is measured; between its pixels others are left out."""
+"""Approximate longer side of the subsampled picture for measuring sharpness, in pixels."""
 APART_PX = 8
 WIDTH_PX, HEIGHT_PX = 40, 32
-"""Of the picture in which colours are measured."""
+"""Size of the picture for measuring colours, in pixels."""
 LONGEST_RECENT = 600
-"""Most frames whose sharpness is kept, whatever the frame rate."""
+"""Largest number of recent frames, independent of the frame rate."""
 DARK = 28
-"""Darker pixels do not count: noise, or outside of the field of view."""
+"""Level below which pixels are ignored as noise or outside the field of view."""
 
 
 @dataclass(frozen=True)
 class SharpnessSettings:
-    """When a frame is withheld; values are shares of what is usual. Raises InvalidSetting out of range."""
+    """Thresholds for withholding a frame, relative to usual values.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     blurred_below: float = 0.75
-    """A frame of less than this sharpness is blurred ..."""
+    """Relative sharpness below which a frame is blurred."""
     sharp_above: float = 0.82
-    """... and one after it is sharp again from this on."""
+    """Relative sharpness from which a frame after a blurred one is sharp again."""
     smoke_contrast: float = 0.75
-    """Smoke: contrast below this ..."""
+    """Relative contrast below which a frame may be smoky."""
     smoke_saturation: float = 0.8
-    """... and saturation below this ..."""
+    """Relative saturation below which a frame may be smoky."""
     smoke_haze: float = 15.0
-    """... and the haze higher by so many levels."""
+    """Increase of the haze level required for smoke."""
     clear_above: float = 0.87
-    """After smoke a frame is clear again with contrast or saturation above this."""
+    """Relative contrast or saturation above which a frame after smoke is clear again."""
     recent_s: float = 1.5
-    """Usual sharpness is the median over this time, so that blur is withheld for half of it at most. After smoke for as long it is usual."""
+    """Window in seconds of the usual sharpness (median). Blur is withheld for at most half of it.
+    Smoke that lasts longer becomes the usual state.
+    """
     recent_frames: int = 5
-    """The median is taken over at least so many frames, for streams of few frames a second; before there are as many, every frame passes."""
+    """Smallest number of frames for the median, for low frame rates. All frames pass before."""
     clear_frames: int = 300
-    """Usual contrast, saturation and haze are the medians of so many frames that were good."""
+    """Number of good frames for the usual contrast, saturation and haze (medians)."""
 
     def __post_init__(self) -> None:
         share, count = NumberIn(0.01, 1.0), IntegerIn(1, 100_000)
@@ -75,47 +83,56 @@ class SharpnessSettings:
 
 @dataclass(frozen=True)
 class Appearance:
-    """How sharp and how clear a picture is."""
+    """Sharpness and clarity measures of a picture."""
 
     rows: float
-    """Sharpness along rows, about 0.3 to 0.5."""
+    """Sharpness along rows, typically 0.3 to 0.5."""
     columns: float
     """Sharpness along columns."""
     contrast: float
-    """Standard deviation of the logarithm of brightness."""
+    """Standard deviation of log brightness."""
     saturation: float
     """Median of 1 - darkest channel / brightest channel."""
     haze: float
-    """Level of the darkest channel that a tenth of the pixels stay below."""
+    """10th percentile of the darkest channel."""
 
 
 class SharpnessGate:
-    """Compares each frame of a stream with what is usual in it; keeps a few numbers for each of a bounded number of frames."""
+    """Comparison of each frame of a stream with the usual values, in constant memory."""
 
     def __init__(self, settings: SharpnessSettings | None = None) -> None:
         self.settings = settings or SharpnessSettings()
         self._clear: NDArray[np.float64] = np.empty((self.settings.clear_frames, 3))
-        """Contrast, saturation and haze of good frames, in a ring."""
+        """Ring buffer of contrast, saturation and haze of good frames."""
         self.start_scene()
 
     def start_scene(self) -> None:
-        """Forget what is usual: another scene begins."""
+        """Reset the usual values for another scene."""
         self._recent: deque[tuple[float, float, float]] = deque(maxlen=LONGEST_RECENT)
-        """Seconds since the frame before, and sharpness along rows and columns, of recent frames."""
+        """Interval in seconds and sharpness along rows and columns of recent frames."""
         self._last_ns: int | None = None
         self._clear_count = 0
         self._fault: str | None = None
         self._smoke_s = self._unseen_s = 0.0
-        """Duration of the smoke so far, and of frames that could not be measured. Such frames keep the fault of the frame before."""
+        """Duration of the current smoke, and of frames that could not be measured, in seconds. Such
+        frames keep the previous result.
+        """
 
     def fault(self, image: NDArray[np.uint8], pts_ns: int, kept: NDArray[np.generic] | None = None) -> str | None:
-        """Judge the stream's next frame: "blur", "smoke", or None for a good one.
+        """Judge the stream's next frame.
 
-        image: RGB uint8 [H, W, 3]. pts_ns: its time. kept: [H, W], 0 where it shows no tissue.
+        Args:
+            image: RGB uint8 [H, W, 3].
+            pts_ns: timestamp in nanoseconds.
+            kept: [H, W], 0 outside the tissue, or None.
+
+        Returns:
+            "blur", "smoke", or None for a good frame.
         """
         elapsed_s = 0.0 if self._last_ns is None else (pts_ns - self._last_ns) * 1e-9
         self._last_ns = pts_ns
-        # A gap says nothing about the frame after it, and a clock that stands still must not stop the window.
+        # Bound the interval: a gap must not dominate the median, and a constant clock must not stop
+        # the window.
         elapsed_s = min(max(elapsed_s, 1e-3), self.settings.recent_s / self.settings.recent_frames)
         seen = appearance(image, kept)
         self._unseen_s = 0.0 if seen is not None else self._unseen_s + elapsed_s
@@ -140,7 +157,7 @@ class SharpnessGate:
         return self._fault
 
     def _remember(self, elapsed_s: float, seen: Appearance) -> None:
-        """Append the frame's sharpness, and drop frames that are no longer recent."""
+        """Append the frame's sharpness and drop frames outside the window."""
         self._recent.append((elapsed_s, seen.rows, seen.columns))
         together_s = sum(each[0] for each in self._recent)
         while (
@@ -149,7 +166,7 @@ class SharpnessGate:
             together_s -= self._recent.popleft()[0]
 
     def _usual_sharpness(self) -> tuple[float, float]:
-        """Median sharpness of the recent frames along rows and columns, each frame weighed by the time that it stands for."""
+        """Return the median sharpness along rows and columns, weighted by the frames' intervals."""
         elapsed_s, *values = np.array(self._recent).T
         usual = []
         for sharpness in values:
@@ -159,7 +176,7 @@ class SharpnessGate:
         return usual[0], usual[1]
 
     def _judged(self, sharpness: float, clear: NDArray[np.float64]) -> str | None:
-        """Judge a frame by its sharpness relative to the usual one, and its contrast, saturation and haze."""
+        """Judge a frame by its relative sharpness, and its contrast, saturation and haze."""
         settings = self.settings
         known = min(self._clear_count, len(self._clear))
         usual = np.maximum(np.partition(self._clear[:known], known // 2, axis=0)[known // 2], 1e-6)
@@ -176,7 +193,7 @@ class SharpnessGate:
 
 
 def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None) -> Appearance | None:
-    """Measure RGB uint8 [H, W, 3] where `kept` [H, W] is not 0; None where there is too little to tell."""
+    """Measure RGB uint8 [H, W, 3] where `kept` [H, W] is not 0; None with too few usable pixels."""
     step = max(1, round(max(image.shape[:2]) / SIDE_PX))
     grey = luma(sampled(image, step))
     if min(grey.shape) <= 2 * APART_PX:
@@ -199,7 +216,9 @@ def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None
 
 
 def _sharpness(grey: NDArray[np.uint8], counted: NDArray[np.uint8], axis: int) -> float | None:
-    """Mean difference between rows (or columns, axis 1) that are next to each other, over that between some APART_PX apart; None for a flat picture."""
+    """Return the mean difference of neighbouring rows (columns for axis 1) over that of rows
+    `APART_PX` apart; None for a flat picture.
+    """
     means = []
     for apart in (1, APART_PX):
         here, there = ((slice(None),) * axis + (part,) for part in (slice(apart, None), slice(-apart)))

@@ -1,6 +1,6 @@
-"""The times of a stream's frames: out of order, jumped, gone on.
+"""Correction of a stream's timestamps: late frames, clock jumps and gaps.
 
-A model is a function of time, so a clock that jumps by an hour must not reach it: the jump is taken out and the stream goes on as it did.
+A model is a function of time, so clock jumps are removed before timestamps reach it.
 """
 
 from __future__ import annotations
@@ -21,16 +21,22 @@ REPEATED_TIME = "repeated time"
 
 @dataclass(frozen=True)
 class ClockSettings:
-    """When a step of the clock is none of time. Raises InvalidSetting out of range."""
+    """Thresholds of timestamp steps.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     longest_step_s: float = 10.0
-    """A longer step forward is a jump of the clock, unless the frame arrived so much later as well."""
+    """Forward step in seconds above which the clock jumped, if arrival times are unknown."""
     arrival_agrees_s: float = 1.0
-    """How far a step may differ from that between the arrivals. Without arrival times only `longest_step_s` counts."""
+    """Largest difference in seconds between a forward step and the difference of arrival times."""
     late_frames: int = 4
-    """So many frames in a row that are earlier than the newest one are no late frames any more: the clock was set back."""
+    """Consecutive frames earlier than the newest one from which the clock was set back; fewer are
+    late frames.
+    """
     gap_intervals: float = 4.0
-    """A step of more than so many usual intervals is counted as a gap."""
+    """Step in usual intervals above which a gap is reported."""
 
     def __post_init__(self) -> None:
         check_settings(
@@ -44,30 +50,35 @@ class ClockSettings:
 
 @dataclass(frozen=True)
 class Timing:
-    """When a frame is shown."""
+    """Corrected time of a frame."""
 
     pts_ns: int
-    """Its time with all jumps taken out; never before that of an earlier frame."""
+    """Timestamp without clock jumps in nanoseconds; never decreases."""
     finding: str | None = None
-    """What was found: OUT_OF_ORDER, CLOCK_JUMP, GAP or REPEATED_TIME; None: nothing."""
+    """OUT_OF_ORDER, CLOCK_JUMP, GAP or REPEATED_TIME, or None."""
 
 
 class StreamClock:
-    """Follows the times of a stream, one call a frame."""
+    """Timestamp correction of a stream, called for each frame."""
 
     def __init__(self, settings: ClockSettings | None = None) -> None:
         self.settings = settings or ClockSettings()
         self._offset_ns = 0
         self._given_ns: int | None = None
-        """The newest frame's time as its source gave it ..."""
+        """Original timestamp of the newest frame."""
         self._shown_ns = 0
-        """... and without the jumps."""
+        """Corrected timestamp of the newest frame."""
         self._arrived_ns: int | None = None
         self._late: list[int] = []
         self._steps: deque[int] = deque(maxlen=15)
 
     def observe(self, pts_ns: int, arrived_ns: int | None) -> Timing:
-        """The time of the next frame, from the times at which its source says that it was taken and at which it arrived."""
+        """Correct the timestamp of the next frame.
+
+        Args:
+            pts_ns: capture time from the source in nanoseconds.
+            arrived_ns: arrival time in nanoseconds, or None.
+        """
         if self._given_ns is None:
             return self._go_on(pts_ns, arrived_ns, None)
         step_ns = pts_ns - self._given_ns
@@ -90,7 +101,8 @@ class StreamClock:
     def _too_far(self, step_ns: int, arrived_ns: int | None) -> bool:
         if arrived_ns is not None and self._arrived_ns is not None:
             ahead_ns = step_ns - (arrived_ns - self._arrived_ns)
-            # A burst after a stall arrives faster than it was taken: only what is also long in itself is a jump.
+            # After a stall frames arrive faster than they were captured, so only a step that is
+            # long in itself is a jump.
             return ahead_ns > self.settings.arrival_agrees_s * 1e9 and step_ns > self.settings.arrival_agrees_s * 1e9
         return step_ns > self.settings.longest_step_s * 1e9
 

@@ -1,8 +1,8 @@
-"""A recorder's strips and text at the borders: what is drawn into the picture and does not move with the tissue.
+"""Detection of recorder overlays: strips and text drawn at the picture's borders.
 
-Drawn things have sharp edges that stay at the same pixels while everything else moves. Near each border the mean of the brightness gradient over
-time is kept, and how much it varies: a long straight edge along the border that stays is the edge of a strip, which reaches from there to the
-border; strong edges that stay and lie close together are text.
+Drawn elements have sharp edges at fixed pixels while everything else moves. Near each border the
+temporal mean and deviation of the brightness gradient are kept. A long straight constant edge along
+the border is that of a strip, which extends to the border. Dense strong constant edges are text.
 """
 
 from __future__ import annotations
@@ -18,37 +18,43 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 LONG_SIDE_PX = 800
-"""Of longer pictures only every second, third, … pixel is looked at."""
+"""Longest side in pixels above which pictures are subsampled."""
 SMALLEST_PX = 64
-"""In smaller pictures nothing is looked for."""
+"""Shortest side of a picture that is examined, in pixels."""
 
 
 @dataclass(frozen=True)
 class StripSettings:
-    """What counts as drawn into the picture. Raises InvalidSetting out of range."""
+    """Thresholds of drawn elements.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     band: float = 0.08
-    """How far from a border strips and text are looked for, in shares of the picture's height or width."""
+    """Width of the examined band at each border, as a share of the picture's height or width."""
     every: int = 4
-    """One frame in so many is looked at, the borders one after another ..."""
+    """Number of frames in which all four borders are examined in turn."""
     first_after: int = 10
-    """... and after so many of those, and again each time, it is decided."""
+    """Number of examined rounds between decisions."""
     remembered: int = 40
-    """Means go over about so many of them."""
+    """Time constant of the temporal means, in rounds."""
     edge_levels: float = 10.0
-    """A strip's edge is a step of at least so many levels ..."""
+    """Smallest step of a strip's edge, in levels."""
     edge_steadiness: float = 2.5
-    """... and of this many times its mean deviation from frame to frame ..."""
+    """Smallest ratio of this step to its mean temporal deviation."""
     edge_share: float = 0.15
-    """... along at least this share of the border, without a break."""
+    """Smallest length of an unbroken edge, as a share of the border."""
     whole_share: float = 0.6
-    """A strip that is seen along this share of the border goes along all of it."""
+    """Visible share of the border from which a strip is extended along all of it."""
     text_levels: float = 25.0
-    """Text has steps of at least so many levels ..."""
+    """Smallest step of text, in levels."""
     text_steadiness: float = 5.0
-    """... so steady ..."""
+    """Smallest ratio of this step to its mean temporal deviation."""
     text_length: float = 0.02
-    """... over at least this share of the picture's width, and a third of it in height."""
+    """Smallest extent of text as a share of the longer side of the band; a third of it in the other
+    direction.
+    """
 
     def __post_init__(self) -> None:
         share, count, levels = NumberIn(0.001, 0.5), IntegerIn(1, 10_000), NumberIn(0.1, 255.0)
@@ -69,28 +75,32 @@ class StripSettings:
 
 
 class StripDetector:
-    """Follows a stream, one call a frame; keeps the mean gradient near each border."""
+    """Overlay detector of a stream, called for each frame. It keeps mean gradients near each
+    border.
+    """
 
     def __init__(self, settings: StripSettings | None = None) -> None:
         self.settings = settings or StripSettings()
         self.mask: NDArray[np.uint8] | None = None
-        """uint8 [H, W]: 0 on strips and text; None without any. The same array until it changes; not to be written to."""
+        """Mask uint8 [H, W], 0 on strips and text; None without any. Read-only, and the same array
+        until it changes.
+        """
         self._shape: tuple[int, ...] = ()
         self._bands: list[_Band] = []
         self._small: tuple[int, int] = (0, 0)
-        """Height and width of the picture that is looked at: every `_step`-th pixel."""
+        """Height and width of the subsampled picture."""
         self._step = 1
         self._frames = 0
         self._before: NDArray[np.bool_] | None = None
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """`mask` after this frame, RGB uint8 [H, W, 3], which must be a usable one."""
+        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask`."""
         if image.shape != self._shape:
             self._start(image.shape)
         if self._bands:
             some = image[:: self._step, :: self._step]
             turn, slice_of = divmod(self._frames, self.settings.every)
-            # A border at a time, so that no frame takes much longer than another.
+            # One border per frame, to distribute the cost evenly.
             for band in self._bands[slice_of :: self.settings.every]:
                 band.add(some, self.settings)
             if slice_of == self.settings.every - 1 and (turn + 1) % self.settings.first_after == 0:
@@ -112,7 +122,7 @@ class StripDetector:
         drawn = np.zeros(self._small, bool)
         for band in self._bands:
             band.mark(drawn, self.settings)
-        # Twice in a row, so that tissue that rested for a while is not taken for a strip.
+        # Require two decisions in a row, so that resting tissue is not taken for a strip.
         before, self._before = self._before, drawn
         found = (
             drawn if before is None else drawn & cv2.dilate(before.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
@@ -128,21 +138,21 @@ class StripDetector:
 
 
 class _Band:
-    """The part of the picture near one border, turned so that the border is its last row."""
+    """Part of the picture near one border, rotated so that the border is its last row."""
 
     def __init__(self, turns: int, depth_px: int) -> None:
         self._turns, self._depth_px = turns, depth_px
         self._mean: NDArray[np.float32] | None = None
-        """Mean gradient over time, [2, depth, length]: across the border and along it."""
+        """Temporal mean gradient [2, depth, length], across and along the border."""
         self._deviation: NDArray[np.float32] = np.zeros(0, np.float32)
         self._count = 0
 
     def _of(self, plane: NDArray) -> NDArray:
-        """A view of the band in a picture."""
+        """Return a view of the band in a picture."""
         return np.rot90(plane, self._turns)[-self._depth_px :]
 
     def add(self, image: NDArray[np.uint8], settings: StripSettings) -> None:
-        """Take a frame into the means."""
+        """Add a frame to the means."""
         grey = luma(np.ascontiguousarray(self._of(image))).astype(np.float32)
         gradient = np.zeros((2, *grey.shape), np.float32)
         gradient[0, 1:] = grey[1:] - grey[:-1]
@@ -157,7 +167,7 @@ class _Band:
         self._deviation += share * (np.abs(difference) - self._deviation)
 
     def mark(self, drawn: NDArray[np.bool_], settings: StripSettings) -> None:
-        """Set what is drawn near this border in a picture's plane [H, W]."""
+        """Mark drawn pixels near this border in a plane [H, W]."""
         if self._mean is None:
             return
         strength = np.abs(self._mean)
@@ -170,7 +180,7 @@ class _Band:
         edges = (strength >= settings.edge_levels) & (steadiness >= settings.edge_steadiness)
         depth, length = edges.shape
         least = round(settings.edge_share * length)
-        # An edge that is tilted by a pixel, or broken by letters, is one edge.
+        # Join an edge that is tilted by a pixel or interrupted by letters.
         joined = cv2.morphologyEx(
             cv2.dilate(edges.astype(np.uint8), np.ones((3, 1), np.uint8)), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8)
         )
@@ -178,7 +188,7 @@ class _Band:
         seen = runs.any(axis=0)
         first = np.where(seen, runs.argmax(axis=0), depth)
         if seen.mean() >= settings.whole_share:
-            # The rest of its edge cannot be told from what is behind it.
+            # The rest of its edge is indistinguishable from the background.
             first = np.where(seen, first, int(np.median(first[seen])))
         return np.arange(depth)[:, None] >= first
 

@@ -1,4 +1,4 @@
-"""Regions of a picture that are grey beside its tissue, and which of them are tools."""
+"""Classification of grey regions in a picture as tools."""
 
 from __future__ import annotations
 
@@ -14,56 +14,60 @@ Plane = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 SMALLEST_REGION = 0.003
-"""Share of the field of view; what is smaller is glare or noise."""
+"""Smallest area of a region, as a share of the field of view; smaller ones are glare or noise."""
 SMALLEST_INNER_REGION = 0.01
-"""Of a region that does not reach the border."""
+"""Smallest area of a region that does not reach the border."""
 MOST_GLARE = 0.3
-"""Share of such a region that may be as bright as the brightest pixels: highlights lie inside of the view."""
+"""Share of such a region that may be as bright as the brightest pixels, as highlights are."""
 SHARP_EDGE = 0.36
-"""How much redder it must become across a region's outline, within three pixels to either side. Pale tissue and glare fade slowly."""
+"""Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare
+change gradually.
+"""
 CORE = 0.35
-"""Share of a region that must be clearly below the threshold, by …"""
+"""Share of a region that must be below the threshold by at least `CLEARLY_BELOW`."""
 CLEARLY_BELOW = 0.08
-"""… this much."""
+"""Distance below the threshold that counts as clearly grey."""
 KNOWN = 0.5
-"""A region so much of which was tool in the frame before is a tool with less evidence …"""
+"""Share of a region that was tool in the previous frame, from which thresholds are reduced."""
 KNOWN_DISCOUNT = 0.75
-"""… this share of what a new one needs."""
+"""Factor of the thresholds for such a region."""
 DARKEST = 0.15
-"""Of the mean brightness: what is darker has no colour."""
+"""Share of the mean brightness below which colour is ignored."""
 EDGE_AT = 0.6
-"""Where a tool's edge lies between its own redness and that of what is around it. Beyond the middle: rather tissue lost than tool kept."""
+"""Position of a tool's edge between its own redness and that of the surroundings. Above 0.5 it
+removes more tissue rather than keep parts of a tool.
+"""
 GROWTH_PX = 4
 MARGIN_PX = 1
-"""At working size, so four pixels of a picture that is 640 wide."""
+"""Dilation of tools at working size, four pixels of a 640-pixel-wide picture."""
 
 
 @dataclass(frozen=True)
 class Regions:
-    """What is known about a picture's pixels; planes [h, w]."""
+    """Planes [h, w] of a picture for the classification."""
 
     redness: Plane
     threshold: float
-    """Below it a pixel is grey."""
+    """Redness below which a pixel is grey."""
     brightness: Bytes
     inside: Bytes
-    """The field of view: 1 inside, 0 outside."""
+    """Field of view: 1 inside, 0 outside."""
     levels: NDArray[np.float64]
-    """How many pixels inside have each brightness, [256]."""
+    """Histogram of brightness inside the field of view, [256]."""
     previous: Bytes | None
-    """The frame before's tools: 1, 0 elsewhere."""
+    """Tools of the previous frame: 1, 0 elsewhere."""
     sharp_edge: float = SHARP_EDGE
-    """What a tool's outline must have."""
+    """Smallest change of redness across a tool's outline."""
 
     @property
     def whole(self) -> bool:
-        """Whether the field of view is all of the picture."""
+        """True if the field of view covers the whole picture."""
         return bool(self.levels.sum() == self.inside.size)
 
 
 @cache
 def neighbourhood(size_px: int) -> Bytes:
-    """A square of ones, for morphology."""
+    """Return a square structuring element of ones."""
     return np.ones((size_px, size_px), np.uint8)
 
 
@@ -71,12 +75,12 @@ CROSS: Bytes = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 
 
 def mean_level(levels: NDArray[np.float64]) -> float:
-    """The mean of the brightness that is counted there; 0 of nothing."""
+    """Return the mean of a brightness histogram; 0 if it is empty."""
     return float(levels @ np.arange(256)) / max(1.0, float(levels.sum()))
 
 
 def tool_regions(view: Regions) -> Bytes:
-    """1 on the pixels of those connected grey regions that are tools, 0 elsewhere."""
+    """Return a mask with 1 on connected grey regions that are tools."""
     area_inside = float(view.levels.sum())
     _, bright = cv2.threshold(view.brightness, int(DARKEST * mean_level(view.levels)), 1, cv2.THRESH_BINARY)
     grey = np.asarray(cv2.bitwise_and(_less(view.redness, view.threshold), bright, dst=bright), np.uint8)
@@ -106,13 +110,15 @@ def tool_regions(view: Regions) -> Bytes:
 
 
 def whole_tools(view: Regions, found: Bytes) -> Bytes:
-    """Tools with the edges that reflect the tissue around them, closed, and with a margin; 1 on tools in and out."""
+    """Return the tools extended by edges that reflect surrounding tissue, closed, and dilated by a
+    margin; 1 on tools.
+    """
     if not cv2.countNonZero(found):
         return found
     own = cv2.mean(view.redness, found)[0]
     seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
     around = cv2.dilate(seen, neighbourhood(9), dst=np.empty_like(seen))
-    # Nearer to the tool's own redness than to that around it.
+    # Nearer to the tool's own redness than to that of the surroundings.
     like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness, dst=around), (1 - EDGE_AT) * own)
     if not view.whole:
         like_tool &= view.inside
@@ -125,13 +131,14 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
 
 
 def _less(plane: NDArray[Any], value: float) -> Bytes:
-    """1 where a plane is below a value."""
+    """Return 1 where a plane is below a value."""
     return (plane < np.float32(value)).view(np.uint8)
 
 
 def _evidence(view: Regions) -> Bytes:
-    """[h, w, 4], 1 where a pixel was a tool before, is clearly grey, is as bright as the brightest ones, and is next to the end of the picture or of
-    the field of view."""
+    """Return flags [h, w, 4]: tool in the previous frame, clearly grey, as bright as the brightest
+    pixels, and next to the border of the picture or the field of view.
+    """
     core = _less(view.redness, view.threshold - CLEARLY_BELOW)
     _, glare = cv2.threshold(view.brightness, int(_glare(view.levels)), 1, cv2.THRESH_BINARY)
     previous = np.zeros_like(view.inside) if view.previous is None else view.previous
@@ -139,12 +146,14 @@ def _evidence(view: Regions) -> Bytes:
 
 
 def _change(view: Regions) -> Plane:
-    """How much redness differs within three pixels to either side. It counts where nothing of that lies outside of the view."""
+    """Return the range of redness within three pixels. Valid only where that neighbourhood is
+    inside the view.
+    """
     return np.asarray(cv2.morphologyEx(view.redness, cv2.MORPH_GRADIENT, neighbourhood(7)), np.float32)
 
 
 def _outline(view: Regions, grey: Bytes) -> Bytes:
-    """1 on the outlines of grey regions; the border of the view is none."""
+    """Return 1 on the outlines of grey regions, except along the border of the view."""
     outline = np.empty_like(grey)
     cv2.erode(grey, neighbourhood(3), dst=outline, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     cv2.subtract(grey, outline, dst=outline)
@@ -152,12 +161,14 @@ def _outline(view: Regions, grey: Bytes) -> Bytes:
 
 
 def _well_inside(inside: Bytes) -> Bytes:
-    """1 where nothing within three pixels is outside of the field of view; what lies beyond the picture is not."""
+    """Return 1 where all pixels within a distance of three are in the field of view; beyond the
+    picture counts as inside.
+    """
     return np.asarray(cv2.erode(inside, neighbourhood(7)), np.uint8)
 
 
 def _border(view: Regions) -> Bytes:
-    """1 on pixels next to the end of the picture or of the field of view."""
+    """Return 1 next to the border of the picture or of the field of view."""
     if view.whole:
         border = np.zeros_like(view.inside)
     else:
@@ -168,5 +179,5 @@ def _border(view: Regions) -> Bytes:
 
 
 def _glare(levels: NDArray[np.float64]) -> float:
-    """From here on a pixel is as bright as the brightest ones: a highlight, or overexposed."""
+    """Return the brightness from which a pixel counts as a highlight or overexposed."""
     return 0.9 * float(np.searchsorted(np.cumsum(levels), 0.995 * levels.sum()))

@@ -1,9 +1,10 @@
-"""Which pixels are tools, found by colour, edges and consistency in time: for video that comes without masks.
+"""Tool segmentation by colour, edges and temporal consistency, for video without masks.
 
-Tissue under white light is red; steel, plastic and cloth are closer to grey. How red tissue is, and which tint grey has, differs from scope
-to scope, so nothing is compared with a fixed colour: the threshold is the valley between two peaks of the stream's own distribution of
-redness. Pale tissue, glare and shadow are grey too; what tells a tool from them is that its outline is sharp, that it reaches the border
-of the view or is large, and that most of it is not overexposed.
+Tissue under white light is red, while steel, plastic and cloth are greyer. The redness of tissue
+and the tint of grey vary between scopes, so no fixed colour is used. The threshold is the valley
+between two peaks of the stream's own redness distribution. Pale tissue, glare and shadow are grey
+as well. A tool is distinguished from them by a sharp outline, by reaching the border or being
+large, and by not being mostly overexposed.
 """
 
 from __future__ import annotations
@@ -29,31 +30,37 @@ from gsplat_core.endoscope.tool_regions import (
 from gsplat_core.errors import InvalidInput
 
 LONG_SIDE_PX = 160
-"""The picture is analysed at this size."""
+"""Longer side of the analysed picture, in pixels."""
 SMALLEST_PX = 24
-"""A picture with a shorter side than this is all tissue: nothing can be told from so few pixels."""
+"""Shortest side of a picture that is analysed, in pixels; smaller ones count as all tissue."""
 RED_SCENE = 0.8
-"""Redness that three quarters of a scene's pixels stay under; paler scenes (smoke, fat, a phantom) are stretched to it …"""
+"""Third quartile of redness to which paler scenes (smoke, fat, a phantom) are stretched."""
 PALEST_SCENE = 0.2
-"""… from this value on."""
+"""Third quartile of redness below which scenes are not stretched further."""
 BINS, LOWEST, HIGHEST = 100, -0.3, 0.7
-"""Of the distribution of redness; values beyond count into its first and last bin."""
+"""Bins of the redness distribution; values beyond count in the first and last bin."""
 MEMORY = 0.9
-"""What of the distribution stays from one frame to the next: it follows the stream within about ten frames."""
+"""Share of the distribution kept from one frame to the next; it adapts within about ten frames."""
 FINE_BINS, FINE_REACH = 4500, 4.5
-"""A frame's redness is counted in so many bins from minus to plus this, more than bytes can have; everything else follows from the counts."""
+"""Number and range (±) of fine bins of a frame's redness, more than bytes can resolve."""
 OTHER_SCENE = 0.7
-"""A frame whose distribution differs by this much (0..2, sum of absolute differences) is of another scene: everything starts again."""
+"""Difference of a frame's distribution (0..2, sum of absolute differences) from which another scene
+starts.
+"""
 EXPECTED_VALLEY, VALLEY_SPREAD, HIGHEST_VALLEY = 0.15, 0.3, 0.33
-"""Where the threshold is looked for: with correct white balance grey lies at 0 and pale tissue at 0.3."""
+"""Mean and standard deviation of the expected threshold, and its upper bound. With correct white
+balance grey is at 0 and pale tissue at 0.3.
+"""
 NO_VALLEY, SHARPER_EDGE = 0.25, 0.8
-"""The threshold where the distribution has no valley, pale tissue included; a tool's outline must then be sharper than otherwise."""
+"""Threshold without a valley, which includes pale tissue, and the sharper outline then required of
+tools.
+"""
 CLEAR_VALLEY = 1.15
-"""How much lower than both its peaks a valley must be."""
+"""Smallest ratio of both peaks to a valley."""
 SMALLEST_SHARE = 0.003
-"""Share of the pixels that must lie below the threshold."""
+"""Smallest share of pixels below the threshold."""
 HELD_FRAMES = 3
-"""For how long tools whose evidence is gone from one frame to the next (glare, blur) are kept."""
+"""Number of frames for which tools that disappear suddenly (glare, blur) are kept."""
 
 BIN_EDGES = np.linspace(LOWEST, HIGHEST, BINS + 1)
 BIN_CENTRES = 0.5 * (BIN_EDGES[1:] + BIN_EDGES[:-1])
@@ -61,36 +68,37 @@ FINE_EDGES = np.linspace(-FINE_REACH, FINE_REACH, FINE_BINS + 1)
 EXPECTATION = np.exp(-0.5 * ((BIN_CENTRES - EXPECTED_VALLEY) / VALLEY_SPREAD) ** 2)
 LEVELS = np.arange(256, dtype=np.float32)
 RED_OVER_OTHERS = np.array([[1, -0.25, -0.25, -0.5]], np.float32)
-"""What the logarithms of red, green, blue and the smaller one of green and blue count in the redness."""
+"""Weights of log red, green, blue and the smaller of green and blue in the redness."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A frame at working size."""
+    """Frame at working size."""
 
     redness: Plane
     """Log of red over the other two channels, [h, w]."""
     brightness: Bytes
-    """Largest channel."""
+    """Largest channel, [h, w]."""
     inside: Bytes
-    """The field of view: 1 inside, 0 outside."""
+    """Field of view: 1 inside, 0 outside."""
     levels: NDArray[np.float64]
-    """How many pixels inside have each brightness, [256]."""
+    """Histogram of brightness inside the field of view, [256]."""
 
 
 class ToolFinder:
-    """Finds tools in the frames of one stream, in order. Deterministic; what it remembers has a fixed size.
+    """Tool segmentation of one stream, called for each frame in order. Deterministic, with constant
+    memory.
 
-    The redness of a pixel is its log-opponent chromaticity (Berens and Finlayson, "Log-opponent chromaticity coding of colour space",
-    ICPR 2000): brightness cancels, and another white balance adds a constant. The threshold is found by the mode method (Prewitt and
-    Mendelsohn, "The analysis of cell images", 1966).
+    Redness is log-opponent chromaticity (Berens and Finlayson, "Log-opponent chromaticity coding of
+    colour space", ICPR 2000): brightness cancels, and white balance adds a constant. The threshold
+    is found by the mode method (Prewitt and Mendelsohn, "The analysis of cell images", 1966).
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream: the next frame is the first one."""
+        """Reset for another stream."""
         self._histogram: NDArray[np.float64] | None = None
         self._stretch = 1.0
         self._previous: Bytes | None = None
@@ -98,9 +106,11 @@ class ToolFinder:
         self._held = 0
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The mask of the stream's next picture: uint8 [H, W], 1 = tissue, 0 = tool.
+        """Segment the stream's next picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue,
+        0 = tool.
 
-        image: RGB uint8 [H, W, 3]. Raises InvalidInput for anything else.
+        Raises:
+            InvalidInput: for any other array.
         """
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
@@ -111,14 +121,14 @@ class ToolFinder:
         if self._previous is not None and self._previous.shape != view.redness.shape:
             self.reset()
         tools = self._find(view)
-        # Between the pixels of the working size the outline runs straight.
+        # Outlines are interpolated linearly between pixels of the working size.
         tissue = np.empty((height, width), np.uint8)
         cv2.resize(tools, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
         cv2.threshold(tissue, 0, 1, cv2.THRESH_BINARY_INV, dst=tissue)
         return tissue
 
     def _find(self, view: View) -> Bytes:
-        """1 on tools, at working size."""
+        """Return 1 on tools, at working size."""
         least_lit = int(0.25 * mean_level(view.levels))
         if view.levels[least_lit + 1 :].sum() < SMALLEST_SHARE * view.redness.size:
             self.reset()
@@ -138,7 +148,9 @@ class ToolFinder:
         return tools
 
     def _stretched(self, redness: Plane, lit: Bytes) -> Plane:
-        """Redness with the scene's contrast taken out, after the running distribution has taken in this frame's."""
+        """Update the running distribution with a frame and return its redness, normalised by the
+        scene's contrast.
+        """
         counts = cv2.calcHist([redness], [0], lit, [FINE_BINS], [-FINE_REACH, FINE_REACH])
         below = np.append(0.0, np.cumsum(counts, dtype=np.float64))
         reach = float(np.interp(0.75 * below[-1], below, FINE_EDGES))
@@ -155,7 +167,7 @@ class ToolFinder:
 
 
 def view_of(image: NDArray[np.uint8]) -> View:
-    """A picture at working size: RGB uint8 [H, W, 3] in."""
+    """Reduce a picture, RGB uint8 [H, W, 3], to working size."""
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -164,9 +176,10 @@ def view_of(image: NDArray[np.uint8]) -> View:
     cv2.max(cv2.max(red, green, dst=brightness), blue, dst=brightness)
     inside = field_of_view(brightness)
     levels = cv2.calcHist([brightness], [0], inside, [256], [0, 256]).ravel().astype(np.float64)
-    # In the dark the ratio of channels is noise, and this term pulls it to 0.
+    # The ratio of channels is noise in dark regions; this offset pulls it to 0.
     floor = max(3.0, 0.06 * mean_level(levels))
-    # Halfway between the mean of the other two channels, which is less noisy, and the smaller one, which keeps yellow apart from grey.
+    # Halfway between the mean of the other channels, which is less noisy, and the smaller one,
+    # which separates yellow from grey.
     values = cv2.merge([red, green, blue, cv2.min(green, blue, dst=other)])
     logs = cv2.LUT(values, np.log(LEVELS + np.float32(floor)))
     redness = np.empty(red.shape, np.float32)
@@ -175,25 +188,30 @@ def view_of(image: NDArray[np.uint8]) -> View:
 
 
 def field_of_view(brightness: Bytes) -> Bytes:
-    """1 on what is not black and connected to the border of the picture, 0 elsewhere; brightness: uint8 [h, w]."""
+    """Return 1 except on black pixels connected to the border of the picture. `brightness` is uint8
+    [h, w].
+    """
     darkest = math.ceil(min(24.0, 0.15 * cv2.minMaxLoc(brightness)[1])) - 1
     dark = np.empty_like(brightness)
     cv2.threshold(brightness, darkest, 1, cv2.THRESH_BINARY_INV, dst=dark)
     around = cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     cv2.floodFill(around, None, (0, 0), 2)
     inside = cv2.threshold(around[1:-1, 1:-1], 1, 1, cv2.THRESH_BINARY_INV, dst=dark)[1]
-    # Its outermost pixels mix with the black around.
+    # The outermost pixels mix with the black surround.
     cv2.erode(inside, neighbourhood(3), dst=dark, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     return dark
 
 
 def valley(histogram: NDArray[np.float64] | None) -> tuple[float, bool]:
-    """The redness between a grey peak of a distribution and the rest, and True; NO_VALLEY and False where there is no clear one."""
+    """Return the redness between a grey peak of a distribution and the rest, and True; NO_VALLEY
+    and False without a clear valley.
+    """
     if histogram is None:
         return NO_VALLEY, False
     density = cv2.GaussianBlur(histogram[None], (21, 1), 2.5, borderType=cv2.BORDER_REPLICATE)[0]
     left, right = np.maximum.accumulate(density), np.maximum.accumulate(density[::-1])[::-1]
-    # A high peak makes no valley clearer, and the constant is a pixel or two of noise.
+    # Cap the peaks, so that a high peak makes no valley clearer; the constant is a pixel or two of
+    # noise.
     clear = np.minimum(np.minimum(left, right), 0.02) / (density + 4e-4)
     clear[(np.cumsum(histogram) < SMALLEST_SHARE) | (BIN_CENTRES > HIGHEST_VALLEY)] = 0
     best = int(np.argmax(clear * EXPECTATION))
@@ -202,7 +220,9 @@ def valley(histogram: NDArray[np.float64] | None) -> tuple[float, bool]:
 
 
 def _histogram(below: NDArray[np.float64], stretch: float) -> NDArray[np.float64]:
-    """Shares of the stretched redness, [BINS], from how many pixels lie below each of FINE_EDGES before it was stretched."""
+    """Return the normalised histogram of stretched redness, [BINS], from cumulative counts at
+    FINE_EDGES before stretching.
+    """
     at_edges = np.interp(BIN_EDGES / stretch, FINE_EDGES, below)
     at_edges[0], at_edges[-1] = 0, below[-1]
     return np.diff(at_edges) / below[-1]
