@@ -58,8 +58,8 @@ class SequenceSettings:
     torn.
     """
     moving_share: float = 0.9
-    """Share of frames in which a row must change to be used for that; excludes black borders and
-    recorder overlays.
+    """Share of frames in which a row must change to be used in the test for torn pictures; excludes
+    black borders and recorder overlays.
     """
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ MOST_DISAGREEMENT = 0.25
 """Largest accepted median difference of two depth maps, as a share of their median relief."""
 LEAST_SHARED = 0.1
 """Share of the picture that both depth maps must cover."""
-UNCONFIRMED = "two looks at the tissue by parallax do not find the same relief, so that a level plane may be as close"
+UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level plane may be as accurate"
 """Reason given for depth that no second depth map confirms."""
 
 

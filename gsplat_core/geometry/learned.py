@@ -32,7 +32,7 @@ used; vision transformers have patches of 14 pixels.
 """
 SMALLEST_PX = 4
 GRID_PX = 80
-"""Longer side of the grid on which answers are compared, in cells."""
+"""Longer side of the grid on which network outputs are compared, in cells."""
 EVERY_S = 0.3
 """Time from one inference to the next in seconds; the last answer is reused in between unless the
 scope moves.

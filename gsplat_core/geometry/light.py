@@ -43,8 +43,8 @@ REACH = 0.05
 side.
 """
 
-UNSEEN = "too little of the picture is tissue that is lit neither too dark nor too bright to find depth by light"
-FLAT = "brightness does not change more than pigment could explain, so depth by light is no better than a plane"
+UNSEEN = "too little of the picture is well exposed tissue for depth by shading"
+FLAT = "brightness does not change more than pigment could explain, so depth by shading is no better than a plane"
 
 
 class LightDepth:

@@ -29,8 +29,8 @@ REACH = MOST_LOOKS // 2
 def frames_with_light(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], bool]:
     """Replace the shading depth of a recording by one estimated from all frames together.
 
-    The frames are returned unchanged unless shading depth was requested, the scope is static and
-    all frames show the same tissue.
+    The frames are returned unchanged unless shading depth was requested, the scope is static, all
+    frames show the same tissue and the relief is larger than the expected errors.
 
     Args:
         frames: all frames of the recording.

@@ -110,7 +110,7 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     """
     others = chosen_views(reference, candidates)
     if not others:
-        return doubted(size, DepthOrigin.PARALLAX, "the scope stands still")
+        return doubted(size, DepthOrigin.PARALLAX, "the scope does not move")
     found = explained_by_poses(reference, others)
     if isinstance(found, str):
         return doubted(size, DepthOrigin.PARALLAX, found)

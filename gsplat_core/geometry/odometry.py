@@ -129,7 +129,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
     seen = tracks.observations(LEAST_SEEN if count > LEAST_SEEN else 3)
     if len(seen.frame) < LEAST_POINTS * 3:
         raise InvalidInput(
-            f"only {len(seen.frame)} observations of tissue could be followed over {count} frames: the pictures show too little that can be recognised"
+            f"only {len(seen.frame)} observations of tissue could be tracked over {count} frames: the pictures contain too few recognisable points"
         )
     return _Odometry(seen, camera, times_s).run()
 

@@ -94,7 +94,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
         moved = _medians(focal * abs(plane) * np.linalg.norm(c[kept], axis=2), seen[kept])
         shown = _medians(focal * np.linalg.norm(d[kept], axis=2), seen[kept])
         if moved.max() < LEAST_PARALLAX_PX and shown.max() < 2 * LEAST_PARALLAX_PX:
-            return "the poses move and the pictures hardly do: there is no parallax to find depth from"
+            return "the poses move but the pictures hardly do: there is no parallax to estimate depth from"
         inverse = _relief(c[kept], d[kept], seen[kept], focal, max(plane, 1e-12))
         off = _medians(_off_px(c[kept], d[kept], focal, inverse), seen[kept])
         excess = off / np.maximum(MOST_LEFT_PX, MOST_LEFT * moved)
@@ -105,7 +105,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
         if len(kept) < max(1, FEWEST_AGREEING * len(usable)):
             return CONTRADICTED
     if moved.max() < LEAST_PARALLAX_PX:
-        return "there is too little parallax to find depth from"
+        return "there is too little parallax to estimate depth from"
     agree = (seen[kept] & (_off_px(c[kept], d[kept], focal, inverse) < 3 * MOST_LEFT_PX)).any(0)
     own = np.sqrt(np.maximum(off**2 - POSE_ERROR_PX**2, 0)) / np.maximum(moved, LEAST_PARALLAX_PX)
     views = tuple(usable[number] for number in kept)

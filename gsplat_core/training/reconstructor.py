@@ -80,9 +80,8 @@ class Reconstructor:
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
         self._scope_path: ScopePath | None = None
-        self.depth_doubts: Mapping[
-            str, int
-        ] = {}  # reasons why `fit` found no depth, with numbers of frames of a moving camera
+        self.depth_doubts: Mapping[str, int] = {}
+        """Reasons why `fit` found no depth, with numbers of frames of a moving camera."""
 
     _covers_beside = False
     """Create new Gaussians concurrently with training on a GPU."""

@@ -124,7 +124,7 @@ def test_a_scope_that_stands_still_or_only_turns() -> None:
     turned[:2, :2] = [[0.999, -0.0447], [0.0447, 0.999]]
     for other in (FIRST, FIRST.with_pose(turned)):
         found = found_in(frames, [FIRST] + [other] * 5)
-        assert found.doubt == "the scope stands still"
+        assert found.doubt == "the scope does not move"
 
 
 def test_one_pose_that_is_an_outlier_is_left_out() -> None:

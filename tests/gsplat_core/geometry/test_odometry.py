@@ -93,7 +93,7 @@ def test_after_another_scene_nothing_is_placed_by_the_old_points(rigid):
     ("count", "model", "said"),
     [
         (2, "pinhole", "at least 3 frames, got 2"),
-        (8, "pinhole", "too little that can be recognised"),
+        (8, "pinhole", "too few recognisable points"),
         (8, "fisheye", "this one is fisheye"),
     ],
 )

@@ -59,7 +59,7 @@ def test_what_is_long_ago_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> No
     frames, cameras = video(6, SIDEWAYS)
     apart = [frame.with_fields(pts_ns=number * 100_000_000) for number, frame in enumerate(frames)]
     given, doubts, _ = frames_with_parallax(apart, cameras)
-    assert doubts == {"the scope stands still": 6}
+    assert doubts == {"the scope does not move": 6}
     assert all(frame.depth is None for frame in given)
 
 
