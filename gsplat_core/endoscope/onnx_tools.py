@@ -37,7 +37,7 @@ class OnnxToolFinder:
         """
         self._network = OnnxNetwork(path, "tool network", ToolSettings)
         self.settings = self._network.settings
-        self._probability = self._tried_out()
+        self._probability = self._tried()
         self.not_finite = 0
         """Number of pictures with NaN in the output."""
 
@@ -85,7 +85,7 @@ class OnnxToolFinder:
         ahead = planes[chosen].max(axis=0) - planes[~chosen].max(axis=0)
         return np.asarray(ahead - np.float32(np.log(threshold / (1 - threshold))), np.float32)
 
-    def _tried_out(self) -> bool:
+    def _tried(self) -> bool:
         """Try the network on three pictures, check its output shape, and return True if a single
         channel is a probability.
         """

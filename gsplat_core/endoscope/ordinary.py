@@ -69,9 +69,9 @@ class OrdinaryPictures:
         self._before: NDArray[np.uint8] | None = None
         self._shape: tuple[int, ...] = ()
         self._usual = np.zeros(BANDS)
-        self._looked: tuple[NDArray[np.float64], float] | None = None
+        self._reference: tuple[NDArray[np.float64], float] | None = None
         """Reference mean colour and sharpness."""
-        self._looked_ns = 0
+        self._referenced_ns = 0
         self._last_ns: int | None = None
         self._interval_ns = 0.0
 
@@ -84,7 +84,7 @@ class OrdinaryPictures:
         in_time = self._in_time(pts_ns)
         if before is None or self._shape != image.shape:
             self._shape = image.shape
-            return self._look(colour, sharpness, pts_ns)
+            return self._renew_reference(colour, sharpness, pts_ns)
         change = _change_of_bands(small, before)
         usual, settings = self._usual, self.settings
         expected = bool(
@@ -92,20 +92,20 @@ class OrdinaryPictures:
             and (change <= settings.most_change * usual).all()
         )
         self._usual = np.where(usual > 0, usual + USUAL_DECAY * (np.minimum(change, 3 * usual) - usual), change)
-        if not (expected and in_time and self._like_the_looked(colour, sharpness)):
-            return self._look(colour, sharpness, pts_ns)
-        if pts_ns >= self._looked_ns + 1e9 * settings.look_every_s:
-            self._look(colour, sharpness, pts_ns)
+        if not (expected and in_time and self._matches_reference(colour, sharpness)):
+            return self._renew_reference(colour, sharpness, pts_ns)
+        if pts_ns >= self._referenced_ns + 1e9 * settings.look_every_s:
+            self._renew_reference(colour, sharpness, pts_ns)
         return True
 
-    def _look(self, colour: NDArray[np.float64], sharpness: float, pts_ns: int) -> bool:
-        self._looked, self._looked_ns = (colour, sharpness), pts_ns
+    def _renew_reference(self, colour: NDArray[np.float64], sharpness: float, pts_ns: int) -> bool:
+        self._reference, self._referenced_ns = (colour, sharpness), pts_ns
         return False
 
-    def _like_the_looked(self, colour: NDArray[np.float64], sharpness: float) -> bool:
-        if self._looked is None:
+    def _matches_reference(self, colour: NDArray[np.float64], sharpness: float) -> bool:
+        if self._reference is None:
             return False
-        colour_then, sharpness_then = self._looked
+        colour_then, sharpness_then = self._reference
         shifted = float(np.abs(colour - colour_then).max())
         return (
             shifted <= self.settings.brightness_levels

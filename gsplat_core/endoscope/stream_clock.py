@@ -80,7 +80,7 @@ class StreamClock:
             arrived_ns: arrival time in nanoseconds, or None.
         """
         if self._given_ns is None:
-            return self._go_on(pts_ns, arrived_ns, None)
+            return self._accepted(pts_ns, arrived_ns, None)
         step_ns = pts_ns - self._given_ns
         if step_ns < 0:
             self._late = [*self._late, pts_ns] if not self._late or pts_ns > self._late[-1] else [pts_ns]
@@ -96,7 +96,7 @@ class StreamClock:
             finding = GAP
         else:
             self._steps.append(step_ns)
-        return self._go_on(pts_ns, arrived_ns, finding)
+        return self._accepted(pts_ns, arrived_ns, finding)
 
     def _too_far(self, step_ns: int, arrived_ns: int | None) -> bool:
         if arrived_ns is not None and self._arrived_ns is not None:
@@ -111,9 +111,9 @@ class StreamClock:
         if arrived_ns is not None and self._arrived_ns is not None:
             passed_ns = max(passed_ns, arrived_ns - self._arrived_ns)
         self._offset_ns = self._shown_ns + passed_ns - pts_ns
-        return self._go_on(pts_ns, arrived_ns, CLOCK_JUMP)
+        return self._accepted(pts_ns, arrived_ns, CLOCK_JUMP)
 
-    def _go_on(self, pts_ns: int, arrived_ns: int | None, finding: str | None) -> Timing:
+    def _accepted(self, pts_ns: int, arrived_ns: int | None, finding: str | None) -> Timing:
         self._given_ns, self._arrived_ns, self._late = pts_ns, arrived_ns, []
         self._shown_ns = pts_ns + self._offset_ns
         return Timing(self._shown_ns, finding)

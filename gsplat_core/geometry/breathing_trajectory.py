@@ -132,8 +132,8 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
     if not frequencies_hz or start is None:
         return None
     found, frequencies_hz, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
-    told, mistaken = is_told(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
-    if not told:
+    separable, mistaken = is_told(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
+    if not separable:
         return None
     poses = _all_placed(sightings, frames, found, start[1], frequencies_hz)
     error = float(found.off().norm(dim=1).median())

@@ -87,7 +87,7 @@ class StereoDepth:
         shape = frame.image.shape[:2]
         if frame.new_scene is not None or shape != self._size:
             self._forget(shape)
-        why = _unlike_eyes(camera, frame.right_camera)
+        why = _why_not_rectified(camera, frame.right_camera)
         if why is not None:
             return doubted(shape, DepthOrigin.STEREO, why)
         left, right = grey(frame.image), grey(frame.right_image)
@@ -117,7 +117,7 @@ class StereoDepth:
         is unusable, or None.
         """
         look = look_at(left, right, frame.loss_mask)
-        why = look.doubt or _unlike_distances(look, parallel_px, calibrated=frame.right_camera is not None)
+        why = look.doubt or _why_implausible(look, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:
             return why
         self._rows = [*self._rows, look.rows][-KEPT_LOOKS:]
@@ -161,7 +161,7 @@ class StereoDepth:
         aligned = _with_rows_of_left(right, rows, sum(self._span) / 2)
         shrink = _shrink(frame.width_px)
         small = [shrunk(each, shrink) for each in (left, aligned, frame.image)]
-        with self._beside():
+        with self._on_own_stream():
             here, there, guide = _tensors_of(small, self._device)
             found = enlarged(smoothed(find_disparity(here, there, span), guide), frame.width_px, frame.height_px)
             shift = found.px - parallel_px
@@ -172,7 +172,7 @@ class StereoDepth:
             planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
         return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is scarce
 
-    def _beside(self) -> AbstractContextManager[object]:
+    def _on_own_stream(self) -> AbstractContextManager[object]:
         return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
 
     def _as_depth(self, planes: NDArray[np.float32], frame: Frame, camera: Camera, parallel_px: float) -> DepthMap:
@@ -241,7 +241,7 @@ def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _unlike_eyes(left: Camera, right: Camera | None) -> str | None:
+def _why_not_rectified(left: Camera, right: Camera | None) -> str | None:
     """Return the reason why two cameras are not a rectified pair, as a sentence, or None."""
     if right is None:
         return None
@@ -257,7 +257,7 @@ def _unlike_eyes(left: Camera, right: Camera | None) -> str | None:
     return None
 
 
-def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -> str | None:
+def _why_implausible(look: PairLook, parallel_px: float, *, calibrated: bool) -> str | None:
     """Return the reason why the disparities are impossible, as a sentence, or None."""
     shift = look.disparities - parallel_px
     middle = float(np.median(shift))

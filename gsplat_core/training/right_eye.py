@@ -53,10 +53,10 @@ class BothEyes:
     def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:
         self._with_right, self._device = eyes == "both", device
         self._highlights = HighlightFinder()
-        self._beside: ThreadPoolExecutor | None = None
+        self._preparer: ThreadPoolExecutor | None = None
         """Thread that prepares right pictures in order, for GPU training only."""
         if self._with_right and torch.device(device).type == "cuda":
-            self._beside = ThreadPoolExecutor(1, thread_name_prefix="right eye")
+            self._preparer = ThreadPoolExecutor(1, thread_name_prefix="right eye")
         self.trained: Eyes = "left"
         """Eyes with trained pictures so far."""
         self.forget()
@@ -93,9 +93,9 @@ class BothEyes:
         starts at once in another thread.
         """
         colours = self._colours  # of this stream, even if another one starts meanwhile
-        if self._beside is None:
+        if self._preparer is None:
             return lambda: self._prepare(frame, camera, right, colours)
-        return self._beside.submit(self._prepare, frame, camera, right, colours).result
+        return self._preparer.submit(self._prepare, frame, camera, right, colours).result
 
     def _prepare(self, frame: Frame, camera: Camera, right: Camera, colours: EyeColours) -> PreparedPicture:
         image = scene_colours(colours.corrected(frame), frame.exposure)
