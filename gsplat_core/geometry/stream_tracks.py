@@ -99,8 +99,14 @@ def found_again(
 ) -> tuple[Points, NDArray[np.bool_]]:
     """Track points to another picture.
 
+    Args:
+        before: picture that contains the points.
+        after: picture to search.
+        points: positions in `before` [N, 2].
+        guess: start positions in `after` [N, 2].
+
     Returns:
-        Positions [N, 2], and which of them are reliable [N].
+        Positions in `after` [N, 2], and which of them are reliable [N].
     """
     moved, misses_px = followed(before.grey, after.grey, points, guess, window_px=PATCH_PX, levels=LEVELS)
     return moved, (misses_px < RETURN_PX) & after.shows(moved)

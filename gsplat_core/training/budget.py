@@ -81,8 +81,13 @@ class Budget:
         at_most: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> Budget:
-        """Return a budget of as many steps as end before `deadline_s` on `clock`, within `at_least`
-        and `at_most`.
+        """Return a budget of as many steps as end before a deadline.
+
+        Args:
+            deadline_s: time on `clock` by which the last step must be finished, in seconds.
+            at_least: steps that are made even if they miss the deadline.
+            at_most: largest number of steps, or None.
+            clock: monotonic clock in seconds.
         """
         return Budget(None, deadline_s, at_least, at_most, clock)
 

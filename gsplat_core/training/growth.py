@@ -48,7 +48,8 @@ class Uncovered:
         """Create Gaussians for the uncovered tissue on the observation's device, with the density
         of the first frame.
 
-        Their depth is the frame's own or that of the nearest covered pixel. Waits for the copies.
+        Their depth is the frame's own or extrapolated from the covered pixels around. Waits for the
+        copies.
 
         Args:
             frame: frame that provides colours and depth.
@@ -100,10 +101,18 @@ def gaussians_beside(
     config: ReconstructorConfig,
     most: int,
 ) -> Gaussians | None:
-    """Create one Gaussian at each of the pixels `wanted` [M, 2], or at a subset of at most `most`.
+    """Create one Gaussian at each of the given pixels, or at an even subset of them.
 
-    Colours come from the frame, depths from the nearest known depth in `depth_mm` [H, W] (0 =
-    unknown).
+    Args:
+        wanted: pixel positions [M, 2].
+        frame: frame that provides colours.
+        depth_mm: depth [H, W], 0 = unknown. Unknown pixels get extrapolated depth.
+        observation: the same view as tensors; determines camera and device.
+        config: settings.
+        most: largest number of Gaussians.
+
+    Returns:
+        The Gaussians, or None if there are none to create.
     """
     if len(wanted) == 0 or most <= 0:
         return None

@@ -39,11 +39,18 @@ MAX_ANGLE_RAD = math.radians(85)
 def gaussians_from_frame(
     frame: Frame, camera: Camera, count: int, *, sh_degree: int, default_depth_mm: float, seed: int = 0
 ) -> Gaussians:
-    """Create about `count` Gaussians that cover the whole frame including tools.
+    """Create Gaussians that cover the whole frame including tools.
 
     Pixels under tools get in-painted colours (Telea 2004) and extrapolated depth, so that tissue
-    uncovered later has Gaussians. Without depth, Gaussians are placed on the plane z =
-    `default_depth_mm`.
+    uncovered later has Gaussians.
+
+    Args:
+        frame: first frame of a scene.
+        camera: camera of the frame, with its pose.
+        count: approximate number of Gaussians.
+        sh_degree: degree of the spherical harmonics.
+        default_depth_mm: distance of the plane used for a frame without depth, in millimetres.
+        seed: seed of the grid's jitter.
     """
     height, width = frame.image.shape[:2]
     pixels, spacing_px = jittered_grid(width, height, count, seed)

@@ -53,8 +53,17 @@ def _points_of(pixels: NDArray[np.float64], camera: Camera, distance: float) -> 
 def entered(
     pixels: NDArray[np.float64], camera: Camera, before: Camera, distance: float, edge_px: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Return which pixels [M, 2] show content at a distance that was outside the picture of the
-    camera `before`, or within `edge_px` of its edge.
+    """Find pixels whose content was not visible to an earlier camera.
+
+    Args:
+        pixels: positions [M, 2].
+        camera: present camera.
+        before: earlier camera.
+        distance: assumed distance of the content.
+        edge_px: margin at the edge of the earlier picture that counts as not visible.
+
+    Returns:
+        bool [M].
     """
     return ~pixels_of(_points_of(pixels, camera, distance), before, -edge_px)[1].numpy()
 
@@ -116,6 +125,14 @@ def fill_new_tissue(
 
     Otherwise training would stretch neighbouring Gaussians over it, which would follow the
     picture's edge as the camera moves.
+
+    Args:
+        step: training step of the scene.
+        frame: newest frame.
+        observation: the same frame as tensors.
+        before: camera at the last search for new tissue.
+        config: settings.
+        out_of_view: archive of the scene, or None.
     """
     camera = observation.camera
     spacing = grid_spacing(camera.width_px * camera.height_px, config.gaussians)

@@ -225,8 +225,12 @@ class ScoredMean:
 def frame_quality(
     seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
 ) -> FrameQuality:
-    """Compute all measures of one frame. Arguments as in `psnr_tissue_db`; without `similarity` the
-    slow SSIM is NaN.
+    """Compute all measures of one frame, comparing its images once.
+
+    Args:
+        seq: frame number.
+        image, target, mask: as in `psnr_tissue_db`.
+        similarity: compute SSIM as well, which takes longest; otherwise it is NaN.
     """
     pair = _masked_pair(image, target, mask)
     measured = similarity and pair.tissue_pixels

@@ -16,10 +16,18 @@ DEPTH_STEPS = 2**24
 def around_cells(
     now: Gaussians, camera: Camera, spacing: float, shape: tuple[int, int], reach: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """Return the number and mean depth (0 for none) of Gaussian centres around each cell, float32
-    [rows, columns] each.
+    """Count Gaussian centres around each cell of a picture grid and average their depth.
 
-    The neighbourhood includes cells up to `reach` away, also just beyond the picture's edge.
+    Args:
+        now: the scene at the camera's time.
+        camera: camera of the picture.
+        spacing: side of a cell in pixels.
+        shape: number of rows and columns of cells.
+        reach: number of neighbouring cells on each side that are included, also beyond the
+            picture's edge.
+
+    Returns:
+        Number of centres and their mean depth (0 for none), float32 [rows, columns] each.
     """
     rows, columns = (cells + 2 * reach for cells in shape)
     pixels, near = pixels_of(now.means, camera, margin_px=reach * spacing)

@@ -84,10 +84,16 @@ class OutOfView:
         return bool(self.archive.in_view(camera).any())
 
     def make_room(self, step: TrainingStep, observation: Observation, wanted: int, unseen_s: float) -> None:
-        """Archive Gaussians until `wanted` rows are free, as far as possible.
+        """Archive Gaussians until enough rows are free, as far as possible.
 
-        Only Gaussians outside the picture that were not seen for `unseen_s` seconds are archived.
-        Those hidden by a tool stay, since they can be uncovered at any moment.
+        Only Gaussians outside the picture are archived. Those hidden by a tool stay, since they
+        can be uncovered at any moment.
+
+        Args:
+            step: training step of the scene.
+            observation: newest observation.
+            wanted: number of rows to free.
+            unseen_s: seconds for which a Gaussian must have been out of view.
         """
         short = wanted - (self._capacity - step.gaussians.count)
         if short <= 0:

@@ -59,8 +59,13 @@ def loss_and_gradients(
     """Compute the loss against an observation and its gradients.
 
     The result equals `render`, `image_loss` and `backward()` without the cost of an autograd graph.
-    With `colour_relaxation` above 0 the same passes also compute the colour correction
-    (`colour_correction`).
+
+    Args:
+        gaussians: scene at the observation's time.
+        observation: target.
+        weights: weights of the loss terms.
+        colour_relaxation: above 0, the same passes also compute the colour correction
+            (`colour_correction`).
     """
     camera = observation.camera
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
