@@ -121,7 +121,7 @@ class ReconstructorConfig:
     default_depth_mm: float = 60.0
     """Distance of the plane on which a scene without depth starts, in millimetres."""
     eyes: Eyes = "left"
-    """Train on the right eye's pictures as well, for frames with a calibrated right eye."""
+    """Eyes trained on: `left`, or `both` for frames with a calibrated right eye."""
     motion_prior: str = "bumps"
     """Prediction of motion after the newest frame: a name in `MOTION_PRIORS`."""
     motion_detail: Detail = "full"
