@@ -173,7 +173,7 @@ def wrong_camera(kind):
 @pytest.mark.parametrize(
     ("kind", "sentence"),
     [
-        ("metres", "check the distance between the eyes and its unit"),
+        ("metres", "check the baseline and its unit"),
         ("turned", "are not a rectified pair"),
         ("focal", "are not a rectified pair"),
         ("swapped", "the eyes are swapped in the calibration"),
