@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsplat_core.endoscope import cuts
 from gsplat_core.endoscope.cuts import CutDetector, CutSettings, FrameRate
 from gsplat_core.errors import InvalidSetting
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
@@ -144,3 +146,55 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(InvalidSetting, match="same_moved"):
         CutSettings(same_moved=1.2)
+
+
+@pytest.mark.parametrize(
+    ("usual", "now", "is_other"), [(10, 14, False), (10, 15, True), (14, 10, False), (14, 9, True), (10, 10, False)]
+)
+def test_a_rate_is_another_one_beyond_a_factor_of_1_4(usual, now, is_other):
+    rate, seq, at = FrameRate(1.4, 3), 0, 0
+    said = [rate.changed(seq, at)]
+    for interval in [usual] * 3 + [now] * 3:
+        seq, at = seq + 1, at + interval
+        said.append(rate.changed(seq, at))
+    assert said == [False] * 6 + [is_other]
+
+
+def likeness_of(monkeypatch, difference, structure=0.0, moved=0.0, colours=0.0):
+    monkeypatch.setattr(cuts, "difference", lambda a, b: difference)
+    found = SimpleNamespace(difference=difference, structure=structure, moved=moved, colours=colours)
+    monkeypatch.setattr(cuts, "likeness", lambda a, b: found)
+
+
+@pytest.mark.parametrize(
+    ("found", "gap", "same"),
+    [
+        ({"difference": 0.15}, False, True), ({"difference": 0.151}, False, False),
+        ({"difference": 1, "structure": 0.72}, False, True), ({"difference": 1, "structure": 0.719}, False, False),
+        ({"difference": 1, "moved": 0.83}, False, True), ({"difference": 1, "moved": 0.829}, False, False),
+        ({"difference": 0.2, "colours": 0.65}, True, True), ({"difference": 0.2, "colours": 0.65}, False, False),
+        ({"difference": 0.201, "colours": 0.65}, True, False), ({"difference": 0.2, "colours": 0.649}, True, False),
+    ],
+)  # fmt: skip
+def test_limits_of_the_same_scene(monkeypatch, found, gap, same):
+    likeness_of(monkeypatch, **found)
+    assert CutDetector()._same(None, None, gap) == same
+
+
+def test_six_frames_like_no_other_are_in_doubt_and_the_seventh_is_a_cut(monkeypatch):
+    likeness_of(monkeypatch, 1.0)
+    detector, image = CutDetector(), np.zeros((32, 40, 3), np.uint8)
+    said = [detector.observe(image, k, k * FRAME_NS) for k in range(9)]
+    assert [each.in_doubt for each in said] == [False, *[True] * 6, False, True]
+    assert said[7].new_scene == "cut"
+
+
+def test_every_fifteenth_frame_is_a_view_of_its_scene_and_four_are_kept(monkeypatch):
+    likeness_of(monkeypatch, 0.0)
+    detector, image = CutDetector(), np.zeros((32, 40, 3), np.uint8)
+    counts = []
+    for k in range(90):
+        detector.observe(image, k, k * FRAME_NS)
+        counts.append(len(detector._views))
+    assert [counts[k] for k in (13, 14, 28, 29, 59, 89)] == [0, 1, 1, 2, 4, 4]
+    assert (detector._views.maxlen, detector._earlier.maxlen, detector._rate._recent.maxlen) == (4, 8, 15)

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.sharpness import SharpnessGate, SharpnessSettings, appearance
+from gsplat_core.endoscope import sharpness
+from gsplat_core.endoscope.sharpness import Appearance, SharpnessGate, SharpnessSettings, appearance
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording
 from tests.gsplat_core.endoscope.clips import PLACES, brightened, clip, texture
@@ -212,3 +213,61 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(InvalidSetting, match="blurred_below"):
         SharpnessSettings(blurred_below=0.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "sharpness", "clear", "said"),
+    [
+        (None, 0.751, (1, 0.5, 20), None), (None, 0.75, (1, 0.5, 20), None), (None, 0.749, (1, 0.5, 20), "blur"),
+        ("blur", 0.819, (1, 0.5, 20), "blur"), ("blur", 0.82, (1, 0.5, 20), None),
+        (None, 1, (0.74, 0.39, 35), "smoke"), (None, 1, (0.75, 0.39, 35), None), (None, 1, (0.74, 0.4, 35), None),
+        (None, 1, (0.74, 0.39, 34.9), None), ("smoke", 1, (0.86, 0.43, 20), "smoke"), ("smoke", 1, (0.87, 0.43, 20), None),
+        ("smoke", 1, (0.5, 0.435, 20), None),
+    ],
+)  # fmt: skip
+def test_limits_of_blur_and_smoke(before, sharpness, clear, said):
+    """Usual are a contrast of 1, a saturation of 0.5 and a haze of 20 levels."""
+    gate = SharpnessGate()
+    gate._clear[:5] = np.array([[0.2, 0.1, 1], [0.9, 0.45, 10], [1, 0.5, 20], [1.5, 0.8, 30], [2, 0.9, 90]])
+    gate._clear_count, gate._fault = 5, before
+    assert gate._judged(sharpness, np.array(clear, float)) == said
+
+
+def gate_of(monkeypatch, seen):
+    """A gate to which every frame looks like what `seen` gives next."""
+    looks = iter(seen)
+    monkeypatch.setattr(sharpness, "appearance", lambda image, kept: next(looks))
+    return SharpnessGate()
+
+
+SHARP = Appearance(0.4, 0.4, 1.0, 0.5, 20.0)
+
+
+def test_a_faulty_frame_keeps_its_fault_for_1_5_seconds_without_a_measure(monkeypatch):
+    blurred = Appearance(0.2, 0.4, 1.0, 0.5, 20.0)
+    gate = gate_of(monkeypatch, [*[SHARP] * 10, blurred, *[None] * 20])
+    said = [gate.fault(np.zeros((2, 2, 3), np.uint8), k * 140_000_000) for k in range(31)]
+    assert said == [None] * 10 + ["blur"] * 11 + [None] * 10
+
+
+def test_the_first_five_frames_pass_and_the_sixth_is_compared(monkeypatch):
+    blurred = Appearance(0.4, 0.2, 1.0, 0.5, 20.0)
+    gate = gate_of(monkeypatch, [*[SHARP] * 4, blurred, blurred])
+    said = [gate.fault(np.zeros((2, 2, 3), np.uint8), k * 30_000_000) for k in range(6)]
+    assert said == [None] * 5 + ["blur"]
+
+
+def test_a_clock_that_stands_still_counts_a_millisecond_and_a_gap_three_tenths_of_a_second(monkeypatch):
+    gate = gate_of(monkeypatch, [SHARP] * 3)
+    for pts_ns in (0, 0, 60_000_000_000):
+        gate.fault(np.zeros((2, 2, 3), np.uint8), pts_ns)
+    assert [each[0] for each in gate._recent] == pytest.approx([1e-3, 1e-3, 0.3])
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(2, 5), (10, 15), (30, 45)])
+def test_usual_sharpness_is_that_of_a_second_and_a_half_and_of_five_frames_at_least(monkeypatch, fps, frames):
+    gate = gate_of(monkeypatch, [SHARP] * 120)
+    for k in range(120):
+        gate.fault(np.zeros((2, 2, 3), np.uint8), round(k * 1e9 / fps))
+    assert len(gate._recent) == pytest.approx(frames, abs=1)
+    assert len(gate._clear) == 300 and gate._clear_count == 120

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsplat_core.geometry import relief_fit
 from gsplat_core.geometry.light_change import Change
 from gsplat_core.geometry.relief import Grid, Places, appearance
 from gsplat_core.geometry.relief_fit import Equations, find_change, find_reliefs
@@ -145,3 +146,93 @@ def test_weak_evidence_leaves_the_relief_small():
     noise = np.random.default_rng(9).normal(0, 1.0, (32, 40))
     found = find_reliefs(GRID, [Shading(noise, ONES, 1.0, NOTHING, NOTHING)], [None]).key
     assert np.std(PLACES.value @ found) < 0.25
+
+
+@pytest.fixture
+def equations(monkeypatch):
+    """What is given to `Equations`, call by call."""
+    given = []
+
+    def record(own, relief, off, weight, prior, away, tell=1.0):
+        given.append(dict(own=own, relief=relief, off=off, weight=weight, prior=prior, away=away, tell=tell))
+        return Equations(own, relief, off, weight, prior, away, tell)
+
+    monkeypatch.setattr(relief_fit, "Equations", record)
+    return given
+
+
+FLAT = np.zeros(len(GRID.half_waves))
+
+
+def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_three_tenths(equations):
+    share = 0.5 * ONES
+    brighter = np.where(np.arange(40) < 20, 0.0, 0.06) * ONES
+    relief_fit.Followed(GRID, Change(brighter, share, np.zeros((32, 40, 2)), 1.0)).equations(FLAT, FLAT)
+    (one,) = equations
+    # An error of three deviations weighs 1 / sqrt(10) of one that is none.
+    np.testing.assert_allclose(one["weight"].reshape(32, 40)[0, [0, 39]], [1250, 1250 / np.sqrt(10)])
+    np.testing.assert_allclose(one["off"].reshape(32, 40)[0, [0, 39]], [0, 0.06], atol=1e-12)
+    np.testing.assert_allclose(one["own"][:, -1], 1)
+    assert one["tell"] == 0.3
+    # 0.03 for the coarsest cosines, a quarter of it at 1.5 half waves.
+    np.testing.assert_allclose(one["prior"][:-1], (0.03 / (1 + (GRID.half_waves / 1.5) ** 2) ** 2) ** -2)
+    assert one["prior"][-1] == 1e-6
+
+
+def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coarse(equations):
+    seen = np.where(np.arange(40) < 20, 0.0, 0.2) * ONES
+    seen[:, 19] = 0.0
+    brightness = relief_fit.Brightness(GRID, [Shading(seen, ONES, 0.1, NOTHING, NOTHING)] * 2, [0, 1], 0.5)
+    brightness.equations(FLAT, np.zeros((2, len(FLAT))), 0.0)
+    (one,) = equations
+    expected = 0.5 * (2 / 0.1**2) / 2 / np.sqrt(1 + one["off"] ** 2 * 2 / 0.1**2)
+    np.testing.assert_allclose(one["weight"], expected)
+    assert len(one["off"]) == 2 * 32 * 40 and one["tell"] == 1.0
+    pigment = 0.5 * 0.1 / (1 + GRID.half_waves / 2.0) ** 2
+    np.testing.assert_allclose(one["prior"], [*pigment**-2, 1e-6, 4.0])
+    # It starts from no pigment, the median brightness and a flat lamp, of which the last is expected.
+    np.testing.assert_allclose(one["away"], [*FLAT, np.median(seen), 0])
+
+
+def test_glints_become_rarer_by_a_twelfth_radian(equations):
+    found = relief_fit.Glints(GRID, [Shading(NOTHING, ONES, 0.1, 0.1 * ONES, ONES)] * 8)
+    found.equations(FLAT, np.zeros((8, len(FLAT))))
+    (one,) = equations
+    angle = np.tile(appearance(PLACES, FLAT).angle, 8)
+    expected = 64 * np.exp(np.clip(np.log(0.05) - 12 * angle, -12, -0.5))
+    np.testing.assert_allclose(one["off"], (6.4 - expected) / (expected + 0.3))
+    np.testing.assert_allclose(one["weight"], (expected + 0.3) * 4 / 8)
+    np.testing.assert_allclose(one["own"], np.stack([np.ones_like(angle), -12 * angle], axis=1))
+    np.testing.assert_allclose(one["prior"], [1e-3, 0.4**-2])
+    # What errs by more than it should counts less in the next round.
+    spread = float(np.sum(one["off"] ** 2 * (expected + 0.3)) / len(angle))
+    found.equations(FLAT, np.zeros((8, len(FLAT))))
+    np.testing.assert_allclose(equations[1]["weight"], (expected + 0.3) * 0.5 / max(1.0, spread))
+
+
+def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
+    wet = np.where(np.arange(40) < 20, 0.4, 0.6) * ONES
+    relief_fit.Glints(GRID, [Shading(NOTHING, ONES, 0.1, NOTHING, wet)]).equations(FLAT, FLAT[None])
+    weight = equations[0]["weight"].reshape(32, 40)
+    assert not weight[:, :20].any() and weight[:, 20:].all()
+
+
+@pytest.mark.parametrize(
+    ("scaled", "undecided", "width"),
+    [
+        (np.zeros(4), np.ones(4), 0.05),  # nothing is decided: as expected
+        (np.ones(4), np.zeros(4), np.sqrt((4 + 100 * 0.05**2) / 104)),
+        (np.zeros(400), np.zeros(400), 0.025),  # the least
+        (np.full(9, 90.0), np.zeros(9), 2.0),  # the most
+    ],
+)
+def test_the_width_of_a_prior_is_that_of_what_was_found_and_of_a_hundred_expected(scaled, undecided, width):
+    found = relief_fit._width(scaled, undecided, relief_fit.RELIEF, relief_fit.RELIEF_COUNT, relief_fit.RELIEF_LIMITS)
+    assert found == pytest.approx(width)
+
+
+def test_a_prior_pulls_a_relief_towards_none():
+    """Without evidence a step takes the own unknowns back to what is expected."""
+    none = Equations(np.zeros((3, 1)), np.zeros((3, 2)), np.zeros(3), np.ones(3), np.array([4.0]), np.array([0.5]))
+    np.testing.assert_allclose(none.own_step(np.zeros(2)), [-0.5])
+    assert not none.information.any() and not none.pull.any()

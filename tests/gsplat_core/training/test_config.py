@@ -122,3 +122,44 @@ def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
     assert config.starting_from(make_frame(), True) is config
     endless = dataclasses.replace(config, history_s=10.0)
     assert endless.starting_from(deep, False) is endless
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"gaussians": 1, "max_gaussians": 1}, {"steps_per_frame": 1}, {"first_frame_steps": 1}, {"window_frames": 1},
+        {"sh_degree": 0}, {"sh_degree": 4}, {"newest_share": 1.0}, {"newest_share": 1e-9}, {"jump_extra": 0},
+        {"ssim_weight": 0.0}, {"ssim_weight": 1.0}, {"depth_weight": 0.0}, {"jump_ratio": 1e-9}, {"history_s": 1e-9},
+    ],
+)  # fmt: skip
+def test_settings_at_their_limits_are_taken(settings):
+    made = ReconstructorConfig(**settings)
+    assert {name: getattr(made, name) for name in settings} == settings
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("sh_degree", -1), ("history_s", 0.0), ("history_s", float("inf")), ("jump_ratio", float("inf")),
+                        ("default_depth_mm", 0.0), ("bump_spacing_s", float("inf")), ("eyes", "right"), ("motion_detail", "some")],
+)  # fmt: skip
+def test_settings_just_beyond_their_limits_are_refused(name, value):
+    with pytest.raises(InvalidSetting, match=name):
+        ReconstructorConfig(**{name: value})
+
+
+def test_defaults_are_those_of_the_published_figures():
+    """Figures of `benchmarks/RESULTS.md` and the memory in the docs were taken with these."""
+    made = dataclasses.asdict(ReconstructorConfig())
+    rates = made.pop("rates")
+    assert made == {
+        "field": "auto", "gaussians": 30_000, "max_gaussians": 60_000, "sh_degree": 0, "steps_per_frame": 10,
+        "first_frame_steps": 60, "newest_share": 0.7, "window_frames": 30, "jump_ratio": 1.8, "jump_extra": 4,
+        "bump_spacing_s": 0.2, "squared_error": False, "history_s": None, "preallocate": False, "ssim_weight": 0.0,
+        "depth_weight": 0.1, "default_depth_mm": 60.0, "eyes": "left", "motion_prior": "bumps", "motion_detail": "full",
+        "start_from_motion": False, "depth_from_motion": False,
+    }  # fmt: skip
+    assert rates == {"means_px": 0.03, "quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh": 5e-3,
+                     "right_share": 0.1, "field": None}  # fmt: skip
+    offline = ReconstructorConfig.offline()
+    assert (offline.gaussians, offline.max_gaussians, offline.bump_spacing_s) == (60_000, 80_000, 0.05)
+    assert ReconstructorConfig.offline("hexplane").bump_spacing_s == pytest.approx(1 / 15)
+    assert offline.depth_from_motion

@@ -37,3 +37,11 @@ def test_frames_that_say_nothing_change_nothing() -> None:
     damping.learn(torch.full((4, 3), torch.nan), torch.ones(4, 3))
     damping.learn(torch.zeros(0, 3), torch.zeros(0, 3))
     assert share_of(damping) == pytest.approx(AT_FIRST)
+
+
+@pytest.mark.parametrize(("ratio", "share"), [(1.0, 0.66), (0.0, 0.51), (50.0, 0.735), (-50.0, 0.435)])
+def test_one_frame_counts_by_fifteen_hundredths_and_no_further_than_its_bounds(ratio: float, share: float) -> None:
+    """From 0.6 on: 0.6 + 0.15 (ratio - 0.6), the ratio within -0.5 and 1.5."""
+    damping, last = Damping(), torch.ones(5, 3)
+    damping.learn(last, ratio * last)
+    assert share_of(damping) == pytest.approx(share, abs=1e-6)
