@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsplat_core.endoscope import exposure
 from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator, ExposureSettings
 from gsplat_core.errors import InvalidSetting
 from tests.gsplat_core.endoscope.clips import FRAME_NS, brightened, clip, texture
@@ -168,3 +171,88 @@ def test_no_picture_of_any_size_raises_or_gives_a_wild_gain(height, width, seed)
 def test_settings_out_of_range_are_refused():
     with pytest.raises(InvalidSetting, match="dead_zone"):
         ExposureSettings(dead_zone=0.0)
+
+
+def estimator_of(monkeypatch, found, same=(10.0, 10.0), **fields):
+    """An estimator to which every frame compares as `found` says, with shares of pixels that agree with a change and with none."""
+    made = ExposureEstimator()
+    monkeypatch.setattr(made, "_compare", lambda sample, references: found)
+    shares = iter(same)
+    monkeypatch.setattr(exposure, "share_with", lambda *given: next(shares))
+    made._previous = made._anchor = SimpleNamespace(sample=None, log_gain=np.zeros(3))
+    for name, value in fields.items():
+        setattr(made, name, value)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("change", "spread", "same", "is_change"),
+    [
+        (0.08, 0.0, (10, 15), False), (0.081, 0.0, (10, 15), True), (0.081, 0.0, (10, 14.9), False),
+        (-0.081, 0.0, (10, 15), True), (0.15, 0.1, (1, 9), False), (0.16, 0.1, (1, 9), True),
+    ],
+)  # fmt: skip
+def test_limits_of_a_jump(monkeypatch, change, spread, same, is_change):
+    """8 %, one and a half times as much as the frames are unlike, and one and a half times as many pixels that agree."""
+    best = SimpleNamespace(sample=None, log_gain=np.zeros(3))
+    made = estimator_of(monkeypatch, (np.array([0, change, 0]), spread, best), same)
+    assert made._changed(None, [best], 0.08, 1.5) == is_change
+    assert made._log_gain.tolist() == [0, change if is_change else 0, 0]
+
+
+@pytest.mark.parametrize(("step", "is_held"), [(0.0199, True), (0.0201, False)])
+def test_a_gain_is_held_again_after_six_steady_frames(monkeypatch, step, is_held):
+    made = estimator_of(monkeypatch, None, following=True)
+    at = [0.3]
+
+    def compare(sample, references):
+        at[0] += step
+        return np.full(3, at[0]), 0.0, None
+
+    monkeypatch.setattr(made, "_compare", compare)
+    made._log_gain = np.full(3, 0.3)
+    settled = []
+    monkeypatch.setattr(made, "_settle", lambda sample: settled.append(made._steady))
+    for _ in range(5):
+        made._follow(None)
+        assert made.following
+    made._follow(None)
+    assert made.following != is_held and settled == ([6] if is_held else [])
+
+
+@pytest.mark.parametrize(
+    ("gain", "anchor", "settled"), [(0.3, 0.1, 0.25), (0.3, 0.2, 0.3), (-0.3, -0.1, -0.25), (0.0399, 0.0, 0.0), (0.0401, 0, 0.0401)]
+)  # fmt: skip
+def test_a_settled_gain_is_near_that_of_the_first_frame_and_none_below_4_percent(monkeypatch, gain, anchor, settled):
+    made = estimator_of(monkeypatch, (np.full(3, anchor), 0.0, None))
+    made._log_gain = np.full(3, gain)
+    made._settle(None)
+    np.testing.assert_allclose(made._log_gain, settled)
+
+
+@pytest.mark.parametrize(("passed_s", "counted_s"), [(0.5, 0.5), (1.0, 1.0), (60.0, 1.0), (-3.0, 0.0)])
+def test_a_held_gain_is_forgotten_by_five_minutes_and_a_gap_counts_a_second(passed_s, counted_s):
+    made = ExposureEstimator()
+    made._log_gain, made._last_pts_ns = np.full(3, 0.5), 0
+    made._forget(round(passed_s * 1e9))
+    np.testing.assert_allclose(made._log_gain, 0.5 * np.exp(-counted_s / 300))
+
+
+def test_gains_stay_within_eight_and_its_inverse():
+    made = ExposureEstimator()
+    made._set(np.array([9.0, -9.0, 1.0]))
+    assert made.gains == pytest.approx((8, 1 / 8, np.e))
+
+
+def test_references_are_weighed_by_how_alike_they_are(monkeypatch):
+    """Spreads 0.04 and 0.09 weigh 400 to 100; what is beyond 0.25 says nothing, and only the three best count."""
+    shifts = {"a": (0.2, 0.04), "b": (0.1, 0.09), "c": (5.0, 0.251), "d": (0.1, 0.09), "e": (9.0, 0.2)}
+    monkeypatch.setattr(exposure, "ratio", lambda sample, name, channel: shifts[name] if channel != 2 else (0, 0.3))
+    references = [SimpleNamespace(sample=name, log_gain=np.zeros(3)) for name in "cebda"]
+    measured, spread, best = ExposureEstimator()._compare(None, references)
+    expected = (400 * 0.2 + 2 * 100 * 0.1) / 600
+    np.testing.assert_allclose(measured, expected)  # blue, of which nothing is known, as the others
+    assert (spread, best.sample) == (0.04, "a")
+    assert ExposureEstimator()._compare(None, references[:1]) is None
+    shifts["c"] = (0.7, 0.25)
+    assert ExposureEstimator()._compare(None, references[:1])[0] == pytest.approx(0.7)

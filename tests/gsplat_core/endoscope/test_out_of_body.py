@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsplat_core.endoscope import out_of_body
 from gsplat_core.endoscope.out_of_body import (
     COOL_BESIDE_LIGHT,
     COOL_BESIDE_STRAIGHT,
@@ -293,3 +294,50 @@ def test_other_arrays_are_refused_and_close_the_gate(rng, image):
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
         gate.judge(image)
     assert not gate.inside and gate.judge(tissue(rng)) == "not yet certain again"
+
+
+@pytest.mark.parametrize(
+    ("measures", "outside", "tissue"),
+    [
+        ({"straight": 0.47, "cool": 0.4}, "straight edges, little red", False), ({"straight": 0.469, "cool": 0.4}, None, False),
+        ({"straight": 0.47, "cool": 0.399}, None, False), ({"even": 0.5, "smooth": 0.3, "cool": 0.6}, "even light, little red", False),
+        ({"even": 0.5, "smooth": 0.299, "cool": 0.6}, None, False), ({"even": 0.5, "smooth": 0.3, "cool": 0.599}, None, False),
+        ({"cool": 0.299, "redness": 0.34}, None, True), ({"cool": 0.3, "redness": 0.34}, None, False),
+        ({"cool": 0.299, "redness": 0.339}, None, False),
+    ],
+)  # fmt: skip
+def test_limits_of_evidence(measures, outside, tissue):
+    found = Evidence(**(dict.fromkeys(("cool", "redness", "even", "smooth", "straight"), 0.0) | measures))
+    assert (found.outside, found.tissue) == (outside, tissue)
+
+
+@pytest.mark.parametrize(("redness", "returns_after"), [(0.5, 10), (0.2, 60)])
+def test_after_the_outside_ten_pictures_of_tissue_or_sixty_without_evidence_open_the_gate(
+    monkeypatch, redness, returns_after
+):
+    gate = BodyGate()
+    gate.close()
+    seen = Evidence(cool=0.0, redness=redness, even=0.0, smooth=0.0, straight=0.0)
+    monkeypatch.setattr(out_of_body, "evidence_of", lambda image: seen)
+    said = [gate.judge(None) for _ in range(returns_after)]
+    assert all(said[:-1]) and said[-1] is None
+
+
+@pytest.mark.parametrize(("level", "is_judged"), [(38, False), (42, True)])
+def test_a_picture_must_be_brighter_than_forty_levels(level, is_judged):
+    assert (evidence_of(np.full((64, 80, 3), level, np.uint8)) is not None) == is_judged
+
+
+@pytest.mark.parametrize(("side", "is_judged"), [(15, False), (16, True)])
+def test_a_picture_has_sixteen_pixels_a_side_at_least(side, is_judged):
+    assert (evidence_of(np.full((side, 80, 3), 120, np.uint8)) is not None) == is_judged
+
+
+@pytest.mark.parametrize(("red", "cool"), [(1.13, 0.0), (1.11, 1.0)])
+def test_cool_is_what_exceeds_green_and_blue_by_less_than_an_eighth(red, cool):
+    """exp(0.12) = 1.127, of channels with 6 added."""
+    image = np.full((64, 80, 3), 100, np.uint8)
+    image[..., 0] = round(red * 106 - 6)
+    found = evidence_of(image)
+    assert found.cool == cool and found.even == 1.0 and found.smooth == 1.0
+    assert found.redness == pytest.approx(np.log((image[0, 0, 0] + 6) / 106), abs=1e-5)

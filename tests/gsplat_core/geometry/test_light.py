@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
+from gsplat_core.geometry import light
 from gsplat_core.geometry.light import FLAT, UNSEEN, LightDepth
 from gsplat_core.geometry.registry import DEPTHS
+from gsplat_core.geometry.relief import Grid, Places
 from gsplat_core.geometry.shading import shading_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
@@ -139,3 +143,34 @@ def test_a_camera_without_a_pinhole_gets_no_answer():
 
 def test_it_is_found_by_its_name():
     assert DEPTHS["light"] is LightDepth
+
+
+def test_half_of_a_relief_is_believed_where_its_brightness_changes_as_much_as_errors_do():
+    grid = Grid.of(CAMERA, (32, 40))
+    relief = np.zeros((1, len(grid.half_waves)))
+    relief[0, 0] = 1.0
+    values = Places.at(grid, *grid.middles()).value @ relief[0]
+    relief *= 0.05 / 2 / np.std(values)
+    assert light.share_of_distance(grid, relief) == pytest.approx(0.5)
+    assert light.share_of_distance(grid, 2 * relief) == pytest.approx(0.8)
+
+
+def test_confidence_halves_over_a_twentieth_of_the_longer_side():
+    known = np.zeros((32, 40), bool)
+    known[:, :10] = True
+    found = light._near_seen(SimpleNamespace(known=known))
+    np.testing.assert_allclose(found[5, [9, 11, 13]], [1, 0.5, 0.25])
+
+
+@pytest.mark.parametrize(("share", "is_enough"), [(0.25, True), (0.24, False)])
+def test_a_quarter_of_the_picture_must_be_seen(share, is_enough):
+    known = np.arange(100) < round(100 * share)
+    assert light.shows_enough(SimpleNamespace(shading=SimpleNamespace(known=known))) == is_enough
+
+
+@pytest.mark.parametrize(("elapsed_s", "is_new"), [(0.29, False), (0.3, True)])
+def test_a_look_every_three_tenths_of_a_second(elapsed_s, is_new):
+    estimator, frame = LightDepth(), Frame(0, 0, picture(bowl()))
+    first = estimator.estimate(frame, CAMERA)
+    second = estimator.estimate(Frame(1, round(elapsed_s * 1e9), picture(bowl())), CAMERA)
+    assert (second is not first) == is_new

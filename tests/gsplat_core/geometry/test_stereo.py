@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from gsplat_core.geometry import stereo
 from gsplat_core.geometry.stereo import StereoDepth
 from gsplat_core.scene.frames import DepthOrigin
 from tests.gsplat_core.geometry.pairs import (
@@ -242,3 +244,68 @@ def test_tissue_that_comes_nearer_is_followed_between_two_looks(left):
         found = estimator.estimate(frame(left, right_of(left, disparity), seq=seq), camera())
         error, believed = off_by(found, disparity)
         assert error < 0.01 and believed > 0.7, f"frame {seq}"
+
+
+def test_the_span_has_a_fifth_and_four_pixels_of_margin():
+    assert stereo._widened((10.0, 30.0)) == pytest.approx((2.0, 38.0))
+
+
+@pytest.mark.parametrize(("width", "factor"), [(100, 1), (800, 1), (801, 2), (1600, 2), (1601, 3)])
+def test_pictures_wider_than_800_pixels_are_matched_smaller(width, factor):
+    assert stereo._shrink(width) == factor
+
+
+@pytest.mark.parametrize(("confidence", "width", "variance"), [(0.5, 640, 0.25), (0.2, 640, 1.0), (0.5, 1280, 1.0), (1.0, 640, 0.0)])  # fmt: skip
+def test_variance_of_a_disparity_is_that_of_half_a_pixel_at_half_a_confidence(confidence, width, variance):
+    found = stereo.variance_px2(np.full((1, 1), confidence, np.float32), width, 0.0)
+    assert found[0, 0] == pytest.approx(variance)
+    beside = stereo.variance_px2(np.full((1, 1), confidence, np.float32), width, 2.0)
+    assert beside[0, 0] == pytest.approx(variance + 2.0 * stereo._shrink(width) ** 2)
+
+
+def right_camera(turn=0.0, up=0.0, focal=1.0, row=0.0, baseline=BASELINE_MM):
+    left = camera()
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = -baseline, up * baseline, 0
+    K = left.K.copy()
+    K[0, 0] *= focal
+    K[1, 1] *= focal
+    K[1, 2] += row
+    return replace(left, K=K, world_to_camera=pose)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, None), ({"turn": 2e-6}, "axes or heights"), ({"turn": 5e-7}, None), ({"up": 2e-6}, "axes or heights"), ({"up": 5e-7}, None),
+        ({"focal": 1.0011}, "focal lengths"), ({"focal": 1.0009}, None), ({"focal": 0.9985}, "focal lengths"), ({"row": 1.01}, "principal points"),
+        ({"row": -1.01}, "principal points"), ({"row": 0.99}, None), ({"baseline": -4.0}, "swapped"),
+    ],
+)  # fmt: skip
+def test_limits_of_a_rectified_pair(given, said):
+    found = stereo._unlike_eyes(camera(), right_camera(**given))
+    assert found is None if said is None else said in found
+
+
+def test_depth_times_disparity_is_the_focal_length_times_the_baseline(left, right):
+    given = frame(left, right)
+    assert stereo.reach_of(given, camera()) == pytest.approx(FOCAL_PX * BASELINE_MM)
+    assert stereo.reach_of(replace(given, right_camera=None), camera()) == pytest.approx(FOCAL_PX)
+
+
+@pytest.mark.parametrize(
+    ("behind", "said"), [(0.0, None), (0.02, None), (0.03, "behind the scope"), (0.5, "behind the scope"), (0.51, "swapped")]
+)  # fmt: skip
+def test_shares_of_points_behind_the_scope(behind, said):
+    count = round(100 * behind)
+    look = SimpleNamespace(disparities=np.array([-20.0] * count + [20.0] * (100 - count)) + 7)
+    found = stereo._unlike_distances(look, 7.0, calibrated=True)
+    assert found is None if said is None else said in found
+
+
+def test_rows_that_are_off_make_disparities_uncertain_towards_the_border():
+    off = stereo._off_along_rows(np.array([3.0, 0.4, 0.6]), 3, 5, torch.device("cpu"))
+    assert off[1, 2] == 0
+    assert off[2, 2] == pytest.approx(0.4 * 3 / 5) and off[1, 4] == pytest.approx(0.6 * 5 / 3)
+    assert off[0, 0] == pytest.approx(np.hypot(0.24, 1.0))

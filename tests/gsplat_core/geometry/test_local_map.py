@@ -1,0 +1,98 @@
+"""The bounded map of a live stream: which key frames stay, and how it is moved and scaled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.geometry.local_map import KeyFrame, LocalMap, position_of, scaled, unprojected
+
+
+def key(x, numbers=(), y=0.0):
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3], pose[1, 3] = -x, -y
+    numbers = np.array(numbers, np.int64)
+    return KeyFrame(pose, numbers, np.zeros((len(numbers), 2)), None, np.zeros((len(numbers), 2)))
+
+
+def known(places):
+    made = LocalMap()
+    made.add_points(np.arange(len(places)), torch.tensor(places, dtype=torch.float64))
+    return made
+
+
+def test_forty_key_frames_are_kept_and_the_one_nearest_to_another_leaves_with_its_points():
+    made = known([[0.0, 0, 50 + n] for n in range(41)])
+    at = [10.0 * n for n in range(41)]
+    at[20] = 192.0  # 2 beside another; the first one and the newest are nearer to each other still, but stay
+    at[39], at[40] = 371.0, 372.0
+    for n, x in enumerate(at[:40]):
+        made.add_key(key(x, [n]))
+    assert len(made.keys) == 40 and len(made) == 41
+    made.add_key(key(at[40], [40]))
+    assert len(made.keys) == 40
+    gone = set(range(41)) - {int(each.numbers[0]) for each in made.keys}
+    assert gone <= {19, 20} and len(gone) == 1
+    assert len(made) == 40 and not made.knows(np.array(sorted(gone)))[0]
+
+
+def test_the_first_key_frame_stays_though_another_is_beside_it():
+    made = LocalMap()
+    for n in range(41):
+        made.add_key(key([0.0, 0.5][n] if n < 2 else 10.0 * n, []))
+    assert made.keys[0].position[0] == 0.0
+    assert len(made.keys) == 40 and made.keys[1].position[0] == 20.0
+
+
+def test_a_new_point_is_as_far_as_the_median_of_the_five_nearest():
+    made = known([[0.0, 0, z] for z in (10, 20, 30, 40, 50, 1000)])
+    seen = np.array([[0.1 * n, 0.0] for n in range(1, 7)])
+    depth = made.depth_around(key(0.0).pose, np.zeros((1, 2)), np.arange(6), seen)
+    assert depth.tolist() == [30.0]
+
+
+def test_what_came_after_an_earlier_key_frame_is_moved_by_its_share():
+    made = known([[0.0, 0, 50], [0.0, 0, 60], [0.0, 0, 70]])
+    made.keys = [key(0.0, [0]), key(1.0, [0, 1]), key(2.0, [1, 2])]
+    after = torch.eye(4, dtype=torch.float64)
+    after[0, 3] = 4.0
+    made.brought_back(made.keys[0], after, 4.0)
+    # The newest whole, the one between by half: what both show is moved with the first of them.
+    np.testing.assert_allclose(made.points(np.arange(3)), [[0, 0, 50], [2, 0, 120], [4, 0, 280]])
+    np.testing.assert_allclose([each.position[0] for each in made.keys], [0, 2 * 1 + 2, 4 * 2 + 4])
+
+
+def test_all_lengths_are_scaled_as_seen_from_a_key_frame():
+    made = known([[3.0, 0, 50]])
+    made.keys = [key(1.0, [0]), key(4.0)]
+    made._rescale(made.keys[0], 2.0)
+    np.testing.assert_allclose(made.points(np.arange(1)), [[5, 0, 100]])
+    np.testing.assert_allclose([each.position[0] for each in made.keys], [1, 7])
+
+
+@pytest.mark.parametrize(("factor", "is_taken"), [(0.1, False), (0.11, True), (9.9, True), (10.0, False)])
+def test_a_scale_beyond_ten_is_no_scale(factor, is_taken):
+    made = known([[0.0, 0, 50]])
+    made.keys = [key(0.0, [0])]
+    made._rescale(made.keys[0], factor)
+    assert made.points(np.arange(1))[0, 2] == pytest.approx(50 * factor if is_taken else 50)
+
+
+def test_anchors_share_six_points_at_least_and_five_are_taken():
+    made = LocalMap()
+    shares = [7, 5, 6, 20, 9, 8, 30, 10]
+    made.keys = [key(float(n), range(share)) for n, share in enumerate(shares)]
+    window = [key(100.0, range(40))]
+    made.keys += window
+    assert [each.position[0] for each in made._anchors(window)] == [3, 4, 5, 6, 7]
+    few = LocalMap()
+    few.keys = [*made.keys[:3], *window]
+    assert [each.position[0] for each in few._anchors(window)] == [0, 2]
+
+
+def test_poses_and_places():
+    pose = key(3.0, y=4.0).pose
+    np.testing.assert_allclose(position_of(pose), [3, 4, 0])
+    np.testing.assert_allclose(position_of(scaled(pose, 2.0)), [6, 8, 0])
+    np.testing.assert_allclose(unprojected(pose, np.array([[0.1, -0.2]]), torch.tensor([50.0]).double()), [[8, -6, 50]])
