@@ -44,4 +44,6 @@ def test_sinus_with_its_moving_camera_replays(recordings_dir, tmp_path, intraspl
         3,
     )
     assert report.frames.displayed == 6
-    assert report.quality.live.psnr_tissue_db > 23
+    # Measured 28.9 dB; a scene that does not follow the camera is at most the previous frame (28.3), their mean picture has 23.8.
+    assert report.quality.live.psnr_tissue_db > report.quality.baselines.previous_frame_db
+    assert report.quality.live.psnr_tissue_db > 28.3

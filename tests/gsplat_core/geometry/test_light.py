@@ -54,7 +54,8 @@ def test_a_lambertian_surface_is_found():
     found, true = look(picture(bowl())), bowl()
     assert found.doubt is None
     assert (found.origin, found.metric) == (DepthOrigin.LIGHT, False)
-    assert error(found.depth, true) < 0.4 * error(plane(), true)
+    # Measured 0.19 of the level plane's error; the best tilted plane, which needs no light, has 0.75 of it.
+    assert error(found.depth, true) < 0.3 * error(plane(), true)
     assert found.confidence.min() > 0.5
 
 
@@ -74,7 +75,8 @@ def test_a_textured_plane_does_not_become_a_relief(seed):
 def test_vessels_and_pale_tissue_do_not_hide_a_relief():
     pigment = np.exp(-np.maximum(noise(3, 8), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
     found, true = look(picture(bowl(), PINK * pigment)), bowl()
-    assert error(found.depth, true) < 0.6 * error(plane(), true)
+    # Measured 0.22 to 0.26 over six pigments; the best tilted plane has 0.75.
+    assert error(found.depth, true) < 0.35 * error(plane(), true)
 
 
 def test_the_mixture_of_channels_leaves_the_light_and_not_the_pigment():
