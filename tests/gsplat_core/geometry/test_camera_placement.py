@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.geometry import camera_placement
 from gsplat_core.geometry.bundle import Bundle, adjust
 from gsplat_core.geometry.camera_placement import moved, placed
 from gsplat_core.geometry.pose import exp
@@ -70,3 +71,29 @@ def test_rounding_errors_do_not_grow():
     crooked[:3, :3] += 1e-3
     found, _ = placed(crooked, points, rays, FOCAL_PX)
     np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 9e-5, 1.1e-4, 0.3, 2.0])
+def test_a_twist_is_the_matrix_exponential(size):
+    """By the power series of the 4 x 4 matrix, for angles on both sides of where the closed form changes."""
+    twist = np.array([0.4, -0.3, 0.2, *(size * np.array([0.6, -0.48, 0.64]))])
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = [[0, -twist[5], twist[4]], [twist[5], 0, -twist[3]], [-twist[4], twist[3], 0]]
+    generator[:3, 3] = twist[:3]
+    series, term = np.eye(4), np.eye(4)
+    for n in range(1, 40):
+        term = term @ generator / n
+        series = series + term
+    np.testing.assert_allclose(camera_placement.moved(np.eye(4), twist), series, atol=1e-12)
+
+
+def test_derivatives_by_a_twist_are_those_of_finite_differences():
+    points = np.random.default_rng(0).uniform([-20, -15, 40], [20, 15, 70], (6, 3))
+    found = camera_placement._by_twist(points)
+    for k in range(6):
+        rays = []
+        for step in (1e-6, -1e-6):
+            pose = camera_placement.moved(np.eye(4), step * np.eye(6)[k])
+            local = points @ pose[:3, :3].T + pose[:3, 3]
+            rays.append(local[:, :2] / local[:, 2:])
+        np.testing.assert_allclose(found[:, :, k], (rays[0] - rays[1]) / 2e-6, atol=1e-7)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import cv2
@@ -239,3 +240,28 @@ def test_what_is_published_live_is_whole_where_nothing_says_how_it_goes_on() -> 
     for frame in stream([0.0, 1.0]):
         reconstructor.observe(frame, steps=2)
     assert reconstructor.publish().parameter_count == reconstructor.snapshot().parameter_count
+
+
+@pytest.mark.parametrize(
+    ("moved_px", "is_sudden", "usual_px"), [(1.0, False, 0.28), (1.01, True, 0.28), (0.4, False, 0.22)]
+)
+def test_a_motion_of_five_times_the_usual_one_and_more_than_a_pixel_is_sudden(moved_px, is_sudden, usual_px):
+    prior = FlowPrior(ReconstructorConfig())
+    prior._judge(0.2)
+    assert prior._usual_px == pytest.approx(0.2) and not prior._is_sudden
+    prior._judge(moved_px)
+    assert prior._is_sudden == is_sudden and prior._usual_px == pytest.approx(usual_px)
+
+
+@pytest.mark.parametrize(("interval_s", "is_usable"), [(0.0, False), (-0.1, False), (0.15, True), (0.1501, False)])
+def test_frames_more_than_150_ms_apart_show_no_velocity(interval_s, is_usable):
+    prior = FlowPrior(ReconstructorConfig())
+    prior._motion, prior._interval_s = "motion", interval_s
+    assert (prior._usable_motion() == "motion") == is_usable
+    assert prior.horizon_s == 0.15
+
+
+def test_gaussians_are_widened_by_a_twentieth_of_the_squared_motion():
+    """Variances add: a Gaussian of width 1 that moved by 2 has 1 + 0.05 * 4."""
+    found = widened(torch.tensor([[0.0, math.log(10.0), -9.0]]), torch.tensor([[2.0, 0.0, 0.0]]))
+    torch.testing.assert_close(found, torch.tensor([[0.5 * math.log(1.2), 0.5 * math.log(1.002), 0.7]]))

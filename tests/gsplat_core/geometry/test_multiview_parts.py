@@ -1,0 +1,64 @@
+"""Choice of views, distances of a sweep and what is filled in, in closed form."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gsplat_core.geometry import multiview
+from gsplat_core.geometry.multiview import chosen_views
+
+
+def view(x, turn=0.0):
+    pose = np.eye(4)
+    pose[2, :3] = [np.sin(turn), 0, np.cos(turn)]
+    return SimpleNamespace(camera=SimpleNamespace(world_to_camera=pose, position=np.array([x, 0.0, 0.0])), x=x)
+
+
+@pytest.mark.parametrize(
+    ("at", "chosen"),
+    [
+        ([10, 1, 0.99, 0], [1, 10]), ([5], [5]), ([0], []), ([], []), (list(range(1, 7)), [1, 2, 3, 4, 5, 6]),
+        (list(range(1, 12)), [2, 4, 6, 7, 9, 11]),
+    ],
+)  # fmt: skip
+def test_six_views_from_a_tenth_of_the_longest_baseline_on(at, chosen):
+    found = [each.x for each in chosen_views(view(0.0), [view(float(x)) for x in at])]
+    assert found == chosen
+
+
+@pytest.mark.parametrize(("cosine", "is_taken"), [(0.71, True), (0.69, False), (-1.0, False)])
+def test_views_that_look_elsewhere_are_left_out(cosine, is_taken):
+    assert len(chosen_views(view(0.0), [view(5.0, np.arccos(cosine))])) == is_taken
+
+
+@pytest.mark.parametrize(("parallax_px", "count"), [(1.0, 24), (30.0, 66), (500.0, 96)])
+def test_distances_are_three_quarters_of_a_pixel_apart(parallax_px, count):
+    """Between corners at 1 / 50 and 1 / 100, 1.6 times farther and nearer: 0.032 - 0.00625 = 0.02575."""
+    found = SimpleNamespace(inverse_depths=np.repeat([0.01, 0.02], 50), parallax_px=parallax_px, plane=0.0156)
+    inverse = multiview._distances(found)
+    assert (inverse[0], inverse[-1]) == pytest.approx((0.01 / 1.6, 0.02 * 1.6))
+    assert len(inverse) == count
+    np.testing.assert_allclose(np.diff(inverse), (0.032 - 0.00625) / (count - 1))
+
+
+def test_what_is_not_believed_continues_what_is_and_is_believed_by_a_fifth_at_most():
+    inverse, confidence = np.full((40, 60), 0.5, np.float32), np.full((40, 60), 0.4, np.float32)
+    inverse[:, :30], confidence[:, :30] = 0.02, 0.9
+    confidence[:, 50:] = 0.1
+    found, sure = multiview._filled(inverse, confidence, SimpleNamespace(plane=0.03))
+    np.testing.assert_array_equal(found[:, :30], np.float32(0.02))
+    assert found[:, 30:].min() >= 0.02 and found[:, 30:].max() < 0.0301
+    assert found[20, 31] == pytest.approx(0.02, rel=0.05)
+    np.testing.assert_allclose(sure[5, [0, 31, 55]], [0.9, 0.2, 0.1])
+
+
+@pytest.mark.parametrize(("side", "is_kept"), [(2, False), (3, True)])
+def test_patches_below_fourteen_of_ten_thousand_pixels_are_speckles(side, is_kept):
+    """Of 5,000 pixels: 7."""
+    labels, confidence = np.full((50, 100), 10.0, np.float32), np.zeros((50, 100), np.float32)
+    labels[20 : 20 + side, 20 : 20 + side], confidence[20 : 20 + side, 20 : 20 + side] = 14.0, 0.9
+    found = multiview._without_speckles(labels, confidence)
+    assert found[20, 20] == pytest.approx(0.9 if is_kept else 0.2) and found[0, 0] == 0

@@ -1,0 +1,51 @@
+"""Rates, corrections and step times of a live stream at given steps."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.live_training import LiveTraining
+
+
+def test_rates_fall_from_2_to_a_half_within_thirty_steps_in_equal_ratios():
+    live = LiveTraining()
+    assert [live.rate_at(step) for step in (0, 29, 30, 500)] == pytest.approx([2.0, 0.5, 0.5, 0.5])
+    assert live.rate_at(1) / live.rate_at(0) == pytest.approx(0.25 ** (1 / 29))
+    assert [LiveTraining(rate_steps=1).rate_at(step) for step in (0, 1)] == pytest.approx([2.0, 0.5])
+    assert live.recent_share == 0.6 and live.colour_relaxation == 0.0
+
+
+@pytest.mark.parametrize(("number", "or_depth", "factor"), [(3, True, 0.5), (4, True, 0.0), (8, True, 0.0), (4, False, 0.5)])  # fmt: skip
+def test_every_fourth_rehearsal_step_looks_at_depth_in_place_of_colours(number, or_depth, factor):
+    assert LiveTraining(colour_relaxation=0.8).rehearsed_relaxation(number, or_depth) == pytest.approx(0.8 * factor)
+
+
+@pytest.mark.parametrize(
+    "given", [{"first_rate": 100.0}, {"last_rate": 1e-9}, {"rate_steps": 1}, {"recent_share": 0.0}, {"recent_share": 1.0}]
+)  # fmt: skip
+def test_limits_are_taken(given):
+    LiveTraining(**given)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("first_rate", 0.0), ("last_rate", 100.1), ("rate_steps", 0), ("recent_share", -0.01), ("recent_share", 1.01),
+                        ("colour_relaxation", -0.01)],
+)  # fmt: skip
+def test_what_is_beyond_is_refused(name, value):
+    with pytest.raises(InvalidSetting, match=name):
+        LiveTraining(**{name: value})
+
+
+def test_a_longer_step_changes_the_usual_time_by_a_tenth_and_a_shorter_one_at_once(camera):
+    made = LiveReconstructor(ReconstructorConfig(gaussians=10, max_gaussians=10), camera)
+    usual = []
+    for step_s in (1.0, 1.5, 9.0, 0.5):
+        made._learn_step_time(SimpleNamespace(all_finished=lambda: None, step_s=step_s))
+        usual.append(made.step_ns / 1e9)
+    assert usual == pytest.approx([1.0, 1.05, 1.155, 0.5])  # what is far longer counts as twice the usual
+    assert made.rehearsal_ns(3) == pytest.approx(1.5e9)
