@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gsplat_core.endoscope import ordinary
 from gsplat_core.endoscope.ordinary import OrdinaryPictures, OrdinarySettings
 from gsplat_core.errors import InvalidSetting
 
@@ -94,3 +95,20 @@ def test_pictures_of_any_size_and_content_are_taken(rng, size):
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting):
         OrdinarySettings(**wrong)
+
+
+def test_a_closer_look_becomes_the_reference_after_two_tenths_of_a_second(monkeypatch):
+    """Ordinary frames are compared with the last look, which is renewed at 0.2 s and not before."""
+    watch, colours = OrdinaryPictures(), iter(range(1000))
+    small = np.zeros((32, 32, 3), np.uint8)
+    noisy = [np.full_like(small, level) for level in (100, 103)]
+    count = iter(range(1000))
+    monkeypatch.setattr(
+        ordinary, "_sampled", lambda image: (noisy[next(count) % 2], np.full(3, 100 + 0.001 * next(colours)), 5.0)
+    )
+    looked = []
+    for k in range(40):
+        watch.is_ordinary(small, k * 40_000_000)
+        looked.append(watch._looked_ns)
+    renewed = sorted(set(looked))
+    assert {b - a for a, b in zip(renewed[-4:], renewed[-3:], strict=False)} == {200_000_000}

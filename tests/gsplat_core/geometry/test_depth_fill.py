@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.depth_fill import filled_depth
+from gsplat_core.geometry.depth_fill import filled_depth, local_plane
 
 HEIGHT, WIDTH = 96, 128
 
@@ -60,3 +60,22 @@ def test_it_does_not_run_away_from_what_is_known():
     noisy = rng.uniform(40, 80, (HEIGHT, WIDTH)).astype(np.float32)
     found = filled_depth(noisy, known)
     assert found.min() >= 20 and found.max() <= 160 and np.isfinite(found).all()
+
+
+def test_one_known_cell_is_believed_by_its_share_of_the_window():
+    """In the middle of a window of 2 cells it is 1 / (2 pi 2²) = 0.0398 of the weight: twice as much as counts for a half."""
+    values, weight = np.zeros((21, 21), np.float32), np.zeros((21, 21), np.float32)
+    values[10, 10], weight[10, 10] = 0.6, 1.0
+    share = 1 / (2 * np.pi * 4)
+    found = local_plane(values, weight, 2.0)
+    assert found[10, 10] == pytest.approx(0.6 * share / (share + 0.02), rel=0.01)
+    assert abs(found[10, 13]) < abs(found[10, 10])
+
+
+@pytest.mark.parametrize(("slope", "bound"), [(0.9, 2.0), (-0.9, 2.0)])
+def test_a_surface_goes_on_to_half_the_nearest_and_twice_the_farthest_depth_at_most(slope, bound):
+    depth, known = tilted(slope), np.zeros((HEIGHT, WIDTH), bool)
+    known[:, 56:72] = True
+    found = filled_depth(depth, known)
+    nearest, farthest = depth[known].min(), depth[known].max()
+    assert found.min() >= nearest / bound * 0.97 and found.max() <= farthest * bound * 1.03
