@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -96,3 +98,35 @@ def test_poses_and_places():
     np.testing.assert_allclose(position_of(pose), [3, 4, 0])
     np.testing.assert_allclose(position_of(scaled(pose, 2.0)), [6, 8, 0])
     np.testing.assert_allclose(unprojected(pose, np.array([[0.1, -0.2]]), torch.tensor([50.0]).double()), [[8, -6, 50]])
+
+
+@pytest.mark.parametrize(("count", "is_adjusted"), [(11, False), (12, True), (30, True)])
+def test_twelve_points_that_two_key_frames_show_are_adjusted(count, is_adjusted):
+    random = np.random.default_rng(0)
+    places = random.uniform([-20, -15, 45], [20, 15, 70], (count, 3))
+    made = known((places + random.normal(0, 0.5, places.shape)).tolist())
+    for x in (0.0, 8.0):
+        each = key(x, range(count))
+        local = places - [x, 0, 0]
+        each.rays = local[:, :2] / local[:, 2:]
+        each.picture = SimpleNamespace(camera=SimpleNamespace(K=np.diag([100.0, 100.0, 1.0])))
+        made.keys.append(each)
+    made.keys[1].pose[0, 3] += 0.3
+
+    def off_px():
+        parts = [(made.points(each.numbers) @ each.pose[:3, :3].T + each.pose[:3, 3], each.rays) for each in made.keys]
+        return np.mean([np.abs((local[:, :2] / local[:, 2:]).numpy() - rays).mean() * 100 for local, rays in parts])
+
+    first, depth, before = made.keys[0].pose.clone(), made._depth_of(made.keys[0]), off_px()
+    made.adjust()
+    assert before > 0.3
+    assert off_px() < 0.02 if is_adjusted else off_px() == before
+    torch.testing.assert_close(made.keys[0].pose, first)
+    torch.testing.assert_close(made._depth_of(made.keys[0]), depth)
+
+
+def test_one_key_frame_alone_is_not_adjusted():
+    made = known([[0.0, 0, 50]] * 20)
+    made.keys = [key(0.0, range(20))]
+    made.adjust()
+    assert torch.equal(made.keys[0].pose, torch.eye(4, dtype=torch.float64))
