@@ -6,8 +6,10 @@
 
 A mutant is a module with one expression changed: a comparison turned round or moved by its border, an arithmetic operator or a number exchanged,
 `and` for `or`, `min` for `max`, a condition negated, a call left out. Tests are run with the mutant in the place of the module, in all processes
-that they start, and no file of the checkout is changed. First the test files that import the module are run, then those that import a module that
-imports it. A mutant survives when all of them pass. Chosen at random with a seed, in equal parts from each folder.
+that they start, and no file of the checkout is changed. The test files named after the module run first, then those that import it, then those
+that import a module that imports it. The run of a mutant ends at the first failure. A test that also fails without the mutant is flaky: it is
+listed and left out, and the remaining tests decide. A mutant survives when all of them pass. Chosen at random with a seed, in equal parts from
+each folder.
 """
 
 from __future__ import annotations
@@ -35,7 +37,11 @@ PACKAGES = ("gsplat_core", "operators", "services")
 MOST_TEST_FILES = 24
 """Test files beyond those that import the module itself."""
 LIMIT_S = 300.0
-"""A mutant whose tests take longer is killed: it hangs."""
+"""Time limit for one run of pytest. A mutant whose tests take longer counts as killed: it hangs."""
+NO_TESTS = 5
+"""Exit code of pytest when every collected test is deselected."""
+PRECHECK_FILES = 3
+"""Test files of the first, short run of pytest; most mutants are killed there, without collecting the remaining files."""
 COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.GtE, ast.LtE), ast.LtE: (ast.Gt, ast.Lt), ast.Gt: (ast.LtE, ast.GtE), ast.GtE: (ast.Lt, ast.Gt),
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
@@ -170,33 +176,58 @@ def importers() -> dict[str, frozenset[Path]]:
 
 
 def tests_for(path: str) -> list[str]:
-    """Test files to run for a mutant of a module: nearest first.
+    """Return the test files for a mutant of a module, nearest first.
 
-    Those that import the module or are named after it come first, then those that are reached through modules that import it, breadth first.
+    Files named after the module in the mirrored folder come first, then other files of that name, then files that import the module, those in the
+    mirrored folder before others. Files that import the module through other modules follow, breadth first.
     """
     name, stem = module_name(path), Path(path).stem
+    mirror = ROOT / "tests" / Path(path).parent
     named = [each for each in sorted((ROOT / "tests").rglob("test_*.py")) if each.stem.startswith(f"test_{stem}")]
     direct = [each for each in sorted(importers().get(name, ())) if each.name.startswith("test_")]
-    chosen = list(dict.fromkeys([*named, *direct]))
+    near = sorted(named, key=lambda each: each.parent != mirror)
+    near += sorted(direct, key=lambda each: (each.parent != mirror, len(imports_of(each))))
+    chosen = list(dict.fromkeys(near))
     seen, level = {name}, {name}
     while level and len(chosen) < MOST_TEST_FILES:
         above = {each for one in level for each in importers().get(one, ())}
         further = sorted(
-            (each for each in above if each.name.startswith("test_")), key=lambda each: len(imports_of(each))
+            (each for each in above if each.name.startswith("test_")),
+            key=lambda each: (each.parent != mirror, len(imports_of(each)), each),
         )
         chosen = list(dict.fromkeys([*chosen, *further]))
         level = {
             module_name(str(each.relative_to(ROOT))) for each in above if each.parts[len(ROOT.parts)] in PACKAGES
         } - seen
         seen |= level
-    return [str(each.relative_to(ROOT)) for each in chosen[: max(MOST_TEST_FILES, len(named) + len(direct))]]
+    return [str(each.relative_to(ROOT)) for each in chosen[: max(MOST_TEST_FILES, len(near))]]
 
 
-def killed_by(mutant: Mutant, folder: Path) -> str | None:
-    """The first test that fails with the mutant in place, `time` where the tests do not end, None where all pass."""
+@dataclass(frozen=True)
+class Outcome:
+    """Result of the tests of a mutant.
+
+    Attributes:
+        killed_by: the first test that fails only with the mutant, `time` where the tests do not end, `pytest itself` where
+            it dies or cannot load a conftest, None where the mutant survives.
+        flaky: tests that also fail without the mutant.
+    """
+
+    killed_by: str | None
+    flaky: tuple[str, ...] = ()
+
+
+def failed_test(output: str) -> str | None:
+    """Return the id of the first failed test in pytest's output, or None. Captured log lines may begin with ERROR, too."""
+    for line in output.splitlines():
+        if line.startswith(("FAILED tests/", "ERROR tests/")):
+            return line.split(" - ")[0].split(" ", 1)[1].strip()
+    return None
+
+
+def outcome_of(mutant: Mutant, folder: Path) -> Outcome:
+    """Run the tests of a mutant, nearest files first, up to the first failure that the mutant causes."""
     files = tests_for(mutant.path)
-    if not files:
-        return None
     (folder / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
     source = folder / "mutant.py"
     source.write_text(mutant.source, encoding="utf-8")
@@ -206,20 +237,32 @@ def killed_by(mutant: Mutant, folder: Path) -> str | None:
         "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
     }  # fmt: skip
     pytest = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
-    command = [*pytest, *files]
-    try:
-        done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False)
-    except subprocess.TimeoutExpired:
-        return "time"
-    if done.returncode == 0:
-        return None
-    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    if not failed:
-        sys.exit(f"pytest ended with {done.returncode} and no failed test:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-    test = failed[0].split(" - ")[0].split(" ", 1)[1]
-    if subprocess.run([*pytest, test], cwd=ROOT, capture_output=True, check=False).returncode != 0:
-        sys.exit(f"{test} fails without a mutant, too; mend it first")
-    return test
+    flaky: list[str] = []
+    for group in filter(None, (files[:PRECHECK_FILES], files[PRECHECK_FILES:])):
+        while True:
+            command = [*pytest, *(f"--deselect={each}" for each in flaky), *group]
+            try:
+                done = subprocess.run(
+                    command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False
+                )
+            except subprocess.TimeoutExpired:
+                return Outcome("time", tuple(flaky))
+            if done.returncode in (0, NO_TESTS):
+                break
+            test = failed_test(done.stdout)
+            if (
+                test is None
+                and subprocess.run([*command, "--collect-only"], cwd=ROOT, capture_output=True).returncode == 0
+            ):
+                return Outcome("pytest itself", tuple(flaky))
+            if test is None or test in flaky:
+                text = f"{done.stdout[-2000:]}{done.stderr[-2000:]}"
+                sys.exit(f"pytest ended with {done.returncode} and names no new failed test:\n{text}")
+            alone = subprocess.run([*pytest, test], cwd=ROOT, capture_output=True, check=False)
+            if alone.returncode == 0:
+                return Outcome(test, tuple(flaky))
+            flaky.append(test)
+    return Outcome(None, tuple(flaky))
 
 
 def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant]:
@@ -273,26 +316,30 @@ def main() -> int:
         else chosen_mutants(options.only, options.count, options.seed)
     )
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    killed = 0
+    killed, flaky = 0, set[str]()
     with tempfile.TemporaryDirectory() as folder, options.out.open("w", encoding="utf-8") as log:
 
-        def run(numbered: tuple[int, Mutant]) -> tuple[Mutant, str | None, float]:
+        def run(numbered: tuple[int, Mutant]) -> tuple[Mutant, Outcome, float]:
             number, mutant = numbered
             place = Path(folder) / str(number)
             place.mkdir()
             start = time.perf_counter()
-            return mutant, killed_by(mutant, place), time.perf_counter() - start
+            return mutant, outcome_of(mutant, place), time.perf_counter() - start
 
         with ThreadPoolExecutor(options.jobs) as pool:
-            for mutant, by, seconds in pool.map(run, enumerate(chosen)):
+            for mutant, outcome, seconds in pool.map(run, enumerate(chosen)):
+                by = outcome.killed_by
                 killed += by is not None
+                flaky.update(outcome.flaky)
                 result = {"path": mutant.path, "line": mutant.line, "change": mutant.change, "killed_by": by}
-                log.write(json.dumps(result | {"seconds": round(seconds, 1)}) + "\n")
+                log.write(json.dumps(result | {"flaky": outcome.flaky, "seconds": round(seconds, 1)}) + "\n")
                 log.flush()
                 print(
                     f"{'killed  ' if by else 'SURVIVED'} {mutant.path}:{mutant.line} {mutant.change[:120]!r}",
                     flush=True,
                 )
+    for test in sorted(flaky):
+        print(f"flaky: {test} fails without a mutant, too")
     share = killed / max(1, len(chosen))
     print(f"{killed} of {len(chosen)} mutants killed ({share:.0%}); {options.out}")
     return 0 if share >= options.least else 1
