@@ -1,0 +1,212 @@
+"""Rules for the list of files of a zip archive, in this process: each limit on both of its sides."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import stat
+import struct
+import zipfile
+from pathlib import PurePosixPath
+
+import pytest
+
+from services.recordings import archive_list
+from services.recordings.archive_list import ArchiveInvalid, check_end, entries_of
+from services.recordings.limits import RecordingLimits
+
+LIMITS = dataclasses.replace(RecordingLimits(), entries=3, unpacked_bytes=100, entry_bytes=60, ratio=10)
+
+
+def packed(*files: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_STORED) -> io.BytesIO:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        for name, content in files:
+            archive.writestr(name, content)
+    return out
+
+
+def listed(file: io.BytesIO, limits: RecordingLimits = LIMITS, stated: int | None = None) -> list[str]:
+    entries = check_end(file)
+    with zipfile.ZipFile(file) as archive:
+        return [str(each.path) for each in entries_of(archive, file, entries if stated is None else stated, limits)]
+
+
+def with_end(**changed: int) -> io.BytesIO:
+    """An archive of one file whose end record has other figures."""
+    content = bytearray(packed(("a.png", b"x")).getvalue())
+    names = ("disk", "list_disk", "entries", "every", "list_bytes", "list_at", "comment_bytes")
+    values = dict(zip(names, struct.unpack_from("<4H2LH", content, len(content) - 18), strict=True)) | changed
+    struct.pack_into("<4H2LH", content, len(content) - 18, *values.values())
+    return io.BytesIO(bytes(content))
+
+
+def test_the_end_states_the_number_of_entries() -> None:
+    assert check_end(packed(("a.png", b"x"), ("b.png", b"y"))) == 2
+    assert check_end(packed()) == 0, "the shortest archive is nothing but its end"
+
+
+@pytest.mark.parametrize(
+    ("file", "why"),
+    [
+        (io.BytesIO(packed().getvalue()[:-1]), "cut off: it has 21 bytes"),
+        (io.BytesIO(packed(("a.png", b"x")).getvalue() + b"behind"), "something follows"),
+        (with_end(comment_bytes=1), "something follows"),
+        (with_end(entries=0xFFFF), "zip64"),
+        (with_end(every=0xFFFF), "zip64"),
+        (with_end(list_bytes=0xFFFFFFFF), "zip64"),
+        (with_end(list_at=0xFFFFFFFF), "zip64"),
+        (with_end(disk=1), "several parts"),
+        (with_end(list_disk=1), "several parts"),
+        (with_end(every=2), "several parts"),
+        (with_end(list_bytes=(16 << 20) + 1), "at most 16777216 are read"),
+        (with_end(list_bytes=16 << 20), "not where its end says"),
+        (with_end(list_at=1), "not where its end says"),
+    ],
+)  # fmt: skip
+def test_an_end_that_is_not_that_of_one_small_archive_is_refused(file: io.BytesIO, why: str) -> None:
+    with pytest.raises(ArchiveInvalid, match=why):
+        check_end(file)
+
+
+def test_a_zip64_locator_before_the_end_is_refused() -> None:
+    content = packed().getvalue()
+    with pytest.raises(ArchiveInvalid, match="zip64"):
+        check_end(io.BytesIO(b"PK\x06\x07" + bytes(16) + content))
+
+
+@pytest.mark.parametrize(
+    ("names", "paths"),
+    [
+        (["images/0.png"], ["images/0.png"]),
+        (["masks/0.png", "masks/1.png"], ["masks/0.png", "masks/1.png"]),
+        (["rec/images/0.png", "rec/a.yaml"], ["images/0.png", "a.yaml"]),
+        (["one/0.png", "two/0.png"], ["one/0.png", "two/0.png"]),
+        (["rec", "b/c.png"], ["rec", "b/c.png"]),
+        (["a/b/c/d/e.png"], ["b/c/d/e.png"]),
+        (["__MACOSX/._0.png", ".DS_Store", "0.png"], ["0.png"]),
+        (["rec/", "rec/0.png"], ["0.png"]),
+        ([("n" * 100) + "/0.png"], ["0.png"]),
+    ],
+)
+def test_files_are_unpacked_without_a_common_folder_and_hidden_files(names: list[str], paths: list[str]) -> None:
+    assert listed(packed(*((name, b"" if name.endswith("/") else b"x") for name in names))) == paths
+
+
+@pytest.mark.parametrize(
+    ("names", "why"),
+    [
+        (["../0.png"], "file 1 of the archive leads out"),
+        (["a.png", "b/../0.png"], "file 2 of the archive leads out"),
+        (["/0.png"], "leads out"),
+        (["a//0.png"], "leads out"),
+        (["./0.png"], "leads out"),
+        (["c:0.png"], "leads out"),
+        (["a\\0.png"], "leads out"),
+        (["a/b/c/d/e/f.png"], "6 folders deep; at most 5"),
+        (["ü.png"], "other signs"),
+        (["-a.png"], "other signs"),
+        (["n" * 101], "other signs"),
+        (["a.png", "A.png"], "same name, but for capital"),
+        (["a", "a/b.png"], "name of a folder"),
+        ([".hidden"], "holds no files"),
+        ([], "holds no files"),
+    ],
+)
+def test_a_name_that_breaks_a_rule_is_refused(names: list[str], why: str) -> None:
+    with pytest.raises(ArchiveInvalid, match=why):
+        listed(packed(*((name, b"x") for name in names)))
+
+
+def test_limits_hold_on_both_sides_of_their_border() -> None:
+    assert len(listed(packed(*((f"{each}.png", b"x") for each in range(3))))) == 3
+    with pytest.raises(ArchiveInvalid, match="has 4 files; at most 3"):
+        listed(packed(*((f"{each}.png", b"x") for each in range(4))))
+    assert listed(packed(("a", bytes(60)), ("b", bytes(40)))) == ["a", "b"]
+    with pytest.raises(ArchiveInvalid, match="holds 101 bytes; at most 100"):
+        listed(packed(("a", bytes(60)), ("b", bytes(41))))
+    with pytest.raises(ArchiveInvalid, match="file 1 of the archive holds 61 bytes; at most 60"):
+        listed(packed(("a", bytes(61))))
+    with pytest.raises(ArchiveInvalid, match="lists 1 files and says that there are 2"):
+        listed(packed(("a", b"x")), stated=2)
+
+
+@pytest.mark.parametrize(("mib", "refused"), [(1, False), (2, True)])
+def test_the_packing_ratio_is_bounded_for_files_over_one_mebibyte(mib: int, refused: bool) -> None:
+    wide = dataclasses.replace(LIMITS, entry_bytes=4 << 20, unpacked_bytes=4 << 20)
+    file = packed(("a", bytes(mib << 20)), method=zipfile.ZIP_DEFLATED)
+    if refused:
+        with pytest.raises(ArchiveInvalid, match="over 10 times as many"):
+            listed(file, wide)
+        assert listed(file, dataclasses.replace(wide, ratio=2000)) == ["a"]
+    else:
+        assert listed(file, wide) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "refused"),
+    [
+        (0, False),
+        (stat.S_IFREG | 0o644, False),
+        (stat.S_IFLNK | 0o777, True),
+        (stat.S_IFCHR, True),
+        (stat.S_IFIFO, True),
+    ],
+)
+def test_links_and_devices_are_refused(mode: int, refused: bool) -> None:
+    info = zipfile.ZipInfo("a.png")
+    info.external_attr = mode << 16
+    if refused:
+        with pytest.raises(ArchiveInvalid, match="a link or a device"):
+            listed(packed((info, b"x")))
+    else:
+        assert listed(packed((info, b"x"))) == ["a.png"]
+
+
+@pytest.mark.parametrize(("bits", "refused"), [(0x1, True), (0x40, True), (0x2000, True), (0x800, False), (0, False)])
+def test_encrypted_files_are_refused(bits: int, refused: bool) -> None:
+    info = zipfile.ZipInfo("a.png")
+    info.flag_bits = bits
+    if refused:
+        with pytest.raises(ArchiveInvalid, match="encrypted"):
+            archive_list._check_entry(info, 0, LIMITS)
+    else:
+        archive_list._check_entry(info, 0, LIMITS)
+
+
+def test_other_methods_of_packing_are_refused() -> None:
+    with pytest.raises(ArchiveInvalid, match="packed by method 12"):
+        listed(packed(("a.png", b"x"), method=zipfile.ZIP_BZIP2))
+
+
+@pytest.mark.parametrize(
+    ("offset", "size", "why"),
+    [(0, 1, None), (0, 5, "goes on into the list"), (1, 1, "not where its list says"), (30, 1, "not where its list")],
+)
+def test_a_file_lies_where_the_list_says(offset: int, size: int, why: str | None) -> None:
+    file = packed(("a.png", b"x"))
+    with zipfile.ZipFile(file) as archive:
+        info, start = archive.infolist()[0], archive.start_dir
+    info.header_offset, info.compress_size = offset, size
+    if why is None:
+        archive_list._check_places([info], file, start)
+    else:
+        with pytest.raises(ArchiveInvalid, match=why):
+            archive_list._check_places([info], file, start)
+
+
+def test_two_files_in_the_same_place_are_refused() -> None:
+    file = packed(("a.png", b"x"), ("b.png", b"y"))
+    with zipfile.ZipFile(file) as archive:
+        infos, start = archive.infolist(), archive.start_dir
+    archive_list._check_places(infos[::-1], file, start)
+    infos[1].header_offset = infos[0].header_offset
+    with pytest.raises(ArchiveInvalid, match="in the same place"):
+        archive_list._check_places(infos, file, start)
+
+
+def test_a_leading_folder_is_removed_from_paths_alone() -> None:
+    file = packed(("rec/images/0.png", b"x"))
+    with zipfile.ZipFile(file) as archive:
+        (entry,) = entries_of(archive, file, 1, LIMITS)
+    assert entry.path == PurePosixPath("images/0.png") and entry.info.filename == "rec/images/0.png"

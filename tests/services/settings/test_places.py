@@ -1,0 +1,67 @@
+"""Each refused setting is named with the place that it came from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from services.settings import SettingsInvalid
+from services.settings.load import load_settings
+
+
+def refused(file: Path | None = None, flags: dict[str, str] | None = None) -> str:
+    with pytest.raises(SettingsInvalid) as error:
+        load_settings(file, flags)
+    return str(error.value)
+
+
+def test_the_winning_place_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("log:\n  level: x\nserver:\n  port: no\n")
+    assert "settings.yaml, line 4: server.port" in refused(file)
+    monkeypatch.setenv("INTRASPLAT_SERVER__PORT", "seven")
+    assert "INTRASPLAT_SERVER__PORT: server.port" in refused(file)
+    assert "--set server.port: server.port" in refused(file, {"server.port": "none"})
+
+
+@pytest.mark.parametrize("name", ["server", "server.port.more"])
+def test_a_flag_of_a_whole_section_or_of_something_inside_is_named(name: str) -> None:
+    value = "{port: none}" if name == "server" else "1"
+    assert refused(None, {name: value}).startswith(f"--set {name}: server.port")
+
+
+def test_a_flag_with_a_longer_name_is_not_blamed(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("server:\n  por: 1\n")
+    said = refused(file, {"server.port": "8080"})
+    assert said == "settings.yaml, line 2: there is no key 'por' in server; the nearest is 'port'" or said.endswith(
+        "line 2: there is no key 'por' in server; the nearest is 'port'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ({"servr.port": "1"}, "there is no key 'servr'; the nearest is 'server'"),
+        ({"server.prt": "1"}, "there is no key 'prt' in server; the nearest is 'port'"),
+        ({"auth.oidc": "{isuer: x}"}, "there is no key 'isuer' in auth.oidc; the nearest is 'issuer'"),
+        ({"server": "1", "server.port": "2"}, "--set server.port: server is given as a value, too"),
+    ],
+)  # fmt: skip
+def test_a_misspelt_key_gets_the_nearest_one(flags: dict[str, str], said: str) -> None:
+    assert said in refused(None, flags)
+
+
+@pytest.mark.parametrize(
+    ("variable", "is_refused"),
+    [("INTRASPLAT_SERVR__PORT", True), ("INTRASPLAT_RECORDINGS", False), ("OTHER_SERVR__PORT", False)],
+)
+def test_only_our_variables_of_sections_are_looked_at(
+    variable: str, is_refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, "1")
+    if is_refused:
+        assert refused() == f"{variable}: there is no key 'servr'; the nearest is 'server'"
+    else:
+        load_settings()

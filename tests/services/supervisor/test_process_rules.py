@@ -1,0 +1,291 @@
+"""Rules by which a process is taken to be well, hung or ended, with a clock that is set by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from services.bus.errors import NoAnswer
+from services.supervisor import process as processes
+from services.supervisor.launching import Direct
+from services.supervisor.process import ManagedProcess, Rate
+from services.supervisor.specs import EngineSpec, ProcessLimits, SourceSpec, StreamSpec
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: now.s))  # not the event loop's
+    return now
+
+
+def managed(runtime, role="engine", start=None, **spec: Any) -> ManagedProcess:
+    values = {"name": "theatre", "source": SourceSpec(address="synthetic:"), **spec}
+    events: list[Any] = []
+    process = ManagedProcess(StreamSpec(**values), role, runtime.stream("theatre"), start or Direct(), events.append)
+    process.events = events  # type: ignore[attr-defined]
+    return process
+
+
+def test_a_rate_is_that_of_the_last_seconds():
+    rate = Rate(3.0)
+    assert rate.hz is None
+    rate.tell(10, 0.0)
+    rate.tell(12, 0.49)
+    assert rate.hz is None, "too short a time"
+    rate.tell(15, 0.5)
+    assert rate.hz == 10.0
+    for second in range(1, 8):
+        rate.tell(15 + 30 * second, 0.5 + second)
+    assert rate.hz == 30.0, "older counts are forgotten"
+    rate.tell(225, 8.5)
+    assert rate.hz == 20.0, "a count that stands still lowers it"
+    rate.tell(3, 9.0)
+    assert rate.hz is None, "a smaller count is that of a new process"
+    rate.tell(3, 10.0)
+    assert rate.hz == 0.0
+    rate.clear()
+    assert rate.hz is None
+
+
+def test_a_rate_keeps_one_count_at_the_border_of_its_time():
+    rate = Rate(3.0)
+    for moment, count in ((0.0, 0), (1.0, 100), (4.0, 130)):
+        rate.tell(count, moment)
+    assert rate.hz == 10.0, "the count of exactly three seconds ago is the first"
+    rate = Rate(3.0)
+    for moment, count in ((0.0, 0), (1.0, 100), (3.9, 129)):
+        rate.tell(count, moment)
+    assert rate.hz == round(129 / 3.9, 2)
+
+
+def test_a_process_hangs_when_it_is_silent_or_shows_nothing_for_longer_than_its_limit(runtime, clock):
+    process = managed(runtime, limits=ProcessLimits(start_s=20.0, heartbeat_s=3.0, hung_s=10.0))
+    process._heard_s = 100.0
+    assert process._hangs(120.0) is None
+    assert process._hangs(120.1) == "it has not begun within 20 s"
+    process._take({"state": "live", "figures": {"published": 0}})
+    assert process._hangs(103.0) is None
+    assert process._hangs(103.1) == "it has said nothing for 3.1 s"
+    process._heard_s = 200.0
+    assert process._hangs(200.0) is None, "one that has published nothing yet is not measured by it"
+    clock.s = 200.0
+    process._take({"state": "live", "figures": {"published": 5}})
+    clock.s = 205.0
+    process._take({"state": "live", "figures": {"published": 5}})
+    process._heard_s = 211.0
+    assert process._hangs(210.0) is None
+    assert process._hangs(210.5) == "it has published nothing for 10.5 s"
+    clock.s = 211.0
+    process._take({"state": "live", "figures": {"published": 6}})
+    assert process._hangs(213.0) is None
+
+
+@pytest.mark.parametrize(
+    ("role", "state", "figures", "well"),
+    [
+        ("engine", "live", {"published": 1}, True),
+        ("engine", "running", {"published": 1}, True),
+        ("engine", "running", {"published": 0}, False),
+        ("engine", "starting", {"published": 1}, False),
+        ("engine", "running", None, False),
+        ("capture", "live", {}, True),
+        ("capture", "opening", {}, False),
+    ],
+)
+def test_a_process_is_well_once_it_works(runtime, clock, role, state, figures, well):
+    process = managed(runtime, role)
+    process._take({"state": state, "reason": "", "figures": figures})
+    assert (process._well_s == 100.0) is well
+    clock.s = 101.0
+    process._take({"state": state, "reason": "", "figures": figures})
+    assert process._well_s == (100.0 if well else 0.0)
+
+
+def test_the_state_is_that_of_the_heartbeat(runtime, clock):
+    process = managed(runtime, "capture")
+    state = process.state
+    assert (state.state, state.reason, state.pid, state.restarts, state.figures, state.heard_s, state.rate_hz) == (
+        "stopped", "it was not started", None, 0, {}, None, None,
+    )  # fmt: skip
+    process._identity = SimpleNamespace(pid=7)  # type: ignore[assignment]
+    assert (process.state.state, process.state.pid, process.state.heard_s) == ("starting", 7, None)
+    assert process.measures == {}
+    for frames in (0, 30):
+        process._take({"state": "live", "reason": "well", "figures": {"frames": frames}, "measures": {"a": frames}})
+        clock.s += 1.0
+    clock.s -= 0.75
+    state = process.state
+    assert (state.state, state.reason, state.pid, state.figures) == ("live", "well", 7, {"frames": 30})
+    assert (state.heard_s, state.rate_hz) == (0.25, 30.0)
+    assert process.measures == {"a": 30}
+    process._take({"state": "live", "reason": "well", "figures": "junk", "measures": "junk"})
+    assert process.state.figures == {} and process.measures == {}
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "reason"),
+    [
+        (None, None),
+        ({"state": "ended", "reason": "no more frames"}, "no more frames"),
+        ({"state": "failed", "reason": "no GPU"}, "no GPU"),
+        ({"state": "live", "reason": "well"}, None),
+    ],
+)
+def test_the_last_heartbeat_gives_the_reason_of_an_end(runtime, heartbeat, reason):
+    process = managed(runtime)
+    process._heartbeat = heartbeat
+    assert process._last_reason() == reason
+
+
+def test_an_engine_gets_its_gpu_alone(runtime):
+    assert managed(runtime, engine=EngineSpec(gpu=1))._environment() == {"CUDA_VISIBLE_DEVICES": "1"}
+    assert managed(runtime, engine=EngineSpec(gpu=0))._environment() == {"CUDA_VISIBLE_DEVICES": "0"}
+    assert managed(runtime)._environment() == {}
+    assert managed(runtime, "capture", engine=EngineSpec(gpu=1))._environment() == {}
+
+
+class Identity:
+    """A process that ends when it is told to by one of some signals."""
+
+    pid = 7
+
+    def __init__(self, *deadly: int) -> None:
+        self.deadly, self.signals, self.over = deadly, [], asyncio.Event()
+        self.waits: list[float | None] = []
+
+    def signal(self, number: int) -> None:
+        self.signals.append(number)
+        if number in self.deadly:
+            self.over.set()
+
+    async def ended(self, within_s: float | None = None) -> bool:
+        self.waits.append(within_s)
+        if within_s is None:
+            await self.over.wait()
+        return self.over.is_set()
+
+
+class Starter:
+    """Starts nothing; notes what it was asked for."""
+
+    def __init__(self, how: str | None = None) -> None:
+        self.how, self.asked, self.started = how, [], []
+
+    async def start(self, module, arguments, output, environment, *, fresh):
+        self.started.append((module, list(arguments), dict(environment), fresh))
+        raise OSError("no space")
+
+    async def how_ended(self, pid: int) -> str | None:
+        self.asked.append(pid)
+        return self.how
+
+
+@pytest.mark.parametrize(
+    ("deadly", "signals"),
+    [
+        ((signal.SIGTERM, signal.SIGKILL), [signal.SIGTERM, signal.SIGCONT]),
+        ((signal.SIGKILL,), [signal.SIGTERM, signal.SIGCONT, signal.SIGKILL]),
+    ],
+)
+def test_a_process_that_does_not_finish_in_its_time_is_killed(runtime, deadly, signals):
+    async def end() -> tuple[Identity, Starter]:
+        start, identity = Starter(), Identity(*deadly)
+        process = managed(runtime, start=start, limits=ProcessLimits(drain_s=4.0))
+        await process._end(identity)  # type: ignore[arg-type]
+        return identity, start
+
+    identity, start = asyncio.run(end())
+    assert identity.signals == signals and identity.waits[0] == 4.0 and identity.over.is_set()
+    assert start.asked == [7], "its exit status was fetched"
+
+
+@pytest.mark.parametrize(
+    ("how", "heartbeat", "said"),
+    [
+        ("signal 9", {"state": "failed", "reason": "no GPU"}, "signal 9"),
+        (None, {"state": "failed", "reason": "no GPU"}, "no GPU"),
+        (None, None, "it ended"),
+    ],
+)
+def test_the_end_of_a_watched_process_has_its_best_reason(runtime, how, heartbeat, said):
+    async def watched() -> str:
+        process, identity = managed(runtime, start=Starter(how)), Identity()
+        process._heartbeat, process._heard_s = heartbeat, processes.time.monotonic()
+        identity.over.set()
+        return await process._watched(identity)  # type: ignore[arg-type]
+
+    assert asyncio.run(watched()) == said
+
+
+def test_a_hung_process_is_killed_once_and_a_pause_of_the_supervisor_is_not_held_against_it(
+    runtime, clock, monkeypatch
+):
+    monkeypatch.setattr(processes, "LOOK_S", 0.001)
+
+    async def watched() -> tuple[str, list[int]]:
+        process, identity = managed(runtime, start=Starter("signal 9")), Identity(signal.SIGKILL)
+        process._heartbeat, process._heard_s, process._shown = {"state": "live"}, clock.s, (4, clock.s)
+        task = asyncio.create_task(process._watched(identity))  # type: ignore[arg-type]
+        await asyncio.sleep(0.01)
+        clock.s += 1000.0  # the supervisor stood still
+        await asyncio.sleep(0.02)
+        assert not task.done() and process._heard_s == clock.s == process._shown[1] and process._shown[0] == 4
+        silent_s = process._spec.limits.heartbeat_s + 0.5
+        for _ in range(int(silent_s / 0.5) + 2):
+            clock.s += 0.5
+            await asyncio.sleep(0.005)
+        return await task, identity.signals
+
+    how, signals = asyncio.run(watched())
+    assert how.startswith("it has said nothing for") and how.endswith("; it was killed")
+    assert signals == [signal.SIGKILL]
+
+
+@pytest.mark.parametrize(
+    ("restarts", "never_well", "role", "again", "fresh"),
+    [(0, 0, "engine", False, False), (1, 2, "engine", True, False), (5, 3, "engine", True, True), (5, 3, "capture", False, True)],
+)  # fmt: skip
+def test_how_a_process_is_started_depends_on_its_ends(runtime, restarts, never_well, role, again, fresh):
+    start = Starter()
+    process = managed(runtime, role, start=start)
+    process._restarts = SimpleNamespace(total=restarts, never_well=never_well)  # type: ignore[assignment]
+    assert asyncio.run(process._started()) is None
+    ((module, arguments, _, was_fresh),) = start.started
+    assert module == f"services.supervisor.{role}" and ("--again" in arguments) is again and was_fresh is fresh
+    assert process.state.state == "down" and process.state.reason == "it cannot be started: no space"
+
+
+@pytest.mark.parametrize(("size", "kept"), [(1 << 20, True), ((1 << 20) + 1, False)])
+def test_a_log_that_has_grown_too_long_is_begun_anew(runtime, size, kept):
+    process = managed(runtime, start=Starter())
+    log = process._folder.log("engine")
+    log.write_bytes(bytes(size))
+    asyncio.run(process._started())
+    assert log.exists() is kept
+
+
+def test_a_process_that_does_not_run_takes_no_command(runtime):
+    with pytest.raises(NoAnswer, match="the engine process of theatre does not run: it was not started"):
+        asyncio.run(managed(runtime).command("ping", 1.0, {}))
+
+
+@pytest.mark.parametrize("stop", [True, False])
+def test_closing_ends_the_process_only_when_asked(runtime, stop):
+    async def close() -> tuple[Any, Identity]:
+        process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
+        process._identity = identity  # type: ignore[assignment]
+        await process.close(stop=stop, reason="why")
+        return process, identity
+
+    process, identity = asyncio.run(close())
+    assert bool(identity.signals) is stop
+    ((event),) = process.events
+    assert (event.stream, event.role, event.kind, event.reason, event.pid) == (
+        "theatre", "engine", "stopped" if stop else "left", "why", 7,
+    )  # fmt: skip
+    assert (process.state.state, process.state.reason, process.state.pid) == ("stopped", "why", None)
