@@ -146,9 +146,11 @@ class RemoteBlobs:
 
 
 def _written_before(described: dict[str, Any], moment_s: float) -> bool:
-    """Whether a file is older than a moment; False where its store does not say."""
+    """Return True if a file is older than a moment, False where its store does not say. Stores give a datetime, or a Unix time in seconds."""
     written = described.get("LastModified", described.get("created"))
-    return written is not None and written.timestamp() < moment_s
+    if written is None:
+        return False
+    return float(written if isinstance(written, int | float) else written.timestamp()) < moment_s
 
 
 @contextlib.contextmanager

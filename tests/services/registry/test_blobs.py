@@ -1,0 +1,104 @@
+"""Stores of uploaded files: a folder, and an object store in memory."""
+
+from __future__ import annotations
+
+import datetime
+import errno
+from pathlib import Path
+
+import pytest
+
+from services.registry import blobs
+from services.registry.blobs import FolderBlobs, RemoteBlobs, open_blobs
+from services.registry.errors import StoreUnavailable
+
+
+@pytest.fixture
+def remote(request: pytest.FixtureRequest) -> RemoteBlobs:
+    store = open_blobs(f"memory://{request.node.name}/blobs", Path("unused"))
+    assert isinstance(store, RemoteBlobs)
+    return store
+
+
+def test_a_remote_file_is_there_whole_until_it_is_removed(remote: RemoteBlobs, tmp_path: Path) -> None:
+    (tmp_path / "staged").write_bytes(b"whole")
+    assert remote.stored() == []
+    remote.publish(tmp_path / "staged", "key")
+    assert [(each.key, each.size) for each in remote.stored()] == [("key", 5)]
+    with remote.local_file("key", tmp_path) as file:
+        assert file.read_bytes() == b"whole" and file.name.endswith(".part")
+    assert not file.exists(), "the fetched copy is removed"
+    remote.remove("key")
+    remote.remove("key")
+    assert remote.stored() == []
+    with pytest.raises(StoreUnavailable, match="restore it from a backup"), remote.local_file("key", tmp_path):
+        pass
+
+
+def test_a_file_that_arrived_in_part_is_noticed(
+    remote: RemoteBlobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "staged").write_bytes(b"whole")
+    monkeypatch.setattr(remote._files, "info", lambda path: {"size": 4})
+    with pytest.raises(StoreUnavailable, match="has 4 of 5 bytes of key; upload it again"):
+        remote.publish(tmp_path / "staged", "key")
+
+
+def test_a_file_of_another_machine_is_abandoned_after_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+    moment = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+    store = RemoteBlobs("memory://ages/blobs", {})
+    described = [
+        {"name": f"ages/blobs/{name}", "size": "3", "type": kind, **times}
+        for name, kind, times in (
+            ("new", "file", {"LastModified": moment - datetime.timedelta(seconds=3599)}),
+            ("border", "file", {"LastModified": moment - datetime.timedelta(seconds=3600)}),
+            ("old", "file", {"created": moment - datetime.timedelta(seconds=3601)}),
+            ("seconds", "file", {"created": moment.timestamp() - 3601}),
+            ("unknown", "file", {}),
+            ("folder", "directory", {}),
+        )
+    ]
+    monkeypatch.setattr(store._files, "ls", lambda path, detail: described)
+    monkeypatch.setattr(blobs.time, "time", moment.timestamp)
+    assert {each.key: each.abandoned for each in store.stored()} == {
+        "new": False, "border": False, "old": True, "seconds": True, "unknown": False,
+    }  # fmt: skip
+    assert {each.size for each in store.stored()} == {3}
+
+
+def test_a_folder_keeps_files_that_nobody_changes(tmp_path: Path) -> None:
+    store = open_blobs(None, tmp_path / "blobs")
+    assert isinstance(store, FolderBlobs)
+    assert store.folder.stat().st_mode & 0o777 == 0o700
+    (tmp_path / "staged").write_bytes(b"whole")
+    store.publish(tmp_path / "staged", "key")
+    assert not (tmp_path / "staged").exists()
+    assert (store.folder / "key").stat().st_mode & 0o777 == 0o400
+    assert [(each.key, each.size, each.abandoned) for each in store.stored()] == [("key", 5, True)]
+    store.remove("key")
+    store.remove("key")
+    assert store.stored() == []
+
+
+class _Botocore(Exception):
+    __module__ = "botocore.exceptions"
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (FileNotFoundError(errno.ENOENT, "No such file", "a.blob"), "has no a.blob; restore it"),
+        (PermissionError(errno.EACCES, "Permission denied"), "cannot be used: Permission denied; check its space"),
+        (_Botocore("no answer"), "does not answer: no answer; check its address"),
+    ],
+)
+def test_errors_of_a_store_are_said(error: Exception, why: str) -> None:
+    with pytest.raises(StoreUnavailable, match=why), blobs._store_errors("s3://x"):
+        raise error
+
+
+def test_a_bug_stays_one() -> None:
+    with pytest.raises(KeyError), blobs._store_errors("s3://x"):
+        raise KeyError("bug")
+    with pytest.raises(StoreUnavailable, match="give s3://BUCKET/PREFIX"):
+        open_blobs("nonsense://x", Path("unused"))
