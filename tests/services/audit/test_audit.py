@@ -245,3 +245,20 @@ def test_entries_are_what_their_line_says():
         0, "2026-01-01T00:00:00.000+00:00", "x", "a", "", "", "done", detail={"n": 1, "b": True, "s": "t", "z": None}
     )
     assert parse_line(entry.line())[0] == entry
+
+
+@pytest.mark.parametrize("short_by", [0, 1])
+def test_the_longest_entry_is_written_and_a_longer_one_is_not(tmp_path, monkeypatch, short_by):
+    audit = AuditLog(tmp_path / "audit.jsonl")
+    audit.append("key.create", actor="a", subject="first")
+    length = len((tmp_path / "audit.jsonl").read_bytes())
+    audit.append("key.create", actor="a", subject="again")
+    length = len((tmp_path / "audit.jsonl").read_bytes()) - length
+    monkeypatch.setattr("services.audit.log.MOST_LINE_BYTES", length - short_by)
+    if short_by:
+        with pytest.raises(ValueError, match=f"an entry of {length} bytes; at most {length - 1}"):
+            audit.append("key.create", actor="a", subject="third")
+    else:
+        audit.append("key.create", actor="a", subject="third")
+    assert audit.head.seq == 2 - short_by
+    audit.close()
