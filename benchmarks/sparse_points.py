@@ -6,18 +6,26 @@ of the poses; one factor for the whole recording, the median of true over render
 
 from __future__ import annotations
 
+import io
 import math
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.depth import flat_depths
+from gsplat_core.io.files import read_regular
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.float64]
+NAMES = ("points", "obs_point", "obs_frame")
+MOST_BYTES = 256 << 20
+"""Size of the file, and of its arrays together."""
 
 
 @dataclass(frozen=True)
@@ -34,17 +42,33 @@ class SparsePoints:
     @classmethod
     def read(cls, path: str | Path) -> SparsePoints:
         """A `.npz` file with `points` [P, 3], `obs_point` [S] and `obs_frame` [S]. Raises InvalidInput where they do not fit together."""
-        with np.load(path, allow_pickle=False) as stored:
-            missing = {"points", "obs_point", "obs_frame"} - set(stored.files)
-            if missing:
-                raise InvalidInput(
-                    f"{path} has no {', '.join(sorted(missing))}; it must hold points, obs_point and obs_frame"
-                )
-            points, point, frame = (stored[name] for name in ("points", "obs_point", "obs_frame"))
+        try:
+            points, point, frame = _arrays(read_regular(path, MOST_BYTES))
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            RuntimeError,
+            EOFError,
+            RecursionError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
+            said = error.strerror or error if isinstance(error, OSError) else error
+            raise InvalidInput(
+                f"{path} cannot be read: {said!s:.200}; give a .npz file with points, obs_point and obs_frame"
+            ) from error
         if points.ndim != 2 or points.shape[1] != 3 or point.ndim != 1 or point.shape != frame.shape:
             raise InvalidInput(
                 f"{path}: points must be [P, 3], obs_point and obs_frame [S]; got {list(points.shape)}, {list(point.shape)} and {list(frame.shape)}"
             )
+        if points.dtype.kind not in "fiu" or point.dtype.kind not in "iu" or frame.dtype.kind not in "iu":
+            raise InvalidInput(
+                f"{path}: points must be numbers, obs_point and obs_frame integers; got {points.dtype}, {point.dtype} and {frame.dtype}"
+            )
+        if not np.isfinite(points).all():
+            raise InvalidInput(f"{path}: points holds NaN or infinite values; leave these points out")
         if len(point) and not (point.min() >= 0 and point.max() < len(points)):
             raise InvalidInput(
                 f"{path}: obs_point goes from {point.min()} to {point.max()}, and there are {len(points)} points"
@@ -59,6 +83,18 @@ class SparsePoints:
         pixels = seen[:, :2] / seen[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]
         inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(1)
         return pixels[inside], seen[inside, 2]
+
+
+def _arrays(data: bytes) -> list[NDArray[Any]]:
+    """Return the arrays points, obs_point and obs_frame of a `.npz` file. Raises ValueError for other contents."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = [f"{name}.npy" for name in NAMES]
+        missing = [name for name in NAMES if f"{name}.npy" not in archive.namelist()]
+        if missing:
+            raise ValueError(f"it has no {', '.join(sorted(missing))}")
+        if sum(archive.getinfo(name).file_size for name in names) > MOST_BYTES:
+            raise ValueError(f"its arrays have more than {MOST_BYTES >> 20} MiB")
+        return [np.load(io.BytesIO(archive.read(name)), allow_pickle=False) for name in names]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidInput, InvalidSetting
 
 
 @dataclass(frozen=True)
@@ -74,3 +74,12 @@ def shortened(value: object, most: int = 80) -> str:
         return f"a {type(value).__name__} of {len(value)}"
     text = repr(value)
     return text if len(text) <= most else text[:most] + "…"
+
+
+def check_seen_at(time_s: float, window_s: tuple[float, float]) -> None:
+    """Raise InvalidSetting for a time outside of the window (start, end) that a model has seen; all in seconds."""
+    start_s, end_s = window_s
+    if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
+        raise InvalidSetting(
+            f"the model has seen nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
+        )

@@ -15,6 +15,8 @@ SIDECARS = _UNSPECIFIC | {"images_right", "masks", "depth", "true_depth", "scene
 DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json")
 """Files that only a recording's folder has."""
 MAX_PATH_BYTES = 4096
+BATCH_DATABASE = "batch.sqlite"
+"""Lies beside the results of a batch, which other runs must not replace: the batch would take theirs for its own."""
 MARKER = ".intrasplat.json"
 """Lies in every folder that this program has made, and only there."""
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".npy", ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
@@ -30,6 +32,8 @@ def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
             raise OutputError(f"--out is {what}; give a folder for the results alone")
     if _same(real, Path.cwd()):
         raise OutputError("--out is empty or the current folder; give the name of a folder for the results alone")
+    if (real.parent / BATCH_DATABASE).is_file():
+        raise OutputError(f"--out {out} is a result of the batch in {real.parent}; choose another --out")
     for source in inputs:
         if any(_same(parent, real) for parent in _with_parents(source)):
             raise OutputError(f"{source} lies inside --out {out}, where the results are replaced; choose another --out")

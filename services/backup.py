@@ -25,7 +25,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from gsplat_core.errors import UserError
-from gsplat_core.io.files import PartialFolder, sync_folder
+from gsplat_core.io.files import PartialFolder, open_regular, read_regular, sync_folder
 from services.audit import verify
 from services.audit.entries import MOST_LINE_BYTES, parse_line
 from services.audit.head import read_head
@@ -339,7 +339,7 @@ def _manifest(folder: Path) -> tuple[dict[str, Any], dict[str, tuple[int, str]]]
     try:
         if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MOST_MANIFEST_BYTES:
             raise ValueError("it is no plain file, or too long")
-        described = json.loads(path.read_bytes())
+        described = json.loads(read_regular(path, MOST_MANIFEST_BYTES, follow_links=False))
         if described["format"] != FORMAT:
             raise ValueError(f"its format is {described['format']!r:.40}, and this program knows {FORMAT}")
         files = {str(name): (int(size), str(digest)) for name, (size, digest) in described["files"].items()}
@@ -374,7 +374,7 @@ def _copy(source: Path, target: Path) -> str:
     _make_parents(target)
     digest = hashlib.sha256()
     target.unlink(missing_ok=True)
-    with open(source, "rb") as read, open(target, "xb", opener=_private) as written:
+    with open_regular(source) as read, open(target, "xb", opener=_private) as written:
         while piece := read.read(PIECE_BYTES):
             digest.update(piece)
             written.write(piece)
@@ -390,7 +390,7 @@ def _make_parents(target: Path) -> None:
 
 
 def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -76,11 +76,7 @@ class Measurement:
     """
 
     def __init__(self, model: Model, time_s: float, camera: Camera | None = None) -> None:
-        start_s, end_s = model.time_window_s
-        if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
-            raise InvalidSetting(
-                f"the model contains nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
-            )
+        model.check_time(time_s)
         self.camera = camera or model.camera
         self.metric = model.metric
         self.origin = None if model.depth_source is None else model.depth_source.origin

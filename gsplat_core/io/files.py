@@ -8,13 +8,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import io
 import os
 import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -23,6 +24,22 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+
+class _Nonwaiting(io.FileIO):
+    """Unbuffered file that raises OSError where reading would wait. Some files of /proc, such as kmsg, are plain files by their mode and wait."""
+
+    def readinto(self, buffer: Any) -> int:
+        count: int | None = super().readinto(buffer)
+        if count is None:
+            raise OSError(errno.EAGAIN, "it has no contents that could be read without waiting")
+        return count
+
+    def readall(self) -> bytes:
+        data: bytes | None = super().readall()
+        if data is None:
+            raise OSError(errno.EAGAIN, "it has no contents that could be read without waiting")
+        return data
 
 
 def open_regular(path: str | Path, *, follow_links: bool = True) -> BinaryIO:
@@ -44,7 +61,7 @@ def open_regular(path: str | Path, *, follow_links: bool = True) -> BinaryIO:
     if not stat.S_ISREG(mode):
         os.close(descriptor)
         raise _not_regular(mode, path)
-    return os.fdopen(descriptor, "rb")
+    return io.BufferedReader(_Nonwaiting(descriptor), io.DEFAULT_BUFFER_SIZE)
 
 
 def read_regular(path: str | Path, most_bytes: int, *, follow_links: bool = True) -> bytes:

@@ -21,6 +21,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.scope_path import ScopePath
+from gsplat_core.value_ranges import check_seen_at
 
 
 def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
@@ -117,6 +118,10 @@ class Model:
     def as_model(self) -> Model:
         """Itself; a `Snapshot` gives a copy."""
         return self
+
+    def check_time(self, time_s: float) -> None:
+        """Raise InvalidSetting for a time, in seconds, outside of the model's window, which clamping would show as another time."""
+        check_seen_at(time_s, self.time_window_s)
 
     def clamp_time(self, time_s: float) -> float:
         """`time_s` brought into the time window, or into what the field continues after it."""

@@ -16,6 +16,8 @@ MAX_SIDE_PX = 2**15
 """Of one picture; two stand side by side in a video, and video formats count to 65535."""
 MAX_STEPS = 100_000_000
 MAX_FRAMES = 10**9
+LEAST_FPS = 0.001
+"""A video's file cannot state a rate that is much lower."""
 MAX_RENDERED_FRAMES = 1_000_000
 """Of one `render`: nine hours at 30 frames a second."""
 
@@ -60,6 +62,14 @@ def check_picture(camera: Camera, scale: float) -> None:
         )
 
 
+def check_shown_size(width_px: float, height_px: float, scale: float) -> None:
+    """Raise InvalidSetting for a scale that leaves less than one pixel of a side."""
+    if min(width_px, height_px) * scale < 1:
+        raise InvalidSetting(
+            f"at scale {scale:g} nothing is left of {width_px:g}x{height_px:g} px; give at least {1 / min(width_px, height_px):.3g}"
+        )
+
+
 def check_width(width_px: int) -> None:
     """Raises InvalidSetting when pictures side by side are wider than this program makes."""
     if width_px > MAX_SIDE_PX:
@@ -70,8 +80,8 @@ def check_width(width_px: int) -> None:
 
 def frames_to_render(window_s: tuple[float, float], fps: float) -> int:
     """How many frames show a time window from end to end. Raises InvalidSetting for a rate that is out of range, and for too many frames."""
-    if not (math.isfinite(fps) and 0 < fps <= 1000):
-        raise InvalidSetting(f"fps is {fps:g}; it must be above 0 and at most 1000")
+    if not (math.isfinite(fps) and LEAST_FPS <= fps <= 1000):
+        raise InvalidSetting(f"fps is {fps:g}; it must be at least {LEAST_FPS:g} and at most 1000")
     start_s, end_s = window_s
     span = (end_s - start_s) * fps
     if not span < MAX_RENDERED_FRAMES:

@@ -20,7 +20,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from gsplat_core.transfers import HostCopy
 from operators.applications.device import check_device
-from operators.applications.limits import check_picture, check_scale, check_width, frames_to_render
+from operators.applications.limits import check_picture, check_scale, check_shown_size, check_width, frames_to_render
 from operators.applications.memory import render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.views import RECORDED, View, ViewWish, view_of
@@ -70,6 +70,7 @@ def render_model(
     model = load_model(bundle).to(device)
     if is_scene_file(bundle) and view.name == RECORDED.name:  # no camera was recorded
         view = ViewWish("orbit")
+    check_shown_size(model.camera.width_px, model.camera.height_px, scale)
     camera = model.camera.scaled(scale)
     check_picture(camera, scale)
     if device == "cpu":

@@ -27,7 +27,7 @@ from services.cli.options import (
     SynthesizeOptions,
     takes_run_options,
 )
-from services.cli.streams import printable
+from services.cli.streams import sentence
 
 # Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
 _USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
@@ -66,7 +66,7 @@ def _say_usage(error: Any) -> int:
         return BAD_INPUT
     command = error.ctx.command_path if getattr(error, "ctx", None) is not None else "intrasplat"
     said = " ".join(error.format_message().split()).rstrip(".")
-    typer.echo(f"error: {printable(said)}; `{command} --help` lists what there is", err=True)
+    typer.echo(f"error: {sentence(said)}; `{command} --help` lists what there is", err=True)
     return BAD_INPUT
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,12 +11,15 @@ import typer
 
 from services.audit import verify
 from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.streams import printable
 from services.control.app import AUDIT_FILE
 from services.settings import SettingsInvalid, load_settings
 
 
 def audit_verify_command(file: Path | None, config: Path | None, head: str | None, *, as_json: bool) -> int:
     """Say whether an audit log is as it was written; 2 when it is not."""
+    if head is not None and not re.fullmatch("[0-9a-f]{64}", head):
+        raise SettingsInvalid(f"--head is {head!r:.80}, no digest; give the 64 hexadecimal digits of an entry")
     path = file or load_settings(config).data_dir / AUDIT_FILE
     try:
         verdict = verify(path, head)
@@ -23,6 +27,11 @@ def audit_verify_command(file: Path | None, config: Path | None, head: str | Non
         raise SettingsInvalid(
             f"{path}: {getattr(error, 'strerror', None) or error}; give the audit log's path"
         ) from error
+    if not verdict.intact:
+        typer.echo(
+            f"error: {printable(str(path))} is NOT as it was written: {len(verdict.findings)} findings on standard output; compare it with a backup",
+            err=True,
+        )
     if as_json:
         typer.echo(json.dumps({"intact": verdict.intact, **asdict(verdict)}, indent=2))
         return OK if verdict.intact else BAD_INPUT

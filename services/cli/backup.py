@@ -19,7 +19,18 @@ def backup_command(target: Path, config: Path | None, data: Path | None, *, as_j
     keep_files_private()
     made = make_backup(_settings(config, data), target)
     _say(f"{target}: ", made, as_json)
-    return OK if not made.missing and made.audit == "intact" else BAD_INPUT
+    if not made.missing and made.audit == "intact":
+        return OK
+    wrong = (
+        f"files of {len(made.missing)} entries were missing"
+        if made.missing
+        else "the audit log was NOT as it was written"
+    )
+    typer.echo(
+        f"error: {wrong} in the service already; the backup was made as far as possible, keep an older one too",
+        err=True,
+    )
+    return BAD_INPUT
 
 
 def restore_command(source: Path, config: Path | None, data: Path | None, *, check: bool, as_json: bool) -> int:

@@ -45,6 +45,11 @@ def batch_command(
         return INTERRUPTED
     if summary.is_whole:
         return OK
+    left = sum(summary.counts.values()) + len(summary.unusable) - summary.counts["done"]
+    typer.echo(
+        f"error: {left} recordings have no result; mend what is said about each, and the same command goes on with them",
+        err=True,
+    )
     nothing = [str(job.reason).startswith("nothing was shown") for job in summary.failed]
     return NOTHING_SHOWN if nothing and all(nothing) and not summary.counts["done"] else BAD_INPUT
 

@@ -42,6 +42,7 @@ def compare_command(
             "the model's lengths have no known unit, so that its size beside the mesh is not known; give --pairs, three or more"
         )
     time_s = loaded.time_window_s[1] if time_s is None else time_s
+    loaded.check_time(time_s)
     seen = mesh_of(loaded, time_s)
     surface = ClosestPoints(*read_surface(mesh))
     points = seen.vertices.astype(np.float64)

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 
 from services.cli.interrupt import INTERRUPTED as INTERRUPTED
-from services.cli.streams import printable
+from services.cli.streams import sentence
 
 OK = 0
 BUG = 1
@@ -63,7 +63,7 @@ def user_sentence(error: BaseException, arguments: Iterable[str] = ()) -> str | 
             where = f"\n  in operator {link.operator}{frame}"
         elif not isinstance(link, RunFailed):  # that one says that a run ended early; what it is raised from says why
             said = str(link) if isinstance(link, UserError) else _of_the_machine(link, arguments)
-            return None if said is None else printable(said) + where
+            return None if said is None else sentence(said) + where
     return None
 
 

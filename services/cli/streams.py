@@ -10,6 +10,7 @@ import codecs
 import errno
 import io
 import os
+import re
 import select
 import sys
 from typing import Any, TextIO
@@ -104,6 +105,15 @@ def _as_the_system_spells_it(error: UnicodeError) -> tuple[bytes | str, int]:
     if 0xDC80 <= character <= 0xDCFF:
         return bytes([character - 0xDC00]), error.start + 1
     return error.object[error.start].encode("ascii", "backslashreplace"), error.start + 1
+
+
+MOST_WORD = 240
+"""Characters of a word in a sentence; a longer one is a value that somebody gave, and is cut in its middle."""
+
+
+def sentence(text: str) -> str:
+    """Return an error's text on one line, in which no value makes what to do about it impossible to find."""
+    return re.sub(rf"\S{{{MOST_WORD + 1},}}", lambda word: f"{word[0][:160]}...{word[0][-60:]}", printable(text))
 
 
 def printable(text: str) -> str:

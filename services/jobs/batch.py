@@ -17,7 +17,7 @@ from gsplat_core.io.recordings.calibration import POSES_FILE
 from gsplat_core.io.recordings.layouts import split_eyes
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES
 from operators.output_folder import is_whole_output
-from operators.output_paths import DESCRIPTIONS
+from operators.output_paths import BATCH_DATABASE, DESCRIPTIONS
 from operators.storage import storage_errors
 from services.jobs.options import ReplayOptions
 from services.jobs.pool import JobPool, PoolSettings
@@ -26,7 +26,7 @@ from services.jobs.results import RUNNING, Results
 from services.jobs.runner import Runner
 from services.jobs.store import MOST_AT_ONCE, JobStore
 
-DATABASE = "batch.sqlite"
+DATABASE = BATCH_DATABASE
 WHO = "batch"
 SAY_S = 0.5
 RECORDINGS = ".recordings.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -13,7 +14,6 @@ from operators.applications.evaluated import EvaluatedRun
 from services.reports.schema import RunReport
 
 REPORT, MODEL = "report.json", "model"
-_MOST_BYTES = 256 * 2**20
 
 
 def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
@@ -22,7 +22,7 @@ def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
 
     Raises InvalidSetting for a run without a model or with a report that cannot be read; BundleError.
     """
-    if (path / REPORT).is_file():
+    if os.path.lexists(path / REPORT):
         report = _read(path / REPORT)
         if not (path / MODEL).is_dir():
             raise InvalidSetting(f"{path} is a run that left no model; give another run, or a model folder")
@@ -35,7 +35,7 @@ def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
         return model, _run(path, report)
     model = load_bundle(path)
     beside = path.absolute().parent / REPORT
-    if path.absolute().name == MODEL and beside.is_file():
+    if path.absolute().name == MODEL and os.path.lexists(beside):
         report = _read(beside)
         if report.model is not None and report.model.sha256 == model.sha256():
             return model, _run(beside.parent, report)
@@ -44,10 +44,12 @@ def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
 
 def _read(path: Path) -> RunReport:
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InvalidSetting(f"{path} is larger than {_MOST_BYTES // 2**20} MiB; it is not a run's report")
         return RunReport.read(path)
-    except (ValidationError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise InvalidSetting(
+            f"{path} cannot be read: {error.strerror or error}; give the model's folder to evaluate it alone"
+        ) from error
+    except (ValidationError, UnicodeDecodeError, RecursionError) as error:
         said = str(error).splitlines()
         raise InvalidSetting(
             f"{path} is not a report of this version ({' '.join(said[:2])}); give the model's folder to evaluate it alone"

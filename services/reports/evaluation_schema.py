@@ -11,8 +11,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from gsplat_core.io.regular_files import read_regular
 from operators.storage import write_whole
-from services.reports.schema import NOTICE, Count, ModelFacts, Part, RecordingFacts
+from services.reports.schema import MOST_REPORT_BYTES, NOTICE, Count, ModelFacts, Part, RecordingFacts
 
 Decibels = float | None
 Seconds = tuple[float, float]
@@ -293,5 +294,5 @@ class EvaluationReport(Part):
 
     @classmethod
     def read(cls, path: Path) -> EvaluationReport:
-        """Read a report back; raises pydantic.ValidationError where it does not fit."""
-        return cls.model_validate_json(path.read_text(encoding="utf-8"))
+        """Read a report back. Raises pydantic.ValidationError where it does not fit, OSError for anything but a plain file of at most MOST_REPORT_BYTES."""
+        return cls.model_validate_json(read_regular(path, MOST_REPORT_BYTES))

@@ -11,7 +11,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gsplat_core.io.regular_files import read_regular
 from operators.storage import write_whole
+
+MOST_REPORT_BYTES = 256 << 20
 
 NOTICE = "Research use only, not a medical device."
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -271,5 +274,5 @@ class RunReport(Part):
 
     @classmethod
     def read(cls, path: Path) -> RunReport:
-        """Read a report back; raises pydantic.ValidationError where it does not fit."""
-        return cls.model_validate_json(path.read_text(encoding="utf-8"))
+        """Read a report back. Raises pydantic.ValidationError where it does not fit, OSError for anything but a plain file of at most MOST_REPORT_BYTES."""
+        return cls.model_validate_json(read_regular(path, MOST_REPORT_BYTES))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.value_ranges import check_seen_at
 
 MOST_TIMES = 1000
 DEFAULT_TIMES = 30
@@ -80,10 +81,7 @@ class ExportWish:
         start_s, end_s = window_s
         if not self.format.is_sequence:
             time_s = end_s if self.time_s is None else self.time_s
-            if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
-                raise InvalidSetting(
-                    f"the model has seen nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
-                )
+            check_seen_at(time_s, window_s)
             return [time_s]
         count = self.times or DEFAULT_TIMES
         if count == 1 or end_s == start_s:

@@ -17,7 +17,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,6 +45,17 @@ _MEND = "put back a copy of it from a backup, or move it away to begin without k
 
 class KeyConflict(UserError):
     """Keys cannot be changed in this way now; says why."""
+
+
+class KeysUnwritable(UserError, OSError):
+    """The file of the keys cannot be written; the earlier file stays."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        said = error.strerror or error
+        super().__init__(
+            f"{path} cannot be written: {said}; no key was changed. Free space on its disk, or mend the rights of its folder"
+        )
+        self.errno = error.errno
 
 
 class KeysUnreadable(UserError, ValueError):
@@ -254,8 +265,12 @@ class KeyStore:
     @contextmanager
     def _changing(self) -> Iterator[dict[str, ApiKey]]:
         """The keys to change; written when the block ends without an error."""
-        self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with open(self._path.with_suffix(".lock"), "a", opener=_private) as lock:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            opened = open(self._path.with_suffix(".lock"), "a", opener=_private)  # noqa: SIM115 - closed below
+        except OSError as error:
+            raise KeysUnwritable(self._path.with_suffix(".lock"), error) from error
+        with opened as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             keys = dict(self._current())
             yield keys
@@ -338,8 +353,8 @@ def _parse_used(path: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+        found = json.loads(read_regular(path, MOST_BYTES))
+    except (OSError, ValueError, RecursionError) as error:
         log.error("%s cannot be read: %s; it is begun anew", path, error)
         return {}
     return {str(key): str(at) for key, at in found.items()} if isinstance(found, dict) else {}
@@ -352,12 +367,18 @@ def _write(path: Path, keys: dict[str, ApiKey]) -> None:
 
 
 def _write_json(path: Path, values: object) -> None:
+    """Replace a file durably. Raises KeysUnwritable; the earlier file stays then, and nothing else is left."""
     unfinished = path.with_suffix(".new")
-    with open(unfinished, "w", opener=_private) as file:
-        json.dump(values, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(unfinished, path)
+    try:
+        with open(unfinished, "w", opener=_private) as file:
+            json.dump(values, file, indent=1)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    except OSError as error:
+        with suppress(OSError):
+            unfinished.unlink()
+        raise KeysUnwritable(path, error) from error
 
 
 def _private(path: str, flags: int) -> int:
