@@ -26,6 +26,7 @@ from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session, Start
+from operators.errors import NothingShown
 from operators.sources.source import FrameSource
 
 
@@ -129,7 +130,13 @@ def _fit(
     choice = "none" if settings.depth == "parallax" else settings.depth
     finder = DepthFinder(choice, description.camera, device=settings.device)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
-        learning.fit((finder.with_depth(frame) for frame in frames if _trains(frame)), steps, after_step)
+        chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
+        if not chosen:
+            raise NothingShown(
+                f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on, since they are damaged,"
+                " withheld or held out; give a recording with other frames"
+            )
+        learning.fit(chosen, steps, after_step)
     for doubt, count in sorted(learning.depth_doubts.items()):
         notes.append(f"{count} key frames were given no depth to learn from by parallax: {doubt}")
     return learning.snapshot(), learning.eyes, done

@@ -37,6 +37,11 @@ def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
         assert run(["replay", str(session), "--out", str(tmp_path / "again"), *more]) == NOTHING_SHOWN
         said = capsys.readouterr().err
         assert "6 withheld when they were recorded (out of body: 6)" in said and "interrupted" not in said
+    assert run(["reconstruct", str(session), "--out", str(tmp_path / "fit"), "--steps", "2"]) == NOTHING_SHOWN
+    assert "can be trained on" in capsys.readouterr().err
+    assert run(["batch", str(session.parent), "--out", str(tmp_path / "batch"), "--workers", "1"]) == NOTHING_SHOWN
+    said = capsys.readouterr().err
+    assert "withheld when they were recorded" in said and "error: 1 recordings have no result" in said
 
 
 def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsys):
