@@ -105,7 +105,7 @@ class FrameReader:
         kind, channels = PLANES[name]
         wanted = [4, 4] if name == "pose" else [*shape[:2], *([] if channels is None else [channels])]
         whole = all(type(side) is int and 0 < side <= MAX_PIXELS for side in [*shape, *wanted])
-        if shape != wanted or not whole or shape[0] * shape[1] > MAX_PIXELS:
+        if len(shape) < 2 or shape != wanted or not whole or shape[0] * shape[1] > MAX_PIXELS:
             raise BadHeader(f"{name} cannot have the shape {shape!r:.40}")
         count = int(np.prod(shape))
         end = offset + count * np.dtype(kind).itemsize if type(offset) is int and offset >= 0 else -1
