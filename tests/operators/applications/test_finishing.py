@@ -1,0 +1,101 @@
+"""After the graph: the model is saved, and baselines are measured where the source can be read again."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from operators.applications import finishing
+from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
+from operators.metrics import QualityResult
+from operators.outcome import OutcomeBuilder
+from operators.reconstruct import ModelResult
+from operators.sources.source import SourceState
+
+
+class Scripted:
+    """Gives what it was told to, None where no frame came in time; its state is that after the last read."""
+
+    def __init__(self, given, digest="d"):
+        self.given, self.calls = given, []
+        self.description = SimpleNamespace(name="pipe -", digest=digest)
+
+    @property
+    def state(self):
+        return SourceState.LIVE if self.left else SourceState.ENDED
+
+    def open(self):
+        self.calls.append("open")
+        self.left = list(self.given)
+
+    def read(self, timeout_s):
+        assert self.calls[-1] == "open"
+        return self.left.pop(0) if self.left else None
+
+    def close(self):
+        self.calls.append("close")
+
+
+def session(**fields):
+    values = {"stop_requested": lambda: False, "failure": None, "notes": [], "reached": OutcomeBuilder()}
+    return SimpleNamespace(**(values | fields))
+
+
+@pytest.mark.parametrize(
+    ("given", "count", "frames"),
+    [
+        ([None, 1, None, None, 2, 3], 2, [1, 2]),
+        ([1, 2, 3], 3, [1, 2, 3]),
+        ([1, None, 2], 5, [1, 2]),
+        ([1], 0, []),
+        ([], 1, []),
+    ],
+)
+def test_the_first_frames_are_read_each_time_from_the_beginning(given, count, frames):
+    source = Scripted(given)
+    first = FirstFrames(source, count)
+    assert list(first) == frames and list(first) == frames
+    assert source.calls == ["open", "close"] * 2
+
+
+@pytest.mark.parametrize("reached_its_own", [True, False])
+@pytest.mark.parametrize("has_fitted", [True, False])
+def test_the_newest_model_is_saved(tmp_path, monkeypatch, reached_its_own, has_fitted):
+    saved = []
+    monkeypatch.setattr(finishing, "save_bundle", lambda model, folder: saved.append((model, folder)))
+    run = session()
+    if reached_its_own:
+        run.reached.add(ModelResult("trained"))
+    saves_model(tmp_path, "fitted" if has_fitted else None)(run)
+    model = "trained" if reached_its_own else "fitted" if has_fitted else None
+    assert saved == ([(model, tmp_path / "model")] if model else [])
+    assert run.reached.outputs == ({"model": tmp_path / "model"} if model else {})
+    result = run.reached.find(ModelResult)
+    assert (None if result is None else result.model) == model
+
+
+@pytest.mark.parametrize(
+    ("fields", "digest", "said"),
+    [
+        ({"stop_requested": lambda: True}, "d", "the run ended early"),
+        ({"failure": ValueError("full")}, "d", "the run ended early"),
+        ({"stop_requested": lambda: True}, None, "the run ended early"),
+        ({}, None, "pipe - can be read only once"),
+    ],
+)
+def test_baselines_are_left_out_with_a_note(fields, digest, said):
+    run = session(**fields)
+    measures_baselines(Scripted([1], digest))(run)
+    (note,) = run.notes
+    assert note.startswith(said) and not run.reached.parts
+
+
+@pytest.mark.parametrize("shown", [None, 2])
+def test_baselines_are_of_the_frames_that_were_shown(monkeypatch, shown):
+    monkeypatch.setattr(finishing, "measure_baselines", lambda frames: SimpleNamespace(frames=list(frames)))
+    run = session()
+    if shown is not None:
+        run.reached.add(QualityResult(None, None, (), 1, "", shown))
+    measures_baselines(Scripted([1, 2, 3]))(run)
+    assert run.reached.find(SimpleNamespace).frames == [1, 2, 3][: shown or 0] and not run.notes

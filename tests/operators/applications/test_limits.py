@@ -1,0 +1,83 @@
+"""Ranges of options that several applications take, at both of their borders."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.cameras import Camera
+from operators.applications import limits
+
+
+def camera(width_px, height_px):
+    return Camera.from_focal(30.0, width_px, height_px)
+
+
+POSSIBLE = [
+    (limits.check_seed, (0,)),
+    (limits.check_seed, (9223372036854775807,)),
+    (limits.check_steps, ("steps", 1)),
+    (limits.check_steps, ("steps", 100_000_000)),
+    (limits.check_max_frames, (None,)),
+    (limits.check_max_frames, (1,)),
+    (limits.check_max_frames, (1_000_000_000,)),
+    (limits.check_scale, (1e-9,)),
+    (limits.check_scale, (64.0,)),
+    (limits.check_picture, (camera(8192, 8192), 1.0)),
+    (limits.check_picture, (camera(32768, 2048), 1.0)),
+    (limits.check_picture, (camera(2048, 32768), 1.0)),
+    (limits.check_width, (32768,)),
+]
+IMPOSSIBLE = [
+    (limits.check_seed, (-1,), "seed is -1; it must be from 0 to 9223372036854775807"),
+    (limits.check_seed, (9223372036854775808,), "seed is 9223372036854775808"),
+    (limits.check_steps, ("rounds", 0), "rounds is 0; it must be from 1 to 100000000"),
+    (limits.check_steps, ("rounds", 100_000_001), "rounds is 100000001"),
+    (limits.check_max_frames, (0,), "at least 1, got 0"),
+    (limits.check_max_frames, (1_000_000_001,), "at most 1000000000, got 1000000001"),
+    (limits.check_scale, (0.0,), "a positive number, got 0"),
+    (limits.check_scale, (math.inf,), "a positive number, got inf"),
+    (limits.check_scale, (math.nan,), "a positive number, got nan"),
+    (limits.check_scale, (64.01,), "at most 64, got 64.01"),
+    (
+        limits.check_picture,
+        (camera(8193, 8192), 2.0),
+        "at scale 2 a picture has 8193x8192 px; at most 64 million and 32768",
+    ),
+    (limits.check_picture, (camera(32769, 1), 2.0), "32769x1 px"),
+    (limits.check_picture, (camera(1, 32769), 2.0), "1x32769 px"),
+    (limits.check_width, (32769,), "32769 px wide; at most 32768"),
+]
+
+
+@pytest.mark.parametrize(("check", "given"), POSSIBLE)
+def test_values_up_to_the_border_are_taken(check, given):
+    check(*given)
+
+
+@pytest.mark.parametrize(("check", "given", "said"), IMPOSSIBLE)
+def test_values_beyond_the_border_are_refused(check, given, said):
+    with pytest.raises(InvalidSetting, match=said):
+        check(*given)
+
+
+@pytest.mark.parametrize(
+    ("window_s", "fps", "frames"),
+    [((0.0, 0.0), 25, 1), ((1.0, 2.0), 25, 26), ((0.0, 0.1), 30, 4), ((0.0, 0.999), 1, 1), ((0.0, 0.5), 1000, 501)],
+)
+def test_a_window_is_shown_from_end_to_end(window_s, fps, frames):
+    assert limits.frames_to_render(window_s, fps) == frames
+
+
+@pytest.mark.parametrize("fps", [0, -1, 1000.5, math.inf, math.nan])
+def test_a_rate_out_of_range_is_refused(fps):
+    with pytest.raises(InvalidSetting, match="it must be above 0 and at most 1000"):
+        limits.frames_to_render((0.0, 1.0), fps)
+
+
+def test_too_many_frames_are_refused():
+    assert limits.frames_to_render((5.0, 1004.999), 1000) == 1_000_000
+    with pytest.raises(InvalidSetting, match=r"from 5 to 1005 s is 1e\+06 frames at fps 1000; at most 1000000"):
+        limits.frames_to_render((5.0, 1005.0), 1000)
