@@ -7,9 +7,13 @@ from datetime import timedelta
 import pytest
 
 from operators.graph import (
+    AsynchronousCondition,
+    AsynchronousEventState,
+    BooleanCondition,
     Condition,
     CountCondition,
     ManualClock,
+    MessageOrTimeoutCondition,
     Operator,
     PeriodicCondition,
     PeriodicConditionPolicy,
@@ -123,3 +127,60 @@ def test_all_conditions_must_agree(kit, runner):
 
     runner(kit.Wired(wire))
     assert len(stamps) == 2
+
+
+def test_a_count_is_used_up_exactly():
+    assert CountCondition(None, 0).check(0) == (SchedulingStatus.NEVER, 0)
+    condition = CountCondition(None, 1)
+    assert condition.check(0) == (SchedulingStatus.READY, 0)
+    condition.on_execute(0)
+    assert condition.check(0) == (SchedulingStatus.NEVER, 0)
+
+
+def test_a_message_of_any_input_ends_the_wait_and_so_does_the_timeout():
+    condition, edges = MessageOrTimeoutCondition(None, 50), ([], [])
+    condition.watch(iter(edges))
+    assert condition.check(0) == (SchedulingStatus.READY, 0)
+    condition.on_execute(7)
+    assert condition.check(56) == (SchedulingStatus.WAIT_TIME, 57)
+    assert condition.check(57) == (SchedulingStatus.READY, 0)
+    for edge in edges:
+        edge.append("message")
+        assert condition.check(8) == (SchedulingStatus.READY, 0)
+        edge.clear()
+    assert condition.check(8)[0] is SchedulingStatus.WAIT_TIME
+
+
+def test_the_shortest_times_are_one_nanosecond():
+    assert PeriodicCondition(None, 1).recess_period_ns == 1
+    assert PeriodicCondition(None, timedelta(microseconds=3)).recess_period_ns == 3000
+    assert MessageOrTimeoutCondition(None, 1).timeout_ns == 1
+    for impossible in (0, -1):
+        with pytest.raises(ValueError, match=f"timeout must be positive, got {impossible} ns"):
+            MessageOrTimeoutCondition(None, impossible)
+
+
+def test_each_state_of_an_event_has_its_status_and_each_change_wakes():
+    condition, woken = AsynchronousCondition(None), []
+    assert condition.check(0)[0] is SchedulingStatus.READY
+    condition.event_state = AsynchronousEventState.WAIT  # without a scheduler that waits, there is nothing to wake
+    condition._wake = lambda: woken.append(condition.event_state)
+    for state, status in (
+        (AsynchronousEventState.EVENT_WAITING, SchedulingStatus.WAIT_EVENT),
+        (AsynchronousEventState.EVENT_DONE, SchedulingStatus.READY),
+        (AsynchronousEventState.WAIT, SchedulingStatus.WAIT),
+        (AsynchronousEventState.EVENT_NEVER, SchedulingStatus.NEVER),
+        (AsynchronousEventState.READY, SchedulingStatus.READY),
+    ):
+        condition.event_state = state
+        assert condition.check(0) == (status, 0)
+        assert woken.pop() is state and not woken
+
+
+def test_a_disabled_tick_is_final_and_wakes():
+    condition, woken = BooleanCondition(None), []
+    assert condition.check_tick_enabled() and condition.check(0)[0] is SchedulingStatus.READY
+    condition._wake = lambda: woken.append(True)
+    condition.disable_tick()
+    assert not condition.check_tick_enabled() and condition.check(0)[0] is SchedulingStatus.NEVER
+    assert woken == [True]
