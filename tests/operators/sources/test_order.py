@@ -7,6 +7,7 @@ import random
 import numpy as np
 import pytest
 
+from gsplat_core.scene.frames import Frame
 from operators.sources.order import FrameOrder
 
 MS = 1_000_000
@@ -140,3 +141,69 @@ def test_whatever_a_sender_does_numbers_increase_and_time_rises(frame, seed):
             assert last is None or (out.seq > last.seq and out.pts_ns > last.pts_ns)
             last = out
     assert taken > 60, "most of it is of use"
+
+
+S = 1_000_000_000
+
+
+def numbered(seq, pts_ns):
+    return Frame(seq, pts_ns, np.full((2, 2, 3), seq % 251, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("second", "arrived_ns", "counts", "out"),
+    [
+        ((11, 5 * S + 40), 40, {}, (1, 40)),
+        ((14, 5 * S + 40), 40, {"missing": 3}, (4, 40)),
+        ((11, 5 * S), 40, {"repaired_times": 1}, (1, 1)),
+        ((9, 4 * S), 40, {"out_of_order": 1}, None),  # exactly 1 s back is late
+        ((9, 4 * S - 1), 40, {"clock_resets": 1}, (1, 40)),
+        ((9, 4 * S - 1), 0, {"clock_resets": 1}, (1, 1)),  # times rise, though no time has passed here
+        ((11, 5 * S - 1), 40, {"out_of_order": 1}, None),
+        ((10, 5 * S + 7), 40, {"duplicates": 1}, None),
+        ((11, 7 * S + 40), 40, {}, (1, 2 * S + 40)),  # exactly 2 s ahead of our clock
+        ((11, 7 * S + 41), 40, {"clock_jumps": 1}, (1, 40)),
+        ((11, 7 * S + 1), -90, {"clock_jumps": 1}, (1, 1)),  # our own clock does not count backwards
+        ((1_000_010, 5 * S + 40), 40, {"missing": 999_999}, (1_000_000, 40)),
+        ((1_000_011, 5 * S + 40), 40, {"clock_resets": 1}, (1, 40)),
+    ],
+)
+def test_each_step_between_two_frames_has_its_answer(second, arrived_ns, counts, out):
+    order = FrameOrder()
+    first = order.take(numbered(10, 5 * S), 0)
+    assert (first.seq, first.pts_ns) == (0, 0)
+    found = order.take(numbered(*second), arrived_ns)
+    assert (None if found is None else (found.seq, found.pts_ns)) == out
+    assert {reason: count for reason, count in order.counts.items() if count} == counts
+    if found is not None:
+        assert found.arrived_ns == arrived_ns
+
+
+@pytest.mark.parametrize(
+    ("late", "resets"),
+    [
+        ([(1, 3), (2, 4), (3, 5)], 1),
+        ([(1, 3), (2, 3), (3, 3)], 1),
+        ([(1, 3), (2, 4)], 0),
+        ([(1, 3), (2, 4), (2, 5)], 0),  # the same number again is no stream
+        ([(1, 5), (2, 4), (3, 5)], 0),  # its time falls back
+        ([(3, 3), (1, 4), (2, 5), (3, 6)], 1),
+    ],
+)
+def test_three_late_frames_in_a_row_are_a_new_beginning(late, resets):
+    order = FrameOrder()
+    order.take(numbered(10, 100), 0)
+    found = [order.take(numbered(*each), 50) for each in late]
+    assert order.counts.get("clock_resets", 0) == resets and order.counts["out_of_order"] == len(late) - resets
+    assert [each is not None for each in found] == [False] * (len(late) - resets) + [True] * resets
+
+
+def test_a_trusted_sender_keeps_its_numbers_and_goes_on_after_a_restart():
+    order = FrameOrder(trusted=True)
+    assert order.take(numbered(10, 7), 0).seq == 10
+    assert order.take(numbered(9, 3), 1).pts_ns == 3  # nothing is looked at
+    order.restart()
+    found = order.take(numbered(0, 0), 31)
+    assert (found.seq, found.pts_ns) == (10, 33) and not any(order.counts.values())
+    found = order.take(numbered(1, 40), 90)
+    assert (found.seq, found.pts_ns) == (11, 73)
