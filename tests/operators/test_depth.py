@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry import registry
-from gsplat_core.geometry.depth_map import DepthMap, doubted
+from gsplat_core.geometry.depth_map import BELIEVED, DepthMap, doubted
 from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
-from operators.depth import DepthOp, FoundDepth, without_depth
+from operators.depth import DepthCounts, DepthOp, FoundDepth, without_depth
 from operators.outcome import OutcomeBuilder
 
 CAMERA = Camera.from_focal(20.0, 24, 16)
@@ -173,3 +175,70 @@ def test_auto_asks_what_takes_long_where_there_is_time_and_never_about_held_out_
         compute(operator, frame=frame(seq, pose=np.eye(4)))
     compute(operator, frame=frame(4))
     assert [given.seq for given, _ in slow.asked] == asked
+
+
+def finder(doubts=(), remarks=()):
+    return SimpleNamespace(
+        doubts=SimpleNamespace(counted=lambda: dict(doubts)), remarks=SimpleNamespace(counted=lambda: list(remarks))
+    )
+
+
+def test_counts_of_depth_are_shares_and_sentences(frame):
+    half = PLANE.copy()
+    half[:8] = 0
+    sure = np.full((16, 24), BELIEVED, np.float32)
+    sure[:, :6] = np.nextafter(np.float32(BELIEVED), np.float32(0))
+    first, second, outcome = DepthCounts(), DepthCounts(), OutcomeBuilder()
+    measured = frame(depth=half)
+    first.take(measured, measured)
+    found = frame(depth=PLANE, depth_confidence=sure, depth_origin=DepthOrigin.STEREO)
+    second.take(frame(), found)
+    second.take(frame(depth=PLANE), frame())
+    second.take(frame(), frame())
+    first.passed_over, second.passed_over = 2, 3
+    (first + second).contribute(outcome, "stereo", finder({"dark": 4}, ["it was slow"]))
+    result = outcome.find(FoundDepth)
+    assert dict(result.frames) == {"measured": 1, "stereo": 1} and result.known_share == pytest.approx(0.625)
+    assert result.passed_over == 5 and result.doubts == {"dark": 4}
+    text = " | ".join(outcome.notes)
+    for said in (
+        "the depth of 1 frames was found in them, of 62% of their pixels",
+        "not looked for in 5 frames",
+        "it was slow",
+        "4 frames were given no depth: dark",
+        "the depth that 1 frames came with was not used (depth is 'stereo')",
+    ):
+        assert said in text
+
+
+def test_without_frames_there_is_nothing_to_say():
+    outcome = OutcomeBuilder()
+    DepthCounts().contribute(outcome, "auto", None)
+    result = outcome.find(FoundDepth)
+    assert (dict(result.frames), result.known_share, result.metric, result.passed_over) == ({}, 0.0, True, 0)
+    assert outcome.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("choice", "fields", "motion", "ways"),
+    [
+        ("auto", {"depth"}, False, None),
+        ("recorded", {"depth"}, False, None),
+        ("none", {"depth"}, False, "the recording's depth is left out (depth is 'none'): the scene"),
+        ("auto", set(), False, "the recording has no depth: the scene"),
+        ("auto", {"right_image"}, False, "unless the two eyes show"),
+        ("stereo", {"right_image"}, False, "unless the two eyes show"),
+        ("none", {"right_image"}, False, "no depth: the scene"),
+        ("onnx:a", {"right_image"}, False, "unless answers of the depth network show"),
+        ("auto", {"pose"}, False, "unless the given poses show"),
+        ("parallax", {"pose"}, False, "unless the given poses show"),
+        ("none", {"pose"}, True, "unless the given poses show"),
+        ("none", {"pose"}, False, "no depth: the scene"),
+        ("auto", {"right_image", "pose"}, False, "unless the two eyes or the given poses show"),
+        ("light", set(), False, "unless light and shade show"),
+    ],
+)
+def test_a_note_names_the_ways_to_depth(choice, fields, motion, ways):
+    config = SimpleNamespace(depth_from_motion=motion, default_depth_mm=50.0)
+    note = without_depth(choice, frozenset(fields), config)
+    assert (note is None) if ways is None else (ways in note and "a plane 50 mm away" in note)

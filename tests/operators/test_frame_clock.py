@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from gsplat_core.errors import InvalidSetting
@@ -171,3 +173,90 @@ def test_waiting_for_a_picture_ends_when_it_is_shown_or_does_not_come(clock):
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting):
         ClockSettings(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("possible", "impossible"),
+    [
+        ([{"budget_ms": 1e-9}, {"budget_ms": 10_000}], [{"budget_ms": 0}, {"budget_ms": 10_000.1}]),
+        ([{"auto_share": 1}, {"auto_share": 1e-9}], [{"auto_share": 0}, {"auto_share": 1.01}]),
+        ([{"least_share": 1}, {"least_share": 1e-9}], [{"least_share": 0}, {"least_share": 1.01}]),
+        ([{"auto_most_ms": 1e-9}, {"auto_most_ms": 10_000}], [{"auto_most_ms": 0}, {"auto_most_ms": 10_000.1}]),
+        ([{"at_least_steps": 1}, {"at_least_steps": 80}], [{"at_least_steps": 0}, {"at_least_steps": 81}]),
+        ([{"first_at_least_steps": 1}, {"first_at_least_steps": 60}], [{"first_at_least_steps": 0}, {"first_at_least_steps": 61}]),
+        ([{"fewest_steps": 80}, {"fewest_steps": 1, "at_least_steps": 1}], [{"fewest_steps": 0}, {"fewest_steps": 81}, {"fewest_steps": 3, "at_least_steps": 2}]),
+        ([{"catch_up_intervals": 1e-9}, {"catch_up_intervals": 1e9}], [{"catch_up_intervals": 0}, {"catch_up_intervals": math.inf}]),
+    ],
+)  # fmt: skip
+def test_settings_are_taken_up_to_their_borders(possible, impossible):
+    for fields in possible:
+        ClockSettings(**fields)
+    for fields in impossible:
+        with pytest.raises(InvalidSetting):
+            ClockSettings(**fields)
+
+
+def came(clock, frame, fake_time, seq=0):
+    clock.budget(frame(seq, arrived_ns=fake_time.ns))
+
+
+def test_rehearsal_ends_exactly_0_3_ms_before_the_next_frame(frame, fake_time):
+    clock = FrameClock(ClockSettings(rehearse_at_most=7), 100, fake_time)
+    assert not clock.may_rehearse(0, 0)
+    came(clock, frame, fake_time)
+    assert clock.may_rehearse(6, 9_700_000 - 1) and not clock.may_rehearse(7, 0)
+    assert not clock.may_rehearse(0, 9_700_000)
+    fake_time.ns += 9_699_999
+    assert clock.may_rehearse(0, 0) and not clock.may_rehearse(0, 1)
+
+
+def test_a_frame_is_passed_over_after_exactly_four_intervals(frame, fake_time):
+    clock = FrameClock(ClockSettings(), 100, fake_time)
+    late = frame(arrived_ns=fake_time.ns)
+    fake_time.pass_ms(40)
+    assert not clock.too_late(late, 1)
+    fake_time.ns += 1
+    assert clock.too_late(late, 1) and not clock.too_late(late, 0) and not clock.too_late(frame(), 1)
+
+
+@pytest.mark.parametrize("name", ["training_ns", "display_ns"])
+def test_frames_are_caught_up_with_below_four_fifths_of_the_interval(frame, fake_time, name):
+    clock = FrameClock(ClockSettings(), 100, fake_time)
+    young = frame(arrived_ns=fake_time.ns)
+    setattr(clock, name, 7_999_999.0)
+    assert not clock.too_late(young, 1)
+    setattr(clock, name, 8_000_000.0)
+    assert clock.too_late(young, 1)
+
+
+def test_usual_times_follow_the_newest_by_a_fifth_and_intervals_by_a_tenth(frame, fake_time):
+    clock = FrameClock(ClockSettings(fewest_steps=2), 100, fake_time)
+    clock.shown(0, 7_000_000)
+    assert clock.display_ns == pytest.approx(3e6)
+    clock.shown(0, 10**12)  # counts as four times the usual and a millisecond: 13 ms
+    assert clock.display_ns == pytest.approx(5e6)
+    clock.shown(10, 0)
+    assert clock.display_ns == pytest.approx(4e6)
+    clock.published(0, 10_000_000, steps=5, step_ns=1e6)  # three steps more than the fewest
+    assert clock.training_ns == pytest.approx(1.4e6)
+    clock.published(0, 10_000_000, steps=1, step_ns=1e6)
+    assert clock.training_ns == pytest.approx(1.4e6 + 0.2 * 8.6e6)
+    came(clock, frame, fake_time, 0)
+    for ms, seq, interval_ms in ((30, 1, 12.0), (1000, 2, 16.8), (0, 3, 16.8 - 0.08 * 16.8), (60, 7, None)):
+        before = clock.interval_ns
+        fake_time.pass_ms(ms)
+        came(clock, frame, fake_time, seq)
+        expected = before + 0.1 * (15e6 - before) if interval_ms is None else interval_ms * 1e6
+        assert clock.interval_ns == pytest.approx(expected)
+
+
+def test_a_share_and_a_most_of_the_time_between_frames_are_the_defaults(fake_time):
+    assert FrameClock(ClockSettings(), 100, fake_time).show_after_ns == pytest.approx(6e6)
+    assert FrameClock(ClockSettings(), 10, fake_time).show_after_ns == pytest.approx(18.3e6)
+    assert FrameClock(ClockSettings(auto_share=0.5, auto_most_ms=30), 10, fake_time).show_after_ns == pytest.approx(
+        30e6
+    )
+    assert FrameClock(ClockSettings(auto_share=0.5, auto_most_ms=90), 10, fake_time).show_after_ns == pytest.approx(
+        50e6
+    )
+    assert FrameClock(ClockSettings(budget_ms=7), 10, fake_time).show_after_ns == 7e6

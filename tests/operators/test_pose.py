@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.live_odometry import LiveOdometry
+from gsplat_core.geometry.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
 from operators.outcome import OutcomeBuilder
@@ -112,3 +114,32 @@ def test_what_cannot_be_estimated_is_refused_before_the_run():
         check_poses("estimated", fisheye)
     with pytest.raises(InvalidSetting, match="poses is 'guessed'; choose given or estimated"):
         check_poses("guessed", FIRST)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({}, [0]),
+        ({"explained": MOSTLY}, [0]),
+        ({"explained": MOSTLY - 1e-6}, [0, "explain little"]),
+        ({"not_placed": 1}, [0, "1 frames could not be placed"]),
+        ({"begun": 2}, [0, "1 times the scope was lost"]),
+        ({"frames": 0, "begun": 9}, []),
+    ],
+)
+def test_what_a_reader_must_know_of_estimated_poses_is_said(fields, said):
+    values = {"frames": 9, "not_placed": 0, "begun": 1, "returned": 3, "explained": 1.0, "is_measured": False}
+    operator = PoseOp(None, camera=Camera.from_focal(300.0, WIDTH, HEIGHT))
+    operator._odometry = SimpleNamespace(**(values | fields))
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    result, notes = outcome.find(EstimatedPoses), outcome.notes
+    expected = values | fields
+    assert (result.frames, result.not_placed, result.begun, result.returned) == tuple(
+        expected[name] for name in ("frames", "not_placed", "begun", "returned")
+    )
+    assert len(notes) == len(said)
+    for note, part in zip(notes[1:], said[1:], strict=True):
+        assert part in note
+    if notes:
+        assert "lengths have no scale" in notes[0]

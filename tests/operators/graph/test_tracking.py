@@ -142,3 +142,49 @@ def test_a_chain_of_diamonds_does_not_explode():
         trails = [tracker.extend(f"{side}{depth}", [trail]) for side in "ab"]
         trail = tracker.extend(f"join{depth}", trails)
     assert len(trail) == 64
+
+
+def test_durations_are_summed_and_counted_up_to_a_bound():
+    histogram = Histogram()
+    for duration in (-4, 0, 10, 20, 20, 63, 2**44, 2**50):
+        histogram.record(duration)
+    assert histogram.sum_ns == 10 + 20 + 20 + 63 + 2**44 + 2**50
+    assert histogram.between([10, 20, 62, 63, 2**60]) == [3, 2, 0, 1, 2, 0]
+    assert histogram.between([]) == [8]
+    assert histogram.quantiles_ms((0.25, 0.5, 1.0)) == [0.0, 20 * 1e-6, (2**44 - 1) * 1e-6]
+
+
+def test_a_bucket_is_a_32nd_of_an_octave():
+    for duration, end in (
+        (63, 63),
+        (64, 65),
+        (65, 65),
+        (66, 67),
+        (128, 131),
+        (131, 131),
+        (132, 135),
+        (2**20, 2**20 + 2**15 - 1),
+    ):
+        histogram = Histogram()
+        histogram.record(duration)
+        histogram.record(2**40)
+        assert histogram.quantiles_ms((0.5,)) == [end * 1e-6]
+
+
+def test_a_leaf_counts_each_path_and_a_loop_none():
+    tracker = FlowTracker()
+    root = tracker.begin("source", 5)
+    assert tracker.begin("source", 7)[0][0] is root[0][0]
+    tracker.finish("sink", [root, tracker.begin("source", 7), tracker.begin("sink", 1)])
+    assert {path: summary.count for path, summary in tracker.latency().items()} == {"source,sink": 2}
+    tracker.reset()
+    assert tracker.paths() == {} == tracker.operators()
+
+
+def test_curves_are_given_by_path():
+    tracker = FlowTracker()
+    tracker.finish("sink", [tracker.begin("source", 0)])
+    ((path, values),) = tracker.latency_quantiles_ms((0.5, 1.0)).items()
+    assert path == "source,sink" and len(values) == 2 and 0 < values[0] <= values[1]
+    tracker.operator("a").record(2_000_000)
+    assert tracker.compute()["a"].max_ms == 2.0 and tracker.operator("a") is tracker.operators()["a"]
