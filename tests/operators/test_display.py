@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.display import DisplayOp, DisplaySettings, LiveDisplayResult, _age_text, draw_label
+from gsplat_core.scene.frames import FrameStatus
+from operators.display import (
+    LOOK_NS,
+    DisplayOp,
+    DisplaySettings,
+    LiveDisplayResult,
+    _age_text,
+    _nobody_sees,
+    draw_label,
+)
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.messages import PictureState
 from operators.outcome import OutcomeBuilder
@@ -241,3 +250,61 @@ def test_each_change_of_state_is_counted_once(screen, rendered, frame, fake_time
 @pytest.mark.parametrize(("age_ns", "said"), [(4_400_000, "4 ms"), (999_000_000, "999 ms"), (1_250_000_000, "1.2 s")])
 def test_ages_are_written_in_ms_or_s(age_ns, said):
     assert _age_text(age_ns) == said
+
+
+@pytest.mark.parametrize(
+    ("possible", "fields"),
+    [
+        (True, {"stale_after_ms": 1e-9}),
+        (False, {"stale_after_ms": 0}),
+        (True, {"stale_after_ms": 999.9}),
+        (False, {"stale_after_ms": 1000}),
+        (True, {"frozen_after_ms": 60_000}),
+        (False, {"frozen_after_ms": 60_001}),
+        (True, {"stale_after_intervals": 1}),
+        (False, {"stale_after_intervals": 0.9}),
+        (True, {"stale_after_intervals": 100}),
+        (False, {"stale_after_intervals": 100.1}),
+    ],
+)
+def test_thresholds_are_taken_up_to_their_borders(possible, fields):
+    if possible:
+        DisplaySettings(**fields)
+    else:
+        with pytest.raises(InvalidSetting):
+            DisplaySettings(**fields)
+
+
+def test_the_operator_looks_twenty_times_a_second_and_keeps_four_pictures(fake_time):
+    clock = FrameClock(ClockSettings(), 25, fake_time)
+    operator = DisplayOp(None, clock=clock, source_state=lambda: SourceState.LIVE)
+    (condition,) = operator.conditions
+    assert LOOK_NS == condition.timeout_ns == 50_000_000
+    assert operator.spec.inputs["rendered"].capacity == 4
+
+
+@pytest.mark.parametrize(
+    ("state", "unused", "nobody"),
+    [
+        (PictureState.LIVE, True, False),
+        (PictureState.STALE, True, True),
+        (PictureState.STALE, False, False),
+        (PictureState.FROZEN, False, True),
+        (PictureState.SOURCE_LOST, False, True),
+    ],
+)
+def test_a_picture_is_memory_where_nothing_of_it_was_seen_for_long(rendered, frame, state, unused, nobody):
+    for fields in ({"withheld": "black"}, {"status": FrameStatus.DAMAGED, "damage": "torn"}) if unused else ({},):
+        assert _nobody_sees(rendered(frame=frame(**fields)), state) is nobody
+
+
+@pytest.mark.parametrize(("height", "edge"), [(64, 2), (160, 2), (240, 3)])
+def test_the_frame_of_a_picture_that_is_not_live_is_an_80th_of_its_height(height, edge):
+    picture = np.full((height, 320, 3), 7, np.uint8)
+    draw_label(picture, PictureState.FROZEN, 0)
+    column = (picture[:, 300] != 7).any(-1)
+    # OpenCV draws a line of that thickness around the border, half of it inside of the picture.
+    assert 0 < int(column[: height // 2].sum()) <= edge and column[0] and column[-1]
+    live = np.full((height, 320, 3), 7, np.uint8)
+    draw_label(live, PictureState.LIVE, 0)
+    assert (live[-1] == 7).all() and (live[:, -1] == 7).all() and (live[:8, :8] != 7).any()

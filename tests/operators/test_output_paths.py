@@ -98,3 +98,118 @@ def test_folders_of_our_own_results_are_no_recordings(tmp_path, monkeypatch):
     check_folder_path(tmp_path / "images")
     (tmp_path / "film.mp4").touch()
     check_folder_path(tmp_path / "images")
+
+
+REPORT = '{"series": 1, "outputs": 2, "notes": 3}'
+
+
+def refused(said, out, *inputs, **options):
+    with pytest.raises(OutputError, match=said):
+        check_file_path(out, inputs, **options)
+
+
+def test_a_file_replaces_only_what_this_program_wrote_and_only_when_asked(tmp_path):
+    out = tmp_path / "a.json"
+    check_file_path(out)
+    out.write_text(REPORT)
+    refused("is there already; give another --to, or --overwrite", out, option="--to")
+    check_file_path(out, overwrite=True)
+    out.write_text("{}")
+    refused("was not written by intrasplat", out, overwrite=True)
+    link = tmp_path / "b.json"
+    link.symlink_to(out)
+    refused("is there already", link)
+    out.write_text(REPORT)
+    refused("is not a plain file", link, overwrite=True)
+    (tmp_path / "gone.json").symlink_to(tmp_path / "nothing")
+    refused("is not a plain file", tmp_path / "gone.json", overwrite=True)
+    os.mkfifo(tmp_path / "pipe.json")
+    refused("is not a plain file", tmp_path / "pipe.json", overwrite=True)
+
+
+def test_a_file_is_no_folder_and_lies_in_one(tmp_path):
+    refused("is a folder", tmp_path)
+    refused("there is no folder .*none to write a.json into", tmp_path / "none" / "a.json")
+
+
+def test_an_input_is_never_written_over(tmp_path):
+    source = tmp_path / "model.json"
+    source.write_text(REPORT)
+    refused("is what the command reads", source, source, overwrite=True)
+    recording = tmp_path / "recording"
+    (recording / "sub").mkdir(parents=True)
+    part = recording / "sub" / "part.json"
+    part.write_text(REPORT)
+    refused("lies inside .*recording, which the run reads", recording / "new.json", recording)
+    linked = tmp_path / "linked.json"
+    os.link(part, linked)
+    refused("part.json by another name", linked, recording, overwrite=True)
+    check_file_path(linked, overwrite=True)  # no input has that other name
+    check_file_path(recording / "new.json", [recording], into_recording=True)
+    refused("lies inside", recording / "sub" / "new.json", recording, into_recording=True)
+
+
+@pytest.mark.parametrize(
+    "description", ["recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json"]
+)
+def test_nothing_is_put_beside_a_recordings_description(tmp_path, description):
+    (tmp_path / description).write_text("")
+    refused(f"is a recording's folder .it holds {description}", tmp_path / "a.ply")
+    check_file_path(tmp_path / "a.ply", into_recording=True)
+
+
+@pytest.mark.parametrize("sidecar", ["images", "masks", "depth", "images_right", "flow"])
+def test_a_folder_of_pictures_belongs_to_a_recording(tmp_path, sidecar):
+    (tmp_path / sidecar).mkdir()
+    check_file_path(tmp_path / "a.ply")
+    (tmp_path / sidecar / "notes.txt").write_text("")
+    check_file_path(tmp_path / "a.ply")
+    (tmp_path / sidecar / "0001.PNG").write_text("")
+    refused(f"is a recording's folder .it holds {sidecar}", tmp_path / "a.ply")
+    (tmp_path / sidecar / ".intrasplat.json").write_text("")
+    check_file_path(tmp_path / "a.ply")
+
+
+def test_a_folder_among_a_recordings_pictures_is_refused(tmp_path):
+    for name in ("views", "masks"):
+        (tmp_path / name).mkdir()
+        check_folder_path(tmp_path / name / "run")
+    (tmp_path / "frame.png").write_text("")
+    check_folder_path(tmp_path / "views" / "run")  # beside pictures an unspecific name means nothing
+    with pytest.raises(OutputError, match="masks, which belongs to the recording"):
+        check_folder_path(tmp_path / "masks" / "run")
+    (tmp_path / "recording.json").write_text("")
+    with pytest.raises(OutputError, match="views, which belongs to the recording"):
+        check_folder_path(tmp_path / "views" / "run")
+    (tmp_path / ".intrasplat.json").write_text("")
+    check_folder_path(tmp_path / "views" / "run")
+
+
+def path_of(count):
+    """A path of so many bytes."""
+    return Path(("/" + "x" * 99) * 40 + "/" + "y" * (count - 4001))
+
+
+def test_a_path_has_at_most_4095_bytes(tmp_path):
+    refused("there is no folder", path_of(4095))
+    refused("is no name that a file can have", path_of(4096))
+    check_folder_path(path_of(4095))
+    with pytest.raises(OutputError, match="--out has 4096 bytes; a path has at most 4095"):
+        check_folder_path(path_of(4096))
+    refused("is no name that a file can have", tmp_path / "a\0b")
+    refused("cannot be used: File name too long", tmp_path / ("y" * 300))
+
+
+def test_results_do_not_go_into_the_home_folder_the_root_or_around_an_input(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    for place, said in (
+        (Path("/"), "the root"),
+        (tmp_path / "home", "your home folder"),
+        (Path(), "the current folder"),
+    ):
+        with pytest.raises(OutputError, match=said):
+            check_folder_path(place)
+    check_folder_path(tmp_path / "home" / "run", [tmp_path / "clip.mp4"])
+    with pytest.raises(OutputError, match=r"clip\.mp4 lies inside --out"):
+        check_folder_path(tmp_path / "run", [tmp_path / "run" / "clip.mp4"])

@@ -14,6 +14,7 @@ from gsplat_core.errors import InvalidSetting
 from operators.outcome import OutcomeBuilder
 from operators.tool_mask import (
     BELIEVED_FRAMES,
+    LEAST_TISSUE,
     TOOL_MASKS,
     FoundMasks,
     FoundToolMaskOp,
@@ -212,3 +213,65 @@ def test_another_scene_has_shown_no_tissue_yet_and_withheld_frames_say_nothing(f
     assert found == [0.5, 0.0, 1.0, 1.0]
     found, operator = tissue_shares(frame, compute, 0.0, 0.0, **{"0": {"withheld": "out of body"}})
     assert found == [0.0, 1.0] and found_masks(operator).disbelieved == 1
+
+
+class SaysPixels:
+    """Finds a mask with so many tissue pixels of 384."""
+
+    def __init__(self):
+        self.tissue, self.resets = 0, 0
+
+    def find(self, image):
+        mask = np.zeros(image.shape[:2], np.uint8)
+        mask.reshape(-1)[: self.tissue] = 1
+        return mask
+
+    def reset(self):
+        self.resets += 1
+
+
+def doubting(doubts=True):
+    finder = SaysPixels()
+    operator = FoundToolMaskOp(None, make_finder=lambda: finder, method="says", doubts=doubts)
+    operator.start()
+    return operator, finder
+
+
+def tissue(operator, compute, frame, **fields):
+    (given,) = compute(operator, frame=frame(**fields))
+    return int(given.mask.sum())
+
+
+def test_a_picture_that_is_all_tool_is_believed_for_ten_frames_after_tissue(frame, compute):
+    operator, finder = doubting()
+    assert BELIEVED_FRAMES == 10
+    assert tissue(operator, compute, frame) == 384  # nothing showed tissue before
+    finder.tissue = 384
+    assert tissue(operator, compute, frame) == 384
+    finder.tissue = 0
+    assert [tissue(operator, compute, frame) for _ in range(12)] == [0] * 10 + [384] * 2
+    finder.tissue = 100
+    assert tissue(operator, compute, frame) == 100
+    finder.tissue = 0
+    assert tissue(operator, compute, frame) == 0
+    assert tissue(operator, compute, frame, new_scene="cut") == 384 and finder.resets == 1
+    assert tissue(operator, compute, frame, withheld="black") == 0
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    result = outcome.find(FoundMasks)
+    assert (result.method, result.found, result.recorded, result.disbelieved) == ("says", 18, 0, 4)
+    assert result.tool_share == pytest.approx((10 + 284 / 384 + 1 + 1) / 18)
+    (note,) = outcome.notes
+    assert note.startswith("in 4 frames everything looked like a tool")
+
+
+def test_the_least_tissue_is_believed_and_a_finder_without_doubts_always(frame, compute):
+    least = int(np.ceil(LEAST_TISSUE * 384))
+    operator, finder = doubting()
+    finder.tissue = least
+    assert tissue(operator, compute, frame) == least
+    operator, finder = doubting()
+    finder.tissue = least - 1
+    assert tissue(operator, compute, frame) == 384
+    operator, finder = doubting(doubts=False)
+    assert tissue(operator, compute, frame) == 0

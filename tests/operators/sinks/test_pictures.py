@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from operators.sinks.pictures import depth_map, depth_range, error_map
+from operators.sinks.pictures import CAPTION_HEIGHT_PX, depth_map, depth_range, error_map, fitted, side_by_side
 
 GREY = (70, 74, 80)
 
@@ -36,3 +37,39 @@ def test_a_flat_scene_is_one_colour_and_an_empty_one_has_no_range(rendered):
     flat = rendered(depth=np.full((16, 24), 60, np.float32))
     assert np.ptp(depth_map(flat).reshape(-1, 3), axis=0).max() == 0
     assert depth_range(rendered(depth=np.zeros((16, 24), np.float32))) is None
+
+
+@pytest.mark.parametrize(
+    ("size", "wanted", "box"),
+    [
+        ((10, 20), (30, 40), (5, 25, 0, 40)),
+        ((20, 10), (40, 30), (0, 40, 5, 25)),
+        ((10, 10), (10, 10), (0, 10, 0, 10)),
+        ((100, 1), (10, 10), (0, 10, 4, 5)),
+    ],
+)
+def test_a_picture_is_fitted_without_being_stretched(size, wanted, box):
+    canvas = fitted(np.full((*size, 3), 200, np.uint8), *wanted)
+    bright = (canvas == 200).all(-1)
+    top, bottom, left, right = box
+    assert canvas.shape == (*wanted, 3) and bright[top:bottom, left:right].all()
+    assert bright.sum() == (bottom - top) * (right - left) and (canvas[~bright] == (17, 20, 24)).all()
+
+
+@pytest.mark.parametrize(("width", "zoom"), [(24, 14), (319, 2), (320, 1), (321, 1)])
+def test_small_pictures_are_enlarged_by_a_whole_factor(rendered, frame, width, zoom):
+    image = np.full((16, width, 3), 90, np.uint8)
+    pair = side_by_side(rendered(frame=frame(image=image)))
+    assert pair.shape == (CAPTION_HEIGHT_PX + 16 * zoom, 2 * width * zoom, 3)
+    below = pair[CAPTION_HEIGHT_PX:]
+    assert (below[:, : zoom * width - 1] == 90).all() and (below[:, zoom * width + 1 :] == 92).all()
+    assert (below[:, zoom * width - 1 : zoom * width + 1] == (17, 20, 24)).all()
+
+
+def test_the_range_of_depth_is_from_the_2nd_to_the_98th_percentile_of_what_is_known(rendered):
+    depth = np.arange(1, 385, dtype=np.float32).reshape(16, 24)
+    alpha = np.full((16, 24), 0.51, np.float32)
+    known = np.arange(3, 383)
+    depth[0, :2], alpha[-1, -2:] = (0, np.inf), 0.5
+    assert depth_range(rendered(depth=depth, alpha=alpha)) == pytest.approx(np.percentile(known, (2, 98)))
+    assert depth_range(rendered(depth=np.zeros_like(depth), alpha=alpha)) is None
