@@ -56,11 +56,12 @@ class FrameOrder:
     def take(self, frame: Frame, arrived_ns: int) -> Frame | None:
         """The frame with its number and time put right; None for one to be dropped. arrived_ns: when it came in."""
         known, out = self._in, self._out
-        if known is None or out is None:
+        if known is None:
             if not self._trusted:
                 # From nought: a time since the start of some machine has too many digits for single precision.
                 self._seq_offset, self._pts_offset_ns = -frame.seq, -frame.pts_ns
             return self._accept(frame, frame.pts_ns + self._pts_offset_ns, arrived_ns)
+        assert out is not None
         if self._restarted:
             return self._rebase(frame, arrived_ns, None)
         if self._trusted:
