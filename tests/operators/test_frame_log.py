@@ -9,7 +9,7 @@ import pytest
 
 from gsplat_core.errors import InvalidInput
 from operators.errors import StorageFull
-from operators.frame_log import FrameLog, frames_per_entry, read_frames, series
+from operators.frame_log import MAX_SERIES, FrameLog, frames_per_entry, read_frames, series
 from operators.storage import StorageReserve
 
 
@@ -118,3 +118,8 @@ def test_every_frame_is_in_exactly_one_bin():
     for trained in (True, False):
         total = sum(each["frames"] * each["psnr_tissue_db"] for each in binned if each["trained"] is trained)
         assert total == pytest.approx(sum(each["psnr_tissue_db"] for each in entries if each["trained"] is trained))
+
+
+@pytest.mark.parametrize(("frames", "per_entry"), [(0, 1), (1, 1), (4096, 1), (4097, 2), (8192, 2), (8193, 3)])
+def test_a_series_has_at_most_4096_bins(frames, per_entry):
+    assert MAX_SERIES == 4096 and frames_per_entry(frames, MAX_SERIES) == per_entry

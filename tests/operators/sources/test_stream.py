@@ -1,0 +1,46 @@
+"""Sizes of frames from a sender that is not ours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.scene.frames import Frame
+from operators.sources.options import SourceOptions
+from operators.sources.stream import StreamSource, check_size, resized
+
+
+def test_sizes_are_taken_up_to_their_borders():
+    check_size("cam", 1, 1)
+    check_size("cam", MAX_PIXELS, 1)
+    check_size("cam", 8, 9, least=8)
+    for width, height, least in ((0, 5, 1), (5, 0, 1), (MAX_PIXELS + 1, 1, 1), (7, 9, 8), (9, 7, 8)):
+        with pytest.raises(InvalidSetting, match=f"cam: frames of {width}x{height} px cannot be used"):
+            check_size("cam", width, height, least)
+
+
+@pytest.mark.parametrize(("scale", "size"), [(1, (4, 6)), (0.5, (2, 3)), (1.5, (6, 9)), (0.01, (1, 1))])
+def test_frames_are_resized_by_a_factor(scale, size):
+    frame = Frame(0, 0, np.full((4, 6, 3), 9, np.uint8))
+    found = resized(frame, scale)
+    assert found.image.shape == (*size, 3) and (found.image == 9).all()
+    assert (found is frame) is (scale == 1)
+
+
+@pytest.mark.parametrize(("fps", "rate", "notes"), [(None, 30.0, 2), (12.5, 12.5, 1)])
+def test_what_a_sender_does_not_state_is_assumed_and_said(fps, rate, notes):
+    source = StreamSource(SourceOptions(max_frames=5))
+    source.describe("cam", (64, 48), fps)
+    about = source.description
+    assert (about.fps, about.width_px, about.height_px, about.frame_count) == (rate, 64, 48, 5) and len(
+        about.notes
+    ) == notes
+
+
+def test_a_scaled_stream_has_sides_of_at_least_eight_pixels():
+    StreamSource(SourceOptions()).describe("cam", (3, 3), 30)
+    StreamSource(SourceOptions(scale=0.5)).describe("cam", (16, 16), 30)
+    with pytest.raises(InvalidSetting, match="7x7 px cannot be used; both sides must be at least 8 px"):
+        StreamSource(SourceOptions(scale=0.5)).describe("cam", (14, 14), 30)
