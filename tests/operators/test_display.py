@@ -8,6 +8,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import FrameStatus
 from operators.display import (
+    COLOURS,
     LOOK_NS,
     DisplayOp,
     DisplaySettings,
@@ -308,3 +309,20 @@ def test_the_frame_of_a_picture_that_is_not_live_is_an_80th_of_its_height(height
     live = np.full((height, 320, 3), 7, np.uint8)
     draw_label(live, PictureState.LIVE, 0)
     assert (live[-1] == 7).all() and (live[:, -1] == 7).all() and (live[:8, :8] != 7).any()
+
+
+def test_before_it_starts_nothing_was_shown(fake_time):
+    operator = DisplayOp(None, clock=FrameClock(ClockSettings(), 25, fake_time), source_state=lambda: SourceState.LIVE)
+    assert (operator.pictures, operator.state, operator.states, operator.age_p50_ms) == (0, None, {}, 0.0)
+
+
+@pytest.mark.parametrize("state", PictureState)
+def test_the_text_of_a_label_lies_in_its_box_in_the_colour_of_the_state(state):
+    picture = np.full((200, 400, 3), 7, np.uint8)
+    draw_label(picture, state, 120e6)
+    inside = picture[5:-5, 5:-5]
+    text = inside.max(-1) > max(COLOURS[state]) // 2  # its edges are smoothed
+    rows, columns = np.nonzero(text)
+    black = np.nonzero((inside == 0).all(-1))
+    assert len(rows) > 20 and rows.max() < black[0].max() and columns.max() < black[1].max()
+    assert len(black[0]) > len(rows)
