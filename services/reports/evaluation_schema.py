@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 from operators.storage import write_whole
 from services.reports.schema import MOST_REPORT_BYTES, NOTICE, Count, ModelFacts, Part, RecordingFacts
 

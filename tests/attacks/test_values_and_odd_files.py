@@ -9,10 +9,10 @@ import os
 import numpy as np
 import pytest
 
+from benchmarks.sparse_points import SparsePoints
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.evaluation.sparse_points import SparsePoints
-from gsplat_core.io import regular_files
-from gsplat_core.io.regular_files import open_regular, read_regular
+from gsplat_core.io import files
+from gsplat_core.io.files import open_regular, read_regular
 from operators.errors import OutputError
 from operators.output_paths import check_folder_path
 from services.audit import AuditLog
@@ -90,7 +90,7 @@ def test_a_file_that_would_make_the_reader_wait_is_an_error(tmp_path, monkeypatc
     """Files of /proc such as kmsg are plain files by their mode, and wait for contents. A pipe that passes for one stands for them."""
     os.mkfifo(tmp_path / "p")
     writer = os.open(tmp_path / "p", os.O_RDWR)
-    monkeypatch.setattr(regular_files.stat, "S_ISREG", lambda mode: True)
+    monkeypatch.setattr(files.stat, "S_ISREG", lambda mode: True)
     try:
         with pytest.raises(OSError, match="without waiting"):
             read_regular(tmp_path / "p", 100)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 from gsplat_core.scene.frames import Frame
 from operators.sources.options import SourceOptions
 from operators.sources.stream import StreamSource, check_size, resized
