@@ -42,7 +42,7 @@ class _Nonwaiting(io.FileIO):
         return data
 
 
-def open_regular(path: str | Path, *, follow_links: bool = True) -> BinaryIO:
+def open_regular(path: str | Path, *, follow_links: bool = True) -> io.BufferedReader:
     """Open a regular file for reading bytes. Raises OSError for everything else, without waiting."""
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     # Without O_NONBLOCK, opening a pipe waits for its writer. The flag does not affect regular files.
