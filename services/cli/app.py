@@ -44,9 +44,9 @@ app = typer.Typer(
 def run(arguments: list[str]) -> int:
     """Run a command line; returns the exit code. Every error ends here."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    if "" in arguments:
-        at = arguments.index("") + 1
-        typer.echo(f"error: argument {at} is empty; a variable of the shell may be unset", err=True)
+    empty = [f"argument {at}" if not word else word for at, word in enumerate(arguments, 1) if _is_empty(word)]
+    if empty:
+        typer.echo(f"error: {sentence(empty[0])} is empty; a variable of the shell may be unset", err=True)
         return BAD_INPUT
     try:
         code = typer.main.get_command(app).main(arguments, prog_name="intrasplat", standalone_mode=False)
@@ -57,6 +57,11 @@ def run(arguments: list[str]) -> int:
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the one place where errors become exit codes
         return exit_code_of(error, arguments)
     return code if isinstance(code, int) else OK
+
+
+def _is_empty(word: str) -> bool:
+    """Detect an empty argument, or an option with an empty value (`--out=`). No option means anything by one."""
+    return not word or (word.startswith("--") and word.endswith("=") and word.count("=") == 1)
 
 
 def _say_usage(error: Any) -> int:

@@ -13,9 +13,6 @@ import typer
 
 
 def _path(text: str) -> Path:
-    if not text:
-        # An empty name would stand for the current folder.
-        raise typer.BadParameter("it is empty; give a path")
     if "\0" in text:
         raise typer.BadParameter(f"{text!r} holds a zero byte, which no name of a file can")
     return Path(text)

@@ -6,8 +6,9 @@ import subprocess
 import sys
 
 import pytest
+import typer
 
-from services.cli.app import run
+from services.cli.app import app, run
 from services.cli.exit_codes import BAD_INPUT
 
 
@@ -46,3 +47,29 @@ def test_importing_the_command_is_quick_because_it_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout.splitlines()[0], done.stdout.splitlines()[-1]) == ("[]", "[]")
+
+
+def commands(group, path=()):
+    """Yield the words of every command and its parameters."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*path, name))
+        else:
+            yield (*path, name), command.params
+
+
+EVERY_COMMAND = dict(commands(typer.main.get_command(app)))
+
+
+@pytest.mark.parametrize("words", EVERY_COMMAND, ids=" ".join)
+def test_an_empty_argument_or_option_of_any_command_is_refused(words, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # an empty path must not stand for the current folder
+    options = [each.opts[-1] for each in EVERY_COMMAND[words] if each.opts[-1].startswith("--") and not each.is_flag]
+    arguments = sum(each.param_type_name == "argument" for each in EVERY_COMMAND[words])
+    lines = [[f"{option}="] for option in options] + [[option, ""] for option in options]
+    lines += [["given"] * place + [""] for place in range(arguments)]
+    for line in lines:
+        assert run([*words, *line]) == BAD_INPUT, line
+        shown = capsys.readouterr()
+        assert shown.out == "" and "is empty; a variable of the shell may be unset" in shown.err, line
+    assert list(tmp_path.iterdir()) == []
