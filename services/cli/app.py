@@ -44,7 +44,7 @@ app = typer.Typer(
 def run(arguments: list[str]) -> int:
     """Run a command line; returns the exit code. Every error ends here."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    empty = [f"argument {at}" if not word else word for at, word in enumerate(arguments, 1) if _is_empty(word)]
+    empty = [word or f"argument {at}" for at, word in enumerate(arguments, 1) if _is_empty(word)]
     if empty:
         typer.echo(f"error: {sentence(empty[0])} is empty; a variable of the shell may be unset", err=True)
         return BAD_INPUT

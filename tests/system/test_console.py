@@ -92,7 +92,7 @@ def test_the_live_page_fits_the_window(page, window):
     assert shares[0] > (0.15 if window == "phone" else 0.35), "the pictures are what the page is for"
     assert shares[1] > 0.05
     text = page.inner_text("#live .plots")
-    assert "training error of the displayed frame" in text
+    assert "displayed frame, training error" in text
     page.set_viewport_size({"width": 1280, "height": 800})
 
 

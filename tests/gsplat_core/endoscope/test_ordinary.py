@@ -109,6 +109,6 @@ def test_a_closer_look_becomes_the_reference_after_two_tenths_of_a_second(monkey
     looked = []
     for k in range(40):
         watch.is_ordinary(small, k * 40_000_000)
-        looked.append(watch._looked_ns)
+        looked.append(watch._referenced_ns)
     renewed = sorted(set(looked))
     assert {b - a for a, b in zip(renewed[-4:], renewed[-3:], strict=False)} == {200_000_000}

@@ -284,7 +284,7 @@ def right_camera(turn=0.0, up=0.0, focal=1.0, row=0.0, baseline=BASELINE_MM):
     ],
 )  # fmt: skip
 def test_limits_of_a_rectified_pair(given, said):
-    found = stereo._unlike_eyes(camera(), right_camera(**given))
+    found = stereo._why_not_rectified(camera(), right_camera(**given))
     assert found is None if said is None else said in found
 
 
@@ -300,7 +300,7 @@ def test_depth_times_disparity_is_the_focal_length_times_the_baseline(left, righ
 def test_shares_of_points_behind_the_scope(behind, said):
     count = round(100 * behind)
     look = SimpleNamespace(disparities=np.array([-20.0] * count + [20.0] * (100 - count)) + 7)
-    found = stereo._unlike_distances(look, 7.0, calibrated=True)
+    found = stereo._why_implausible(look, 7.0, calibrated=True)
     assert found is None if said is None else said in found
 
 

@@ -73,7 +73,7 @@ def test_a_window_is_shown_from_end_to_end(window_s, fps, frames):
 
 @pytest.mark.parametrize("fps", [0, -1, 1000.5, math.inf, math.nan])
 def test_a_rate_out_of_range_is_refused(fps):
-    with pytest.raises(InvalidSetting, match="it must be above 0 and at most 1000"):
+    with pytest.raises(InvalidSetting, match=r"it must be at least 0\.001 and at most 1000"):
         limits.frames_to_render((0.0, 1.0), fps)
 
 

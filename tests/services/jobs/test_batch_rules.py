@@ -26,10 +26,11 @@ def place(tmp_path):
         (tmp_path / "in" / name).write_bytes(name.encode() * 10_000)
     begin(tmp_path)
     for name in ("a.mp4", "b.mp4"):
-        with OutputFolder(tmp_path / "out" / name, "replay") as output:
+        with OutputFolder(tmp_path / "made" / name, "replay") as output:
             for file in ("report.json", "frames.jsonl"):
                 (output.path / file).write_text("{}")
             output.publish()
+        (tmp_path / "made" / name).rename(tmp_path / "out" / name)
     return tmp_path
 
 

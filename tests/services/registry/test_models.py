@@ -248,7 +248,7 @@ def test_a_full_disk_is_said_and_nothing_is_kept(sqlite_registry, files, tmp_pat
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(files.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreUnavailable, match="the upload cannot be kept: No space left on device; free space"):
         sqlite_registry.upload("liver", packed_model(files), None, "surgeon")
     monkeypatch.undo()

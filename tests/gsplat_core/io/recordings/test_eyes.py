@@ -93,7 +93,7 @@ def test_a_calibration_for_another_size_is_refused(tmp_path):
     picture(tmp_path / "left.png", size=(100, 80))
     picture(tmp_path / "right.png", size=(100, 80))
     scared_json(tmp_path)
-    with pytest.raises(RecordingInvalid, match=r"principal point .* lies outside"):
+    with pytest.raises(RecordingInvalid, match=r"principal point .* is outside"):
         open_recording(tmp_path)
 
 
