@@ -118,7 +118,7 @@ def _changes(node: ast.AST) -> list[Callable[[], None]]:
     if isinstance(node, ast.If | ast.IfExp) and not _only_types(node.test):
         return [lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test))]
     if isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value not in (0, 1, -1, 2):
-        return [lambda: setattr(node, "value", node.value * 100 if isinstance(node.value, float) else node.value + 1)]
+        return [lambda: setattr(node, "value", node.value * (100 if isinstance(node.value, float) else 2))]
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in EXCHANGED:
         return [lambda: setattr(node.func, "id", EXCHANGED[node.func.id])]
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in EXCHANGED:

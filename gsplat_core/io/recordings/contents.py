@@ -94,7 +94,7 @@ class Contents:
             return self.rectification.right_camera
         return self.calibration.camera.right_eye(self.stereo_baseline_mm)
 
-    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+    def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
         """Frame after frame at full size, decoded when asked for; None where one has a problem.
 
         What lies beside the images is read a few frames ahead, in a thread of its own, while the images are decoded in the caller's.
