@@ -1,4 +1,5 @@
-"""The control plane: the service's HTTP API. It imports no torch and no OpenCV; what it steers are processes and stores of their own."""
+"""HTTP control plane of the service. Imports neither torch nor OpenCV; the heavy work runs in other
+processes."""
 
 from services.control.app import new_app
 from services.control.parts import Parts

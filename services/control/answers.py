@@ -1,4 +1,4 @@
-"""Every error of the application as problem+json: the one place where errors become statuses."""
+"""Exception handlers that answer every application error as problem+json."""
 
 from __future__ import annotations
 
@@ -22,30 +22,33 @@ from services.control.problems import OF_STATUS, PROBLEM_JSON, BadRequest, NoSpa
 log = logging.getLogger(__name__)
 
 KNOWN: dict[type[Exception], type[Problem]] = {AuditUnwritable: Unavailable}
-"""Errors of other packages, and what they are here. `Parts.errors` adds those of the parts."""
+"""Errors of base packages and the problem each maps to. `Parts.errors` adds those of the parts."""
 
 OF_ERRNO: dict[int, type[Problem]] = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), NoSpace),
     **dict.fromkeys((errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE), Unavailable),
 }
-"""Errors of the server's disk that any store may raise, and their problems."""
+"""Disk errors that any store may raise, mapped to problems by errno."""
 
 PHRASES = {
     404: "there is nothing at this path; /docs lists what there is",
     405: "this path does not take this method; the header Allow lists those that it takes",
 }
-"""What the framework's own errors say, in a sentence."""
+"""Detail texts for errors that the framework itself raises, by status."""
 
 
 class ProblemResponse(JSONResponse):
-    """A problem as an answer. Where the request's body is not read, the rest of it is thrown away after the answer for at most `drain_s`:
-    a connection that is closed on bytes which nobody has read is reset, and the client loses the answer."""
+    """Problem+json response that drains an unread request body after the answer.
+
+    Closing a connection with unread bytes resets it, and the client would lose the answer. The
+    drain takes at most `drain_s`.
+    """
 
     media_type = PROBLEM_JSON
     drain_s = 0.0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the answer, drain, and end."""
+        """Send the answer, drain the request body if `drain_s` is set, then end the response."""
         if not self.drain_s:
             return await super().__call__(scope, receive, send)
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
@@ -58,7 +61,7 @@ class ProblemResponse(JSONResponse):
 
 
 def response_of(problem: Problem, scope: Scope) -> Response:
-    """The answer; closes the connection where a body was announced that nobody will read."""
+    """Build the response for a problem; close the connection if the request has an unread body."""
     headers = dict(problem.headers)
     unread = _has_unread_body(scope)
     if unread:
@@ -71,7 +74,12 @@ def response_of(problem: Problem, scope: Scope) -> Response:
 
 
 def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Problem]]) -> None:
-    """Install the handlers of an application."""
+    """Install the exception handlers of an application.
+
+    Args:
+        app: the application to extend.
+        errors: problem type for each error type of the parts, in addition to `KNOWN`.
+    """
 
     async def on_problem(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, Problem)
@@ -79,7 +87,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
 
     async def on_http(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, HTTPException)
-        if isinstance(error.__cause__, Problem):  # raised while FastAPI read the body, and wrapped by it
+        if isinstance(error.__cause__, Problem):  # # FastAPI wraps problems raised while it reads the body
             return await _answer(connection, error.__cause__)
         kind = OF_STATUS.get(error.status_code, OF_STATUS[500 if error.status_code >= 500 else 400])
         headers = dict(error.headers or {})
@@ -122,14 +130,15 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
 
 
 def _methods_of(app: FastAPI, connection: HTTPConnection) -> str:
-    """All methods of a path: the framework names only those of the first route that has it."""
+    """Return all methods of a path; the framework lists only those of its first route."""
     path = connection.scope["route"].path
     routes = [each for each in iter_route_contexts(app.routes) if getattr(each, "path", None) == path]
     return ", ".join(sorted({method for each in routes for method in getattr(each, "methods", None) or ()}))
 
 
 def _of_validation(error: RequestValidationError | WebSocketRequestValidationError) -> Problem:
-    """Where and what, without the values: they may be secrets, and the caller has them."""
+    """Describe a validation error by location and message. Values are left out because they may be
+    secrets."""
     errors = [{"at": ".".join(str(part) for part in each["loc"]), "what": each["msg"]} for each in error.errors()]
     said = "; ".join(f"{each['at']}: {each['what']}" for each in errors[:3])
     return Unprocessable(f"{said}; /docs describes what is expected", errors=errors[:20])

@@ -1,4 +1,4 @@
-"""The application: routes, guards and limits around the parts that it is given."""
+"""Application factory: routes, guards and limits around the given parts."""
 
 from __future__ import annotations
 
@@ -40,10 +40,14 @@ AUDIT_FILE = "audit.jsonl"
 
 
 def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
-    """The control plane as an ASGI application; its stores lie in `settings.data_dir`, which is made.
+    """Build the control plane as an ASGI application.
 
-    Raises AuditError where another server uses the same folder. At the first start the administrator's key is put into
-    `settings.admin_key_file`.
+    Creates `settings.data_dir` and its stores. On the first start, writes the administrator's key
+    to `settings.admin_key_file`.
+
+    Raises:
+        AuditError: if another server uses the same data folder.
+        SettingsInvalid: if `auth.oidc` is set and PyJWT is not installed.
     """
     parts = parts or Parts()
     control = _new_state(settings, parts)
@@ -52,7 +56,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
         version=product_version(),
         summary="Live, deforming 3D reconstruction from endoscopic video.",
         description=ABOUT,
-        openapi_url=None, docs_url=None, redoc_url=None,  # ours are in documents.py, and load nothing from elsewhere
+        openapi_url=None, docs_url=None, redoc_url=None,  # # documents.py serves its own, without external resources
         redirect_slashes=False,
         generate_unique_id_function=_operation_id,
         lifespan=_lifespan,
@@ -64,7 +68,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
     describe(app)
     limits = settings.limits
     by_address = TokenBuckets(limits.address_requests_per_s, limits.address_requests_per_s * limits.burst_s)
-    # Each is put around those before it.
+    # # Each middleware wraps the ones added before it.
     app.add_middleware(KnownHosts, server=settings.server, measures=control.measures)
     app.add_middleware(AddressRate, buckets=by_address, measures=control.measures)
     app.add_middleware(HeadLength, measures=control.measures)
@@ -82,7 +86,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
     for folder in (data, uploads):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     keep = settings.audit
-    # First: its lock says that no other server uses these folders.
+    # # Opened first: its lock proves that no other server uses these folders.
     audit = AuditLog(
         data / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days, parts.trusts_ages)
     )
@@ -145,7 +149,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 
 def _remove_unfinished(uploads: Path) -> None:
-    """What a server that was killed had taken in."""
+    """Delete partial uploads of a killed server."""
     for name in os.listdir(uploads):
         if name.startswith("upload-"):
             (uploads / name).unlink()

@@ -1,4 +1,4 @@
-"""Bodies of requests, bounded in length and in time while they are read."""
+"""Request bodies with a bounded length and a minimum transfer rate."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ from services.control.problems import BadRequest, TooLarge, TooSlow
 from services.settings.sections import LimitSettings
 
 GRACE_S = 5.0
-"""So long a body may be slow before its rate is looked at."""
+"""Grace period, in seconds, before the rate of a body is checked."""
 
 
 def refuse_by_length(request: Request, most_bytes: int) -> None:
-    """Raise TooLarge for a body whose header says that it is too long, before a byte of it is read, and BadRequest where two headers say two
-    things: a proxy before this server may have believed the other one."""
+    """Refuse a body by its headers, before any byte is read.
+
+    Raises:
+        TooLarge: if Content-Length exceeds `most_bytes`.
+        BadRequest: if Content-Length is not a number, or is sent together with Transfer-Encoding. A
+            proxy in front may have trusted the other header (request smuggling).
+    """
     stated = request.headers.get("content-length")
     if stated is not None and "transfer-encoding" in request.headers:
         raise BadRequest("Content-Length and Transfer-Encoding were both sent; send one")
@@ -30,7 +35,8 @@ def refuse_by_length(request: Request, most_bytes: int) -> None:
 
 
 class BoundedBody:
-    """A `receive` that raises TooLarge after `most_bytes`, and TooSlow for a body that stalls or trickles."""
+    """ASGI `receive` that raises TooLarge after `most_bytes` and TooSlow for a body that stalls or
+    trickles."""
 
     def __init__(self, scope: Scope, receive: Receive, most_bytes: int, limits: LimitSettings) -> None:
         self._scope = scope
@@ -42,7 +48,7 @@ class BoundedBody:
 
     async def __call__(self) -> Message:
         if self._scope["state"].get("body_read"):
-            return await self._receive()  # waits for the client to leave
+            return await self._receive()  # # blocks until the client disconnects
         try:
             async with asyncio.timeout(self._limits.stall_s):
                 message = await self._receive()

@@ -28,13 +28,18 @@ _SEQUENCE, _VERSION, _UTC_TIME = 0x30, 0xA0, 0x17
 
 
 class ServerCertificate(Collector):
-    """The chain and the key of a server. While it serves, new connections get the newest pair that could be loaded.
+    """Certificate chain and key of a server, reloaded when the files change.
 
-    A pair that cannot be loaded is logged and changes nothing: the one before stays in use, and /readyz is degraded until a good pair is there.
+    New connections get the newest pair that loaded successfully. A pair that fails to load is
+    logged, the previous one stays in use, and /readyz reports degraded.
     """
 
     def __init__(self, certfile: Path, keyfile: Path, events: SystemEvents | None = None) -> None:
-        """Load the pair. Raises OSError (ssl.SSLError is one) where that fails."""
+        """Load the pair.
+
+        Raises:
+            OSError: if loading fails (ssl.SSLError is a subclass).
+        """
         self._certfile, self._keyfile = certfile, keyfile
         self._events = events or SystemEvents()
         self._stamp = self._stamp_now()
@@ -43,20 +48,24 @@ class ServerCertificate(Collector):
 
     @property
     def expires_at(self) -> datetime:
-        """When the first certificate of the chain expires."""
+        """Earliest expiry among the certificates of the chain."""
         return datetime.fromtimestamp(self._expires_s, UTC)
 
     def attach(self, context: ssl.SSLContext) -> None:
-        """Let connections of a listening context have the newest pair."""
+        """Make connections of a listening context use the newest pair."""
 
         def choose(connection: ssl.SSLObject | ssl.SSLSocket, name: str | None, _: ssl.SSLContext) -> None:
             connection.context = self._context
 
-        # Called for each handshake, with a server name or without one.
+        # # OpenSSL calls this for each handshake, with or without a server name.
         context.sni_callback = choose
 
     def look(self) -> bool:
-        """Load the files again if they have changed. Returns True where a new pair is in use."""
+        """Reload the files if they changed.
+
+        Returns:
+            True if a new pair is in use.
+        """
         stamp = self._stamp_now()
         if stamp == self._stamp:
             return False
@@ -76,7 +85,7 @@ class ServerCertificate(Collector):
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """Look again and again while the block lasts."""
+        """Poll the files for changes while the block runs."""
         looking = asyncio.create_task(self._watch(), name="changes of the certificate")
         try:
             yield
@@ -85,7 +94,7 @@ class ServerCertificate(Collector):
             await asyncio.gather(looking, return_exceptions=True)
 
     async def check(self) -> CheckResult:
-        """The expiry for /readyz; degraded once it is over, and where newer files cannot be used."""
+        """Report the expiry for /readyz; degraded if expired or if newer files cannot be used."""
         left_s = self._expires_s - time.time()
         when = f"{self.expires_at:%Y-%m-%d %H:%M} UTC"
         said = f"it expires at {when}, in {left_s / 86400:.0f} days" if left_s > 0 else f"it has expired at {when}"
@@ -96,7 +105,7 @@ class ServerCertificate(Collector):
         return CheckResult(left_s > 0, said if left_s > 0 else f"{said}; renew it", False)
 
     def collect(self) -> Iterable[Metric]:
-        """See `Collector`."""
+        """Export the expiry time and the reload status; see `Collector`."""
         expiry = GaugeMetricFamily(
             "intrasplat_certificate_expiry_timestamp_seconds", "Unix time at which the TLS certificate in use expires."
         )
@@ -118,7 +127,8 @@ class ServerCertificate(Collector):
                 self._events.tell("certificate.reload", "server", "failed")
 
     def _stamp_now(self) -> tuple[object, ...]:
-        """Something that changes with the files; links, as Kubernetes has them, are followed."""
+        """Return a fingerprint of the files (device, inode, mtime, size). Symbolic links, as
+        Kubernetes mounts them, are followed."""
         found: list[object] = []
         for file in (self._certfile, self._keyfile):
             try:
@@ -130,16 +140,21 @@ class ServerCertificate(Collector):
 
 
 def _loaded(certfile: Path, keyfile: Path) -> tuple[ssl.SSLContext, float]:
-    """Return a context with a chain and its key, and the Unix time at which the first of the chain expires. Raises OSError."""
+    """Load a chain and its key.
+
+    Returns:
+        A TLS context, and the Unix time at which the first certificate of the chain expires.
+
+    Raises:
+        OSError: if a file is missing or cannot be used.
+    """
     for file in (certfile, keyfile):
         if not file.exists():
             raise FileNotFoundError(2, f"{file}: No such file or directory")
-        if not file.is_file():  # a pipe would be waited for
+        if not file.is_file():  # # opening a pipe would block
             raise OSError(22, f"{file} is not a file")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(
-        certfile, keyfile, password=""
-    )  # not asked for at a terminal: a key with a passphrase is refused
+    context.load_cert_chain(certfile, keyfile, password="")  # # refuse a key with a passphrase instead of prompting
     try:
         text = certfile.read_text(encoding="ascii", errors="replace")
         expiries = [expiry_of(ssl.PEM_cert_to_DER_cert(each)) for each in _CERTIFICATE.findall(text)]
@@ -149,26 +164,38 @@ def _loaded(certfile: Path, keyfile: Path) -> tuple[ssl.SSLContext, float]:
 
 
 def expiry_of(der: bytes) -> float:
-    """Return the end of a certificate's validity as Unix time (RFC 5280, 4.1). Raises ValueError or IndexError for anything else."""
+    """Return the end of a certificate's validity as Unix time (RFC 5280, 4.1).
+
+    Args:
+        der: a certificate in DER encoding.
+
+    Raises:
+        ValueError: if the data is not a certificate.
+        IndexError: if the data is truncated.
+    """
     certificate = _content(der, 0, _SEQUENCE)[0]
     fields = _content(der, certificate, _SEQUENCE)[0]
     if der[fields] == _VERSION:
         fields = _content(der, fields, _VERSION)[1]
-    for _ in range(3):  # serial number, signature's algorithm, issuer
+    for _ in range(3):  # # skip serial number, signature algorithm, issuer
         fields = _content(der, fields)[1]
     validity = _content(der, fields, _SEQUENCE)[0]
-    at = _content(der, validity)[1]  # past notBefore
+    at = _content(der, validity)[1]  # # skip notBefore
     start, end = _content(der, at)
     text = der[start:end].decode("ascii")
     form = "%y%m%d%H%M%SZ" if der[at] == _UTC_TIME else "%Y%m%d%H%M%SZ"
     time_ = datetime.strptime(text, form)
-    if der[at] == _UTC_TIME and time_.year >= 2050:  # two digits stand for 1950 to 2049
+    if der[at] == _UTC_TIME and time_.year >= 2050:  # # RFC 5280: two-digit years from 50 mean 1950 to 1999
         time_ = time_.replace(year=time_.year - 100)
     return time_.replace(tzinfo=UTC).timestamp()
 
 
 def _content(der: bytes, at: int, tag: int | None = None) -> tuple[int, int]:
-    """Return where the content of the value at `at` begins and ends. Raises ValueError for another tag."""
+    """Return the start and end offset of the content of the DER value at `at`.
+
+    Raises:
+        ValueError: if the value has another tag than `tag`.
+    """
     if tag is not None and der[at] != tag:
         raise ValueError(f"tag {der[at]:#x} in place of {tag:#x}")
     length, start = der[at + 1], at + 2

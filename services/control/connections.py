@@ -1,4 +1,4 @@
-"""A listening socket that takes a bounded number of connections from each address."""
+"""Listening socket with a limit on open connections per client address."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from services.control.limits import network_of_address
 
 log = logging.getLogger(__name__)
 SAY_AGAIN_S = 10.0
-"""Time between two lines in the log about refused connections."""
+"""Seconds between log lines about refused connections."""
 MOST_REFUSED = 64
-"""Connections that one call closes before other work of the event loop goes on."""
+"""Connections that one `accept` call closes before the event loop runs other work."""
 
 
 class AddressBound:
-    """Open connections of each address (of IPv6 each /64), and a bound on them. Any thread may use it."""
+    """Counter and limit of open connections per address (per /64 for IPv6). Thread-safe."""
 
     def __init__(
         self,
@@ -30,12 +30,14 @@ class AddressBound:
         on_refused: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """
+        """Set the limit.
+
         Args:
-            most: connections of one address; 0: no bound.
-            exempt: networks whose connections are not counted, those of trusted proxies. What a proxy says in X-Forwarded-For plays no part:
-                connections are refused before anything is read.
-            on_refused: called for each connection that is closed because its address has too many.
+            most: connections allowed per address; 0 means no limit.
+            exempt: networks that are not counted, normally the trusted proxies. X-Forwarded-For is
+                not considered, because connections are refused before anything is read.
+            on_refused: called for each connection closed because its address is at the limit.
+            clock: monotonic time in seconds.
         """
         self._most, self._on_refused, self._clock = most, on_refused, clock
         self._exempt = [ipaddress.ip_network(each) for each in exempt]
@@ -44,7 +46,11 @@ class AddressBound:
         self._said_s: float | None = None
 
     def enter(self, address: str) -> str | None:
-        """Count a connection. Returns the key to leave with, or None for one too many."""
+        """Count a new connection.
+
+        Returns:
+            The key to pass to `leave`, or None if the address is at its limit.
+        """
         key = "" if not self._most or self._is_exempt(address) else network_of_address(address)
         with self._lock:
             if key and self._open[key] >= self._most:
@@ -55,14 +61,14 @@ class AddressBound:
             return key
 
     def leave(self, key: str) -> None:
-        """Forget a connection that has ended."""
+        """Discount a closed connection."""
         with self._lock:
             self._open[key] -= 1
             if self._open[key] <= 0:
                 del self._open[key]
 
     def open(self, address: str) -> int:
-        """Number of connections that an address has."""
+        """Return the number of open connections of an address."""
         with self._lock:
             return self._open[network_of_address(address)]
 
@@ -84,19 +90,26 @@ class AddressBound:
 
 
 class BoundedListener(socket.socket):
-    """A listening socket whose `accept` closes connections beyond the bound. asyncio accepts by this method, before TLS and before a request."""
+    """Listening socket whose `accept` closes connections above the limit.
+
+    asyncio accepts through this method, before TLS and before any request is read.
+    """
 
     bound: AddressBound
 
     @classmethod
     def of(cls, listener: socket.socket, bound: AddressBound) -> BoundedListener:
-        """Take over a listening socket."""
+        """Wrap an existing listening socket, taking over its descriptor."""
         made = cls(listener.family, listener.type, listener.proto, fileno=listener.detach())
         made.bound = bound
         return made
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept the next connection within the bound. Raises BlockingIOError where none waits, or after many that were refused."""
+        """Accept the next connection within the limit.
+
+        Raises:
+            BlockingIOError: if none is pending, or after `MOST_REFUSED` refused connections.
+        """
         for _ in range(MOST_REFUSED):
             descriptor, address = self._accept()  # type: ignore[attr-defined]
             taken = _Connection(self.family, self.type, self.proto, fileno=descriptor)
@@ -110,19 +123,19 @@ class BoundedListener(socket.socket):
 
 
 class _Connection(socket.socket):
-    """A connection that says once when it is closed, whoever closes it."""
+    """Connection that calls `left` once when it is closed or detached."""
 
     left: Callable[[], None] | None = None
 
     def close(self) -> None:
-        """Close the connection and leave the count."""
+        """Close the connection and discount it."""
         super().close()
         left, self.left = self.left, None
         if left is not None:
             left()
 
     def detach(self) -> int:
-        """Give the descriptor away, and leave the count."""
+        """Release the descriptor and discount the connection."""
         left, self.left = self.left, None
         if left is not None:
             left()

@@ -1,4 +1,4 @@
-"""The Content-Digest header (RFC 9530): what a body's SHA-256 must be."""
+"""Parser for the Content-Digest header (RFC 9530)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ _MEMBER = re.compile(r"\s*(?P<name>[a-z0-9*_.-]+)=:(?P<value>[A-Za-z0-9+/=]*):\s
 
 
 def stated_sha256(header: str | None) -> bytes:
-    """The SHA-256 that a header states. Raises BadRequest for one that is absent, states none, or cannot be read."""
+    """Return the SHA-256 in a Content-Digest header, 32 bytes.
+
+    Raises:
+        BadRequest: if the header is absent, malformed, or does not have exactly one sha-256.
+    """
     if header is None:
         raise BadRequest("send the file's digest as `Content-Digest: sha-256=:BASE64:`")
     digests: list[bytes] = []

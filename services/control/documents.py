@@ -1,4 +1,5 @@
-"""The OpenAPI document and Swagger UI, which comes from this package: no page loads anything from elsewhere."""
+"""OpenAPI document and Swagger UI. All files come from this package; no page loads external
+resources."""
 
 from __future__ import annotations
 
@@ -49,21 +50,21 @@ router = new_router("documents", prefix="")
 @router.get("/openapi.json", include_in_schema=False)
 @requires("public")
 async def openapi_document(request: Request) -> Response:
-    """The API's description."""
+    """Return the OpenAPI document."""
     return JSONResponse(request.app.openapi())
 
 
 @router.get("/docs", include_in_schema=False)
 @requires("public")
 async def swagger_ui() -> Response:
-    """The API's page, to read and to try."""
+    """Return the Swagger UI page."""
     return HTMLResponse(PAGE)
 
 
 @router.get("/docs/{file}", include_in_schema=False)
 @requires("public")
 async def swagger_ui_file(file: str) -> Response:
-    """A file of that page."""
+    """Return a static file of the Swagger UI page."""
     if file not in FILES:
         raise Missing("there is no such file of the API's page")
     return FileResponse(SWAGGER_UI / file, media_type=FILES[file], headers={"Cache-Control": "public, max-age=3600"})
@@ -86,7 +87,7 @@ PROBLEM_SCHEMA: dict[str, Any] = {
 
 
 def _problems_of(path: str, method: str, operation: dict[str, Any]) -> set[int]:
-    """Which problems an operation may answer with, from what it is: a check holds this against a running server."""
+    """Return the problem statuses that an operation may answer with, derived from its shape."""
     found = {400, 413, 421, 429, 431, 500, 503}
     if operation["security"]:
         found |= {401, 403, 422}
@@ -104,7 +105,7 @@ def _problems_of(path: str, method: str, operation: dict[str, Any]) -> set[int]:
 
 
 def describe(app: FastAPI) -> None:
-    """Give the application's document its keys' scheme and its problems."""
+    """Add the key scheme and the problem responses to the application's OpenAPI document."""
     framework = app.openapi
 
     def described() -> dict[str, Any]:
@@ -128,6 +129,6 @@ def _add_common(document: dict[str, Any]) -> None:
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             responses = operation["responses"]
-            responses.pop("422", None)  # as FastAPI would answer
+            responses.pop("422", None)  # # FastAPI's own schema; this server answers with a Problem
             for status in sorted(_problems_of(path, method, operation)):
                 responses.setdefault(str(status), {"description": TITLES[status], "content": content})

@@ -1,7 +1,7 @@
-"""Errors of the server around the application. Those of its answers are in `problems`."""
+"""Errors of the server process. API problems are in `problems`."""
 
 from gsplat_core.errors import UserError
 
 
 class CannotServe(UserError):
-    """The server cannot listen where, or as, the settings say."""
+    """The server cannot listen as the settings demand."""

@@ -1,4 +1,4 @@
-"""WebSocket handshakes that cannot be read, answered instead of left open."""
+"""Answers to malformed WebSocket handshakes, which uvicorn would leave open."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ TOO_LARGE = "the head of the WebSocket handshake has too many or too long lines;
 
 
 class AnsweredHandshakes(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket protocol with an answer to every handshake that the parser refuses.
+    """uvicorn's WebSocket protocol, extended to answer every handshake that the parser refuses.
 
-    uvicorn takes no notice of such a handshake: it neither answers nor closes, and the connection would stay until the client closes it.
+    uvicorn neither answers nor closes such a connection, so it would stay open until the client
+    closes it.
     """
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes of the client. Answer 431 or 400 to a handshake that was refused before the application could see it."""
+        """Parse received bytes. Answer 431 or 400 if the parser refused the handshake before the
+        application saw it."""
         super().data_received(data)
         if self.conn.handshake_exc is not None and not self.handshake_initiated and not self.transport.is_closing():
             causes = (self.conn.handshake_exc, self.conn.handshake_exc.__cause__)

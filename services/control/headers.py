@@ -1,4 +1,4 @@
-"""Security headers on every answer."""
+"""Security headers added to every answer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ CONTENT_SECURITY_POLICY = "; ".join(
         "frame-ancestors 'none'",
     ]
 )
-"""Nothing from anywhere else, nothing inline; pictures of the display and videos of replays arrive as blobs, Swagger UI's symbols as data."""
+"""Policy that blocks external and inline content. Display pictures and replay videos arrive as
+blobs, Swagger UI's icons as data URLs."""
 HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY,
     "X-Content-Type-Options": "nosniff",
@@ -34,7 +35,7 @@ HEADERS = {
 
 
 class SecurityHeaders:
-    """Middleware that adds the headers that an answer does not have yet; over TLS also that it stays with TLS."""
+    """Middleware that adds missing security headers, and Strict-Transport-Security over TLS."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -1,4 +1,4 @@
-"""Length of a request's head: its target and its fields."""
+"""Limit on the length of a request head (target and header fields)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ _BETWEEN = len(": \r\n")
 class HeadLength:
     """Middleware that answers 431 to a request whose head is longer than `MOST_HEAD_BYTES`.
 
-    The HTTP parser bounds only a head whose end has not come yet; one that arrives in a single piece passes it.
+    The HTTP parser limits only incomplete heads; a long head that arrives in one piece passes the
+    parser.
     """
 
     def __init__(self, app: ASGIApp, measures: Measures) -> None:
@@ -35,7 +36,7 @@ class HeadLength:
 
 
 def length_of(scope: Scope) -> int:
-    """Bytes of a head, without the few of the method and the version."""
+    """Return the length of a head in bytes, without method and version."""
     target = scope.get("raw_path") or scope["path"].encode()
     fields = sum(len(name) + len(value) + _BETWEEN for name, value in scope["headers"])
     return len(target) + len(scope["query_string"]) + fields

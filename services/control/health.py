@@ -1,4 +1,4 @@
-"""Readiness: the checks of the control plane and of its parts, put together."""
+"""Readiness: the combined health checks of the control plane and its parts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHECK_TIMEOUT_S = 2.0
 
 
 class CheckView(BaseModel):
-    """One thing that was looked at."""
+    """Result of one health check."""
 
     ok: bool
     detail: str
@@ -23,14 +23,20 @@ class CheckView(BaseModel):
 
 
 class Readiness(BaseModel):
-    """`degraded` is ready: something that is not needed for it is not well, a camera for example."""
+    """Readiness of the service. `degraded` still counts as ready: a component that is not required,
+    such as a camera, has a problem."""
 
     status: Literal["ready", "degraded", "not ready"]
     checks: dict[str, CheckView] | None = None
 
 
 async def readiness(control: ControlState, *, verbose: bool) -> Readiness:
-    """Ask every check. verbose: include what each has found."""
+    """Run every health check concurrently.
+
+    Args:
+        control: state of the application.
+        verbose: include the result of each check.
+    """
     checks = await _results(control)
     status: Literal["ready", "degraded", "not ready"] = "ready" if all(c.ok for c in checks.values()) else "degraded"
     if any(check.needed and not check.ok for check in checks.values()):

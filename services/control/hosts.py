@@ -1,4 +1,4 @@
-"""By which names a server is asked: a page of another name that resolves to this machine (DNS rebinding) is none of its own."""
+"""Host header check against DNS rebinding (a foreign name that resolves to this machine)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ _HOST = re.compile(r"(?P<name>[a-z0-9._-]{1,253}|\[[0-9a-f:.]{2,45}\])(:\d{1,5})
 
 
 class KnownHosts:
-    """Middleware that answers 421 to a request for a host that is not this server.
+    """Middleware that answers 421 to a request for an unknown host.
 
-    An address is always taken: a browser sends it only for a page that lies at this address. So is `localhost`, which no name server is
-    asked for, and what the server listens on. Other names must be listed; with TLS and without a list the certificate says which they are.
+    IP addresses are always accepted, because a browser sends one only for a page served from that
+    address. `localhost` and `server.host` are accepted too. Other names must be in
+    `server.allowed_hosts`. With TLS and an empty list every name is accepted, because the
+    certificate restricts the names.
     """
 
     def __init__(self, app: ASGIApp, server: ServerSettings, measures: Measures) -> None:
@@ -33,13 +35,14 @@ class KnownHosts:
         if scope["type"] == "lifespan":
             return await self._app(scope, receive, send)
         given = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"host"]
-        # Without one there is no browser behind it: HTTP/1.1 must send it, and a request without is refused before it comes here.
+        # # A request without a Host header does not come from a browser: HTTP/1.1 requires the
+        # header, and the parser refuses such requests.
         if len(given) < 2 and all(self.knows(host) for host in given):
             return await self._app(scope, receive, send)
         self._measures.refused.labels("host").inc()
         if scope["type"] == "websocket":
             await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1008})  # before it is accepted: 403 to the client
+            return await send({"type": "websocket.close", "code": 1008})  # # before accept: the client gets 403
         named = f"{', '.join(given):.100}"
         problem = Misdirected(
             f"this server is not known as {named!r}; ask for its address, or add the name to server.allowed_hosts"
@@ -47,7 +50,7 @@ class KnownHosts:
         await response_of(problem, scope)(scope, receive, send)
 
     def knows(self, host: str) -> bool:
-        """Whether a Host header, in small letters, names this server."""
+        """Return True if a lower-case Host header names this server."""
         match = _HOST.fullmatch(host)
         if match is None:
             return False

@@ -1,4 +1,4 @@
-"""An upload on its way in: a file without a name that anybody could ask for, and the digest of what was written."""
+"""Receipt of uploads: body written to a temporary file, digest computed on the way."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PART_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class IncomingFile:
-    """A whole upload; removed when the block that received it ends, unless it was moved away."""
+    """Complete upload. The file is deleted when the receiving block ends, unless it was moved."""
 
     path: Path
     size_bytes: int
@@ -33,7 +33,21 @@ class IncomingFile:
 
 @asynccontextmanager
 async def incoming_file(request: Request, control: ControlState, expected_sha256: bytes) -> AsyncIterator[IncomingFile]:
-    """Write the body to a file as it comes. Raises TooManyRequests, NoSpace, and Unprocessable for another digest or an empty body."""
+    """Stream the request body to a temporary file.
+
+    Args:
+        request: the upload.
+        control: state of the application.
+        expected_sha256: digest that the caller announced, 32 bytes.
+
+    Yields:
+        The complete file.
+
+    Raises:
+        TooManyRequests: if too many uploads run, in total or for this key.
+        NoSpace: if the disk is full.
+        Unprocessable: if the digest differs or the body is empty.
+    """
     if control.uploads.locked():
         raise TooManyRequests("as many uploads as may are running; wait for one to end", 5.0)
     key = request.scope["state"]["caller"].key_id

@@ -1,4 +1,4 @@
-"""Rates: token buckets, and the middleware that holds each address to one before anything else is looked at."""
+"""Token buckets, and the middleware that limits the request rate of each address."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_BUCKETS = 20_000
 
 
 class TokenBuckets:
-    """A bucket for each caller: `rate_per_s` tokens come in, at most `burst` stay, each request takes one."""
+    """Token bucket per caller: `rate_per_s` tokens are added per second, at most `burst` are kept."""
 
     def __init__(self, rate_per_s: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._rate = rate_per_s
@@ -26,21 +26,23 @@ class TokenBuckets:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def wait_s(self, caller: str, tokens: float = 1.0) -> float:
-        """Take tokens; 0 when there were enough, else how long it takes until there are, and nothing is taken."""
+        """Take tokens from a caller's bucket.
+
+        Returns:
+            0 if there were enough tokens; otherwise the seconds until there are, and none is taken.
+        """
         now_s = self._clock()
         left, at_s = self._buckets.pop(caller, (self._burst, now_s))
         left = min(self._burst, left + (now_s - at_s) * self._rate)
         enough = left >= tokens
         self._buckets[caller] = (left - tokens if enough else left, now_s)
         if len(self._buckets) > MOST_BUCKETS:
-            self._buckets.popitem(
-                last=False
-            )  # of whom nothing was heard for longest: its bucket is full again, or nearly
+            self._buckets.popitem(last=False)  # # least recently used: its bucket is full again, or nearly
         return 0.0 if enough else (tokens - left) / self._rate
 
 
 class AddressRate:
-    """Middleware that answers 429 to an address that asks too often."""
+    """Middleware that answers 429 to an address above its request rate."""
 
     def __init__(self, app: ASGIApp, buckets: TokenBuckets, measures: Measures) -> None:
         self._app = app
@@ -57,17 +59,18 @@ class AddressRate:
         problem = TooManyRequests(f"too many requests from this address; wait {wait_s:.1f} s", wait_s)
         if scope["type"] == "websocket":
             await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1013})  # before it is accepted: 403 to the client
+            return await send({"type": "websocket.close", "code": 1013})  # # before accept: the client gets 403
         await response_of(problem, scope)(scope, receive, send)
 
 
 def network_of(scope: Scope) -> str:
-    """The network of a request's client, to which rates apply."""
+    """Return the network of a request's client, used as rate limit key."""
     return network_of_address((scope.get("client") or ("unknown", 0))[0])
 
 
 def network_of_address(host: str) -> str:
-    """The network that an address stands for. Of IPv6 it is the /64, which one host can fill with addresses."""
+    """Return the network of an address: the /64 for IPv6, since one host can use a whole /64,
+    otherwise the address."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:

@@ -1,4 +1,5 @@
-"""The service's log: a line for each event on standard error, JSON for machines and text for a terminal, with the number of the request that it belongs to."""
+"""Service log on standard error, one line per event, with the request id. JSON for machines, text
+for terminals."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ _FACTS = "facts"
 
 
 class JsonFormatter(logging.Formatter):
-    """A record as one line of JSON. Line breaks in it are escaped, so that nobody can forge a line; passwords in addresses are masked."""
+    """Log formatter for one JSON object per line. Escapes line breaks, so clients cannot forge
+    lines, and masks passwords in addresses."""
 
     def format(self, record: logging.LogRecord) -> str:
         entry: dict[str, object] = {
@@ -36,7 +38,8 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """A record as a line for people; passwords in addresses are masked and line breaks of a message are escaped as in JSON."""
+    """Log formatter for terminals. Masks passwords in addresses and escapes line breaks of
+    messages."""
 
     def format(self, record: logging.LogRecord) -> str:
         time = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
@@ -47,7 +50,7 @@ class TextFormatter(logging.Formatter):
 
 
 def log_to_stderr(settings: LogSettings) -> None:
-    """Send every logger of this process to standard error."""
+    """Send the records of all loggers of this process to standard error."""
     handler = logging.StreamHandler()
     text = settings.format == "text" or (settings.format == "auto" and handler.stream.isatty())
     handler.setFormatter(TextFormatter() if text else JsonFormatter())
@@ -55,20 +58,21 @@ def log_to_stderr(settings: LogSettings) -> None:
     logging.captureWarnings(True)
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda raised: _log_uncaught(raised.exc_type, raised.exc_value, raised.exc_traceback)
-    logging.getLogger("uvicorn.access").disabled = True  # it writes addresses with tickets in them
+    logging.getLogger("uvicorn.access").disabled = True  # # its lines contain addresses with tickets
     logging.getLogger("uvicorn.error").addFilter(_is_no_refused_websocket)
     for chatty in ("websockets", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException | None, trace: TracebackType | None) -> None:
-    """Log what nobody has caught, in the format of the log."""
+    """Log an uncaught exception in the format of the log."""
     if error is not None and not issubclass(kind, SystemExit):
         logging.getLogger("intrasplat").critical("an error that nothing has caught", exc_info=(kind, error, trace))
 
 
 def say_start(*lines: str) -> None:
-    """Log where the service is, whatever the level: who has started it waits for these lines."""
+    """Log the service's addresses regardless of the log level, because launch scripts wait for
+    these lines."""
     logger = logging.getLogger("intrasplat.start")
     logger.setLevel(logging.INFO)
     for line in lines:
@@ -76,10 +80,10 @@ def say_start(*lines: str) -> None:
 
 
 def _is_no_refused_websocket(record: logging.LogRecord) -> bool:
-    """uvicorn takes it for an error when a WebSocket is answered with a refusal, which the request's own line has."""
+    """Filter out uvicorn's error for refused WebSockets, which the request log already records."""
     return record.getMessage() != "ASGI callable returned without completing handshake."
 
 
 def facts(**values: object) -> dict[str, dict[str, object]]:
-    """Fields of a line, as `log.info("…", extra=facts(route="/v1/models"))`."""
+    """Return extra fields for a log line: `log.info("…", extra=facts(route="/v1/models"))`."""
     return {_FACTS: values}

@@ -1,4 +1,4 @@
-"""What the control plane measures of itself, for Prometheus. Labels are routes, never the names in them."""
+"""Prometheus metrics of the control plane. Labels hold route templates, never names from requests."""
 
 from __future__ import annotations
 
@@ -16,21 +16,26 @@ DURATIONS_S = (0.001, 0.0025, 0.005, 0.01, 0.0167, 0.0333, 0.05, 0.0667, 0.1, 0.
 
 
 class AuditEntries(Collector):
-    """How many entries the audit log has had, those that the service wrote by itself among them."""
+    """Collector for the number of audit entries, including entries of the service itself."""
 
     def __init__(self, entries: Callable[[], int]) -> None:
         self._entries = entries
 
     def collect(self) -> Iterable[Metric]:
-        """See `Collector`."""
+        """Export the entry count; see `Collector`."""
         return [CounterMetricFamily("intrasplat_audit_entries", "Entries of the audit log", value=self._entries())]
 
 
 class Measures:
-    """The metrics of one application, in a registry of its own."""
+    """Metrics of one application, in its own registry."""
 
     def __init__(self, collectors: Sequence[Collector] = (), audit_entries: Callable[[], int] = lambda: 0) -> None:
-        """audit_entries: how many the audit log has had, whoever wrote them."""
+        """Register all metrics.
+
+        Args:
+            collectors: further collectors to register.
+            audit_entries: returns the number of entries in the audit log.
+        """
         self.registry = CollectorRegistry(auto_describe=True)
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)

@@ -1,4 +1,5 @@
-"""A moment in a request: text in ISO 8601 with a time zone, and not the number of seconds that pydantic would take, too."""
+"""Timestamp type for requests: ISO 8601 text with a time zone. Rejects the numbers that pydantic
+would accept."""
 
 from __future__ import annotations
 
@@ -18,7 +19,11 @@ def _text(value: object) -> object:
 
 
 def _in_utc(moment: datetime) -> datetime:
-    """Return the moment in UTC. Raises ValueError for one that is not in the years 1 to 9999 there."""
+    """Convert a timestamp to UTC.
+
+    Raises:
+        ValueError: if the result is not in the years 1 to 9999.
+    """
     try:
         return moment.astimezone(UTC)
     except OverflowError as error:

@@ -1,4 +1,5 @@
-"""The middleware around what answers: it numbers each request, writes its line in the log, counts it, and answers for what nobody caught."""
+"""Request middleware: assigns request ids, logs and counts requests, and answers uncaught
+exceptions."""
 
 from __future__ import annotations
 
@@ -17,11 +18,11 @@ from services.control.problems import Internal
 log = logging.getLogger("intrasplat.requests")
 METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 QUIET = {"/livez", "/readyz", "/metrics"}
-"""Asked for every few seconds by machines: in the log only when they fail."""
+"""Routes polled by machines; logged only on failure."""
 
 
 class Observed:
-    """Middleware around all but the security headers."""
+    """Outermost middleware except for the security headers."""
 
     def __init__(self, app: ASGIApp, measures: Measures) -> None:
         self._app = app
@@ -47,13 +48,13 @@ class Observed:
         started_s = time.monotonic()
         try:
             await self._app(scope, receive, send_numbered)
-        except Exception:  # the outermost place: a bug becomes an answer without a traceback, which the log has
+        except Exception:  # # outermost handler: a bug becomes a plain 500, the traceback goes to the log
             log.exception("a request failed by a bug in this program")
             if status == 0 and scope["type"] == "http":
                 problem = Internal(f"a bug in this server; its log has the cause under request {request_id}")
                 await response_of(problem, scope)(scope, receive, send_numbered)
             else:
-                raise  # the answer was begun: the server closes the connection
+                raise  # # the answer has begun: the server closes the connection
         finally:
             self._note(scope, status, time.monotonic() - started_s)
             REQUEST_ID.reset(token)

@@ -1,4 +1,4 @@
-"""What the control plane is put together from: protocols, so that each part can be built, tested and left out by itself."""
+"""Protocols of the parts of a server. Each part can be built, tested and omitted separately."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from services.control.system_events import SystemEvents
 
 PictureKind = Literal["raw", "shown", "depth", "confidence", "orbit"]
 BOUNDARY = "picture"
-"""Between the pictures of a multipart answer."""
+"""Boundary between the pictures of a multipart answer."""
 
 
 class VersionRecord(Protocol):
-    """A version of a model, as the registry has it."""
+    """Registry record of one model version."""
 
     @property
     def name(self) -> str: ...
@@ -43,7 +43,7 @@ class VersionRecord(Protocol):
 
 
 class ModelRecord(Protocol):
-    """A model: a name and which of its versions is active."""
+    """Registry record of a model: its name and the active version."""
 
     @property
     def name(self) -> str: ...
@@ -52,13 +52,21 @@ class ModelRecord(Protocol):
 
 
 class Models(Protocol):
-    """The registry of models. Synchronous and safe for threads: the API calls it in one. Its errors are named in `Parts.errors`."""
+    """Model registry. Synchronous and thread-safe; the API calls it in worker threads.
+    `Parts.errors` names its errors."""
 
     def upload(self, name: str, file: Path, digest: str | None, by: str) -> VersionRecord:
-        """Keep a file as a new version; `digest` is its SHA-256 in hex, where somebody states it."""
+        """Store a file as a new version.
+
+        Args:
+            name: the model.
+            file: the bundle to store.
+            digest: its SHA-256 in hex, if the caller states one.
+            by: the caller, for the record.
+        """
 
     def check(self, name: str, version: int) -> VersionRecord:
-        """Validate a version: afterwards it is ready, or rejected with a reason."""
+        """Validate a version and mark it ready, or rejected with a reason."""
 
     def models(self) -> Sequence[ModelRecord]: ...
     def versions(self, name: str) -> Sequence[VersionRecord]: ...
@@ -69,7 +77,7 @@ class Models(Protocol):
 
 
 class StreamState(Protocol):
-    """What a stream is and does."""
+    """Configuration and current state of a stream."""
 
     @property
     def name(self) -> str: ...
@@ -83,18 +91,18 @@ class StreamState(Protocol):
     def options(self) -> Mapping[str, Any]: ...
     @property
     def state(self) -> str:
-        """`stopped`, `starting`, `live`, `stale`, `frozen`, `source lost` or `failed`."""
+        """Return `stopped`, `starting`, `live`, `stale`, `frozen`, `source lost` or `failed`."""
 
     @property
     def reason(self) -> str | None: ...
     @property
     def processes(self) -> Mapping[str, Mapping[str, Any]]:
-        """Of capture and engine: state, pid, restarts, figures."""
+        """Return state, pid, restarts and figures of the capture and engine process."""
 
 
 @dataclass(frozen=True)
 class NewStream:
-    """What a caller asks for; its source was checked against the rules."""
+    """Stream requested by a caller; the source already passed the source rules."""
 
     name: str
     source: str
@@ -104,7 +112,7 @@ class NewStream:
 
 
 class Streams(Protocol):
-    """The streams and their processes."""
+    """Streams and their processes, as managed by the supervisor."""
 
     async def all(self) -> Sequence[StreamState]: ...
     async def get(self, name: str) -> StreamState: ...
@@ -114,33 +122,41 @@ class Streams(Protocol):
     async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamState: ...
     async def delete(self, name: str) -> None: ...
     async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
-        """Turn the stream's virtual camera; returns where it is."""
+        """Set the stream's virtual camera and return its resulting position."""
 
 
 class EncodedPicture(Protocol):
-    """A picture as viewers get it; it is made once for all of them."""
+    """Encoded picture, shared by all viewers."""
 
     @property
     def message(self) -> bytes:
-        """As one message of a WebSocket: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
+        """Return the picture as one WebSocket message: header length (4 bytes, big-endian), JSON
+        header, JPEG."""
 
     @property
     def part(self) -> bytes:
-        """As a part of a multipart answer with the boundary `BOUNDARY`."""
+        """Return the picture as a part of a multipart answer with the boundary `BOUNDARY`."""
 
 
 class Display(Protocol):
-    """Pictures of the streams, newest wins: who reads slowly misses some."""
+    """Source of stream pictures. Slow subscribers skip pictures and get the newest."""
 
     def subscribe(
         self, stream: str, kind: PictureKind, quality: int
     ) -> AbstractAsyncContextManager[AsyncIterator[EncodedPicture]]:
-        """A viewer while it is entered; its pictures end when the stream is gone."""
+        """Subscribe to a stream. The iterator ends when the stream is deleted.
+
+        Args:
+            stream: name of the stream.
+            kind: picture to receive.
+            quality: JPEG quality.
+        """
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """How a part is. A service whose needed parts are well is ready; another one that is not makes it degraded."""
+    """Health of a part. The service is ready if all needed parts are ok, and degraded if another
+    part is not."""
 
     ok: bool
     detail: str = ""
@@ -149,7 +165,7 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a server; requests for an absent one are answered with 503."""
+    """Parts of a server. Requests for an absent part are answered with 503."""
 
     streams: Streams | None = None
     models: Models | None = None
@@ -159,16 +175,17 @@ class Parts:
     snapshots: Snapshots | None = None
     exports: Exports | None = None
     routers: Sequence[APIRouter] = ()
-    """Further routes, made by `new_router`."""
+    """Further routers, created by `new_router`."""
     background: Sequence[Callable[[], AbstractAsyncContextManager[Any]]] = ()
-    """Entered in order when the server starts, left in reverse when it has drained."""
+    """Context managers entered in order at server start and left in reverse order after the drain.
+    """
     checks: Mapping[str, Callable[[], Awaitable[CheckResult]]] = field(default_factory=dict)
-    """For /readyz, by name."""
+    """Health checks for /readyz, by name."""
     collectors: Sequence[Collector] = ()
-    """For /metrics."""
+    """Metric collectors for /metrics."""
     events: SystemEvents = field(default_factory=SystemEvents)
-    """What the parts do by themselves, for the audit log."""
+    """Events of the parts for the audit log, not caused by a request."""
     trusts_ages: Callable[[], bool] = lambda: True
-    """Whether files of the audit log may be removed now because they are old."""
+    """Return True if old audit segments may be deleted by age now."""
     errors: Mapping[type[Exception], type[Problem]] = field(default_factory=dict)
-    """What the parts' errors mean to a caller; their text is shown."""
+    """Problem type for each error type of the parts; the error text is sent to the caller."""

@@ -1,7 +1,9 @@
-"""A listener of its own for /livez and /readyz: it answers while the server's own port is full.
+"""Separate listener for /livez and /readyz that answers even when the main port is at its
+connection limit.
 
-It always listens at the Unix socket `probe.sock` in the runtime folder, and at `server.probe_port` where that is set. It takes no key, speaks no
-TLS, and serves nothing else. A request has `REQUEST_S` to come; of more than `MOST_CONNECTIONS` connections the oldest is closed.
+The listener uses the Unix socket `probe.sock` in the runtime folder, and also `server.probe_port`
+if set. It needs no key, uses no TLS and serves nothing else. A request must arrive within
+`REQUEST_S`. Above `MOST_CONNECTIONS` connections the oldest is closed.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ REQUEST_S = 2.0
 
 
 class ProbeListener:
-    """Answers at the sockets that `bind_probe` gave, in the event loop that calls `open`."""
+    """Probe server on the sockets of `bind_probe`. Runs in the event loop that calls `open`."""
 
     def __init__(self, control: ControlState, sockets: Sequence[socket.socket]) -> None:
         self._control, self._sockets = control, sockets
@@ -38,12 +40,12 @@ class ProbeListener:
         self._open: dict[asyncio.Task[Any], asyncio.StreamWriter] = {}
 
     async def open(self) -> None:
-        """Begin to answer."""
+        """Start answering."""
         for each in self._sockets:
             self._servers.append(await asyncio.start_server(self._serve, sock=each, limit=MOST_HEAD_BYTES))
 
     async def close(self) -> None:
-        """Answer no more, and remove the Unix socket."""
+        """Stop answering and remove the Unix socket."""
         for each in self._sockets:
             if each.family == socket.AF_UNIX:
                 Path(each.getsockname()).unlink(missing_ok=True)
@@ -68,9 +70,9 @@ class ProbeListener:
                 async with asyncio.timeout(REQUEST_S):
                     await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            return  # slow, gone, or too long: nobody waits for an answer
+            return  # # slow, gone, or too long: no client to answer
         except asyncio.CancelledError:
-            return  # one of too many, or the end of the server
+            return  # # evicted by a newer connection, or server shutdown
         finally:
             self._open.pop(task, None)
 
@@ -89,7 +91,11 @@ class ProbeListener:
 
 
 def bind_probe(settings: ServiceSettings) -> list[socket.socket]:
-    """The sockets of the probe listener; the runtime folder is there. Raises CannotServe for a port or a socket that another program has."""
+    """Bind the sockets of the probe listener. The runtime folder must exist.
+
+    Raises:
+        CannotServe: if another program uses the port or the socket.
+    """
     path = settings.runtime_dir / SOCKET
     bound = [_unix(path)]
     server = settings.server
@@ -131,7 +137,7 @@ def _answers(path: Path) -> bool:
         try:
             client.connect(os.fspath(path))
         except OSError as error:
-            return error.errno == errno.EAGAIN  # somebody listens and is busy
+            return error.errno == errno.EAGAIN  # # a busy listener exists
         return True
 
 

@@ -29,7 +29,10 @@ PROBLEM_JSON = "application/problem+json"
 
 
 class Problem(Exception):
-    """An answer that is no success. `detail` says what happened, the value, what to do; it goes to the caller."""
+    """Error answer of the API.
+
+    `detail` is sent to the caller. It states what happened, the value and what to do.
+    """
 
     status = 500
     title = "Internal error"
@@ -43,7 +46,7 @@ class Problem(Exception):
         self.errors = tuple(errors)
 
     def document(self, request_id: str = "") -> dict[str, Any]:
-        """The answer's body."""
+        """Return the body of the answer (RFC 9457)."""
         kind = self.title.lower().replace(" ", "-")
         body: dict[str, Any] = {"type": f"urn:intrasplat:problem:{kind}", "title": self.title, "status": self.status}
         if self.detail:
@@ -56,18 +59,18 @@ class Problem(Exception):
 
 
 def problem_answer(description: str) -> dict[str, Any]:
-    """For the document of a route that answers with a problem which its kind does not have anyway."""
+    """Return the OpenAPI response entry of a problem that is specific to one route."""
     return {"description": description, "content": {PROBLEM_JSON: {"schema": {"$ref": "#/components/schemas/Problem"}}}}
 
 
 class BadRequest(Problem):
-    """The request makes no sense."""
+    """The request is malformed."""
 
     status, title = 400, "Bad request"
 
 
 class Unauthenticated(Problem):
-    """No key, or none that is known."""
+    """The request has no key, or an unknown one."""
 
     status, title = 401, "Not authenticated"
 
@@ -76,61 +79,61 @@ class Unauthenticated(Problem):
 
 
 class Forbidden(Problem):
-    """The key's role does not allow it."""
+    """The role of the key does not permit the operation."""
 
     status, title = 403, "Forbidden"
 
 
 class Missing(Problem):
-    """There is no such thing."""
+    """The named resource does not exist."""
 
     status, title = 404, "Not found"
 
 
 class WrongMethod(Problem):
-    """Not with this method."""
+    """The path does not support this method."""
 
     status, title = 405, "Method not allowed"
 
 
 class TooSlow(Problem):
-    """The body does not come."""
+    """The request body arrived too slowly."""
 
     status, title = 408, "Request timeout"
 
 
 class Conflicting(Problem):
-    """It is not in the state that this needs."""
+    """The resource is not in the required state."""
 
     status, title = 409, "Conflict"
 
 
 class TooLarge(Problem):
-    """The body is longer than it may be."""
+    """The body exceeds the size limit."""
 
     status, title = 413, "Content too large"
 
 
 class WrongContent(Problem):
-    """The body is of another type."""
+    """The body has an unsupported content type."""
 
     status, title = 415, "Unsupported media type"
 
 
 class Misdirected(Problem):
-    """For another server than this one."""
+    """The Host header names another server."""
 
     status, title = 421, "Misdirected request"
 
 
 class Unprocessable(Problem):
-    """Understood, and refused for what it says."""
+    """The request is well-formed, but its content was refused."""
 
     status, title = 422, "Unprocessable content"
 
 
 class TooManyRequests(Problem):
-    """Later."""
+    """The caller exceeded a rate or concurrency limit."""
 
     status, title = 429, "Too many requests"
 
@@ -139,23 +142,23 @@ class TooManyRequests(Problem):
 
 
 class HeadTooLarge(Problem):
-    """The head of the request is longer than it may be."""
+    """The request head exceeds the size limit."""
 
     status, title = 431, "Request header fields too large"
 
 
 class Internal(Problem):
-    """A bug of ours: the log has it, the answer has not."""
+    """Bug in the server. The details are in the log only."""
 
 
 class Unavailable(Problem):
-    """Not now."""
+    """A resource that the request needs is temporarily unavailable."""
 
     status, title = 503, "Service unavailable"
 
 
 class NotBuiltIn(Unavailable):
-    """This server was put together without that part."""
+    """The server runs without the part that the request needs."""
 
     title = "Not built into this server"
 
@@ -173,7 +176,7 @@ OF_STATUS: dict[int, type[Problem]] = {
         HeadTooLarge, Internal, Unavailable, NoSpace,
     )
 }  # fmt: skip
-"""Problems by status, for the framework's own errors."""
+"""Problems by status, for errors raised by the framework."""
 TITLES: dict[int, str] = {status: kind.title for status, kind in OF_STATUS.items()} | {
     Unauthenticated.status: Unauthenticated.title,
     TooManyRequests.status: TooManyRequests.title,

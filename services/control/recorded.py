@@ -1,4 +1,4 @@
-"""What changes something is in the audit log, with its outcome, before the caller hears of it."""
+"""Audit logging of changes: the entry is written before the caller gets the answer."""
 
 from __future__ import annotations
 
@@ -18,8 +18,24 @@ from services.control.state import control_of
 async def recorded(
     request: Request, caller: Caller, event: str, subject: str, detail: Detail | None = None
 ) -> AsyncIterator[Detail]:
-    """Write an entry when the block ends: done, or refused or failed by what it raised, which goes on. What is put into the dictionary that
-    is given becomes part of it. Raises AuditUnwritable where it cannot be written: the caller is told, though the change may be made."""
+    """Append an audit entry with the outcome when the block ends.
+
+    Exceptions of the block are recorded as refused (status below 500) or failed, and re-raised.
+    Values added to the yielded dictionary become part of the entry.
+
+    Args:
+        request: request that causes the change.
+        caller: authenticated caller.
+        event: event name, such as `key.create`.
+        subject: name of the changed resource.
+        detail: initial values of the entry's detail.
+
+    Yields:
+        The detail of the entry.
+
+    Raises:
+        AuditUnwritable: if the entry cannot be written, although the change may already be made.
+    """
     said: Detail = dict(detail or {})
     outcome: Outcome = "failed"
     try:
@@ -42,7 +58,7 @@ async def _write(request: Request, caller: Caller, event: str, subject: str, out
             request_id=request.state.request_id, detail=detail,
         )  # fmt: skip
 
-    # A caller who leaves now does not take the entry along.
+    # # The entry is written even if the caller disconnects now.
     await asyncio.shield(asyncio.to_thread(append))
 
 

@@ -1,4 +1,4 @@
-"""Requests that a caller may send again without their being done again: the header Idempotency-Key."""
+"""Idempotent requests: answers cached by the Idempotency-Key header."""
 
 from __future__ import annotations
 
@@ -24,15 +24,23 @@ MOST_KEPT = 1000
 
 
 class Repeated:
-    """The newest answers by their keys. For one event loop."""
+    """Cache of recent answers by caller and idempotency key. For use in one event loop."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[str, str], tuple[str, asyncio.Task[Any]]] = OrderedDict()
 
     async def once(self, caller: str, key: str | None, asked: str, act: Callable[[], Awaitable[Any]]) -> Any:
-        """What `act` returns, or returned when this caller asked for it with this key. What has failed is done again.
+        """Run `act` once per caller and key; later calls return the first result. Failed runs are
+        not cached.
 
-        Raises Unprocessable where the key was used for something else.
+        Args:
+            caller: key id of the caller.
+            key: the Idempotency-Key; without it `act` always runs.
+            asked: fingerprint of the request.
+            act: performs the request.
+
+        Raises:
+            Unprocessable: if the key was used for a different request.
         """
         if key is None:
             return await act()

@@ -1,5 +1,8 @@
-"""Protocols of recordings and of replays as jobs. Both are synchronous and safe for threads: the API calls them in one. Their errors are named in
-`Parts.errors`."""
+"""Protocols of the recording store and of replay jobs.
+
+Both are synchronous and thread-safe; the API calls them in worker threads. `Parts.errors` names
+their errors.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import Any, Protocol
 
 
 class RecordingRecord(Protocol):
-    """An uploaded recording."""
+    """Record of an uploaded recording."""
 
     @property
     def name(self) -> str: ...
@@ -34,14 +37,24 @@ class RecordingRecord(Protocol):
 
 
 class Recordings(Protocol):
-    """Recordings that were uploaded."""
+    """Store of uploaded recordings."""
 
     def add(self, name: str, file: Path, digest: str, by: str) -> tuple[RecordingRecord, bool]:
-        """Move a file into the store; `digest` is its SHA-256 in hex. False: that very file is there under this name."""
+        """Move a file into the store.
+
+        Args:
+            name: name of the recording.
+            file: path of the upload.
+            digest: its SHA-256 in hex.
+            by: the caller, for the record.
+
+        Returns:
+            The record, and False if the same file is already stored under this name.
+        """
         ...
 
     def check(self, name: str) -> RecordingRecord:
-        """Validate it: afterwards it is ready, or rejected with a reason."""
+        """Validate a recording and mark it ready, or rejected with a reason."""
         ...
 
     def all(self) -> Sequence[RecordingRecord]: ...
@@ -50,7 +63,7 @@ class Recordings(Protocol):
 
 
 class JobRecord(Protocol):
-    """A replay."""
+    """Record of a replay job."""
 
     @property
     def id(self) -> str: ...
@@ -73,7 +86,7 @@ class JobRecord(Protocol):
 
 
 class Submission(Protocol):
-    """What came of a request: one job for each recording."""
+    """Result of a submission: one job per recording."""
 
     @property
     def batch(self) -> str: ...
@@ -84,7 +97,7 @@ class Submission(Protocol):
 
 
 class Jobs(Protocol):
-    """Replays that run by themselves."""
+    """Queue of replay jobs."""
 
     def submit(
         self, recordings: Sequence[str], options: Mapping[str, Any], by: str, idempotency_key: str | None
@@ -98,13 +111,13 @@ class Jobs(Protocol):
     def counts(self, batch: str | None = None) -> Mapping[str, int]: ...
     def cancel(self, job_id: str, by: str) -> JobRecord: ...
     def delete(self, job_id: str) -> JobRecord:
-        """Remove a replay that has ended, with its results."""
+        """Delete a finished replay and its results."""
         ...
 
     def files(self, job: JobRecord) -> Sequence[str]:
-        """The results that are there."""
+        """Return the names of the result files."""
         ...
 
     def file(self, job_id: str, name: str) -> Path:
-        """One of them."""
+        """Return the path of a result file."""
         ...

@@ -1,4 +1,5 @@
-"""The process around the application: uvicorn on a socket of ours, with a bound on slow heads, and an end that drains."""
+"""Server process around the application: uvicorn on a bound socket, with request head limits and a
+draining shutdown."""
 
 from __future__ import annotations
 
@@ -27,10 +28,10 @@ from services.control.systemd import ServiceManager
 from services.settings import ServiceSettings
 
 MOST_UNSENT_BYTES = 64 * 1024
-"""What the system keeps of an answer that it has not sent yet: for a viewer who is slow the newest picture is to wait here, and not twenty old ones
-there."""
+"""Unsent bytes that the kernel buffers per connection. A small buffer keeps old pictures from
+queueing for a slow viewer."""
 MOST_MESSAGE_BYTES = 4096
-"""Of what a viewer sends by WebSocket: nothing that anybody reads."""
+"""Largest WebSocket message accepted from a viewer. The server ignores the content."""
 
 
 def serve(
@@ -45,23 +46,24 @@ def serve(
 
     Args:
         app: the application.
-        settings: where and as what it is served.
-        listener: a socket that listens; see `bind`.
-        listening: called with the server's address once it can be connected to.
-        certificate: that of `certificate_of`, where the settings name one. New connections get its newest pair.
+        settings: address, TLS and limits.
+        listener: listening socket from `bind`.
+        listening: called with the server's address once connections are accepted.
+        certificate: result of `certificate_of`. New connections use its newest pair.
         probes: sockets from `bind_probe`.
 
     Raises:
-        CannotServe: for a certificate that cannot be read, and where the application does not start.
+        CannotServe: if the certificate cannot be read or the application does not start.
     """
     config = config_of(app, settings)
     try:
         config.load()
-    except OSError as error:  # ssl.SSLError is one
+    except OSError as error:  # # includes ssl.SSLError
         raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
     if certificate is not None and config.ssl is not None:
         certificate.attach(config.ssl)
-    # uvicorn raises the signal that ended it again, for whoever handled it before: a server that has drained has done what it was asked to.
+    # # uvicorn re-raises the signal for the previous handler after shutdown. A drained server must
+    # exit normally instead.
     signal.signal(signal.SIGTERM, _done)
     signal.signal(signal.SIGINT, _done)
     control: ControlState = app.state.control
@@ -76,28 +78,35 @@ def serve(
 
 
 def certificate_of(settings: ServiceSettings, events: SystemEvents) -> ServerCertificate | None:
-    """Load the certificate that the settings name; None where they name none. Raises CannotServe."""
+    """Load the certificate that the settings name.
+
+    Returns:
+        The certificate, or None if the settings name none.
+
+    Raises:
+        CannotServe: if it cannot be loaded.
+    """
     if settings.server.certfile is None or settings.server.keyfile is None:
         return None
     try:
         return ServerCertificate(settings.server.certfile, settings.server.keyfile, events)
-    except OSError as error:  # ssl.SSLError is one
+    except OSError as error:  # # includes ssl.SSLError
         said = error.strerror or error
         raise CannotServe(f"TLS: {said}; check server.certfile and server.keyfile") from error
 
 
 def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
-    """How uvicorn is run."""
+    """Return the uvicorn configuration."""
     return uvicorn.Config(
         app,
         http=with_head_limits(settings.limits.head_s),
-        loop="asyncio",  # it accepts by the listener's own method, which counts
+        loop="asyncio",  # # asyncio accepts through the listener's `accept`, which counts connections
         ws=AnsweredHandshakes,
         ws_max_size=MOST_MESSAGE_BYTES,
-        ws_per_message_deflate=False,  # the pictures are compressed
+        ws_per_message_deflate=False,  # # the pictures are already compressed
         log_config=None,
         access_log=False,
-        proxy_headers=False,  # the application has its own list of proxies
+        proxy_headers=False,  # # the application has its own list of trusted proxies
         server_header=False,
         limit_concurrency=settings.limits.connections,
         timeout_graceful_shutdown=max(1, round(settings.server.drain_s)),
@@ -108,7 +117,8 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
 
 
 class DrainingServer(uvicorn.Server):
-    """A server that tells the application at once that it is to end, so that displays without an end do so."""
+    """uvicorn server that signals the drain to the application at once, so that endless displays
+    end."""
 
     def __init__(
         self,
@@ -126,7 +136,7 @@ class DrainingServer(uvicorn.Server):
         self._feeding: asyncio.Task[None] | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to take requests."""
+        """Start accepting requests; notify systemd and start its watchdog task."""
         self._loop = asyncio.get_running_loop()
         await super().startup(sockets)
         if self.started:
@@ -136,14 +146,14 @@ class DrainingServer(uvicorn.Server):
             self._feeding = self._loop.create_task(self._manager.feed_watchdog(), name="watchdog")
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Drain; the probe listener says so to the end."""
+        """Drain. The probe listener answers until the end."""
         try:
             await super().shutdown(sockets)
         finally:
             await self._probe.close()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """The first signal drains; a second SIGINT ends at once."""
+        """Drain on the first signal; end at once on a second SIGINT."""
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self._control.draining.set)
         self._manager.tell("STOPPING=1", "STATUS=ending")
@@ -151,7 +161,14 @@ class DrainingServer(uvicorn.Server):
 
 
 def with_head_limits(head_s: float) -> type[H11Protocol]:
-    """uvicorn's protocol with bounds on the head of a request: `head_s` until it is whole, where uvicorn waits for ever, and 431 for a long one."""
+    """Return uvicorn's HTTP protocol with limits on the request head.
+
+    The head must be complete within `head_s`; uvicorn itself sets no such limit. A head that is too
+    long gets 431.
+
+    Args:
+        head_s: time limit in seconds.
+    """
 
     class HeadLimits(H11Protocol):
         _timer: asyncio.TimerHandle | None = None
@@ -180,7 +197,8 @@ def with_head_limits(head_s: float) -> type[H11Protocol]:
                 self._timer = None
 
         def send_400_response(self, msg: str) -> None:
-            """Answer what is no request, or too long to be one. h11 has not found the end of the head within its bound."""
+            """Answer a malformed request with 400, or with 431 if h11 found no end of the head
+            within its limit."""
             if len(self.conn.trailing_data[0]) <= MOST_HEAD_BYTES:
                 super().send_400_response(msg)
                 return
@@ -203,7 +221,12 @@ def with_head_limits(head_s: float) -> type[H11Protocol]:
 
 
 def bind(settings: ServiceSettings) -> socket.socket:
-    """A socket that listens where the settings say. Raises CannotServe for a port that is taken, and for a network without TLS."""
+    """Bind the listening socket at the configured address.
+
+    Raises:
+        CannotServe: if the port is in use, or the address is reachable from the network without
+            TLS.
+    """
     server = settings.server
     _refuse_plaintext(settings)
     family = socket.AF_INET6 if ":" in server.host else socket.AF_INET
@@ -213,12 +236,14 @@ def bind(settings: ServiceSettings) -> socket.socket:
         raise CannotServe(
             f"cannot listen on {server.host} port {server.port}: {error.strerror}; give another server.host or server.port"
         ) from error
-    # Connections inherit both. asyncio turns Nagle's algorithm off only for sockets that name their protocol, and this one does not: an answer's
-    # body would wait 40 ms for its head to be acknowledged.
+    # # Accepted connections inherit these options. asyncio disables Nagle's algorithm only for
+    # sockets with an explicit
+    # # protocol, which this one lacks: an answer's body would wait 40 ms for the acknowledgement of
+    # its head.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    # The system would take 4 MB for a viewer who is slow: seconds of pictures that are old before they are sent.
+    # # The kernel would buffer up to 4 MB per slow viewer, which is seconds of outdated pictures.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MOST_UNSENT_BYTES)
-    # One whose peer takes nothing for so long is cut off by the system, whatever still waits to be sent.
+    # # The kernel drops a connection whose peer acknowledges nothing for this time.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(settings.limits.viewer_stall_s * 1000))
     return listener
 
@@ -246,4 +271,4 @@ def _address(listener: socket.socket, settings: ServiceSettings) -> str:
 
 
 def _done(number: int, frame: FrameType | None) -> None:
-    """The signal was seen to."""
+    """Ignore a signal that was already handled."""

@@ -1,4 +1,4 @@
-"""Protocols of the parts that take snapshots of streams and export models."""
+"""Protocols of the snapshot store and the model exporter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsplat_core.io.exports.formats import ExportWish
 
 
 class ExportedFile(Protocol):
-    """A file that was made; whoever asked for it closes it."""
+    """Exported file, open for reading. The caller closes it."""
 
     @property
     def file(self) -> BinaryIO: ...
@@ -20,21 +20,32 @@ class ExportedFile(Protocol):
 
 
 class Snapshots(Protocol):
-    """Snapshots of live streams. Their errors are named in `Parts.errors`."""
+    """Snapshots of live streams. `Parts.errors` names their errors."""
 
     async def take(self, stream: str, model: str | None, by: str) -> tuple[Any, Any]:
-        """Write the live model as it stands after a frame. Without `model` it is kept as a file: a snapshot and None. With it, it becomes that
-        model's next version, which is to be checked: what is known of the snapshot, and the version's record."""
+        """Write the current live model of a stream.
+
+        Args:
+            stream: name of the stream.
+            model: if given, the snapshot becomes the next version of this model, still to be
+                checked. Otherwise it is stored as a file.
+            by: the caller, for the record.
+
+        Returns:
+            The snapshot's record, and the version record or None.
+        """
 
     def all(self, stream: str) -> Sequence[Any]:
-        """Those of a stream that are kept, the newest first. For a thread, as what follows."""
+        """Return the stored snapshots of a stream, newest first. Synchronous, like the methods
+        below."""
 
     def get(self, stream: str, number: str) -> Any: ...
     def delete(self, stream: str, number: str) -> None: ...
 
 
 class Exports(Protocol):
-    """Models and snapshots as files. Synchronous and safe for threads; a process of its own makes what is not there yet."""
+    """Exporter of models and snapshots to files. Synchronous and thread-safe; a separate process
+    creates missing exports."""
 
     def of_version(self, name: str, number: int, wish: ExportWish) -> ExportedFile: ...
     def of_snapshot(self, stream: str, number: str, wish: ExportWish) -> ExportedFile: ...

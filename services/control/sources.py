@@ -1,4 +1,5 @@
-"""Which sources a caller may name. A stream makes this machine open what an address says, so only what the settings list is let through."""
+"""Source address rules. A stream makes this machine open the address, so only sources listed in the
+settings are allowed."""
 
 from __future__ import annotations
 
@@ -24,7 +25,12 @@ _STEREO = "stereo:"
 
 
 def check_source(address: str, rules: SourceRules) -> None:
-    """Raise Unprocessable for an address that the rules do not allow. No name is resolved: one that is not listed is refused."""
+    """Check an address against the source rules. No host name is resolved; unlisted names are
+    refused.
+
+    Raises:
+        Unprocessable: if the rules do not allow the address.
+    """
     if len(address) > MOST_LENGTH or not _PRINTABLE.fullmatch(address) or "\\" in address:
         raise Unprocessable(
             "the source's address has spaces, backslashes or letters beyond ASCII, or is too long; encode them as %20"
@@ -45,11 +51,12 @@ def _check_one(address: str, rules: SourceRules) -> None:
         )
     place = ("/" if match["slashes"] == "/" else "") + match[
         "rest"
-    ]  # as the sources read it: one slash begins an absolute path
+    ]  # # as the sources parse it: one slash begins an absolute path
     if scheme in OF_NETWORKS:
         _check_host(address, rules)
     elif scheme in OF_FOLDERS:
-        # Some of them take `?` for the beginning of options, some for a letter: both must fit.
+        # # Some sources treat `?` as the start of options, others as part of the path; both
+        # readings must be allowed.
         for path in (place, place.partition("?")[0]):
             _check_path(path, rules.folders, "sources.folders")
     elif scheme in OF_DEVICES:
@@ -66,7 +73,7 @@ def _check_host(address: str, rules: SourceRules) -> None:
         host, _ = parts.hostname, parts.port
     except ValueError as error:
         raise Unprocessable(f"the source's address cannot be read: {error}") from error
-    # What another reader could take for the host must be what was looked at here: user info ends at the last @ for some, at the first for others.
+    # # URL parsers disagree on user info (first or last @), so an ambiguous authority is refused.
     authority = parts.netloc.rpartition("@")
     if host is None or parts.netloc.count("@") > 1 or not _HOST.fullmatch(authority[2]):
         raise Unprocessable("the source's address has no plain host in it; write scheme://host:port/path")

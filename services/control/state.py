@@ -1,4 +1,4 @@
-"""What the routes of one application share."""
+"""State shared by the routes of one application."""
 
 from __future__ import annotations
 
@@ -28,15 +28,21 @@ Part = TypeVar("Part")
 
 
 class Persons(Protocol):
-    """Who has signed in elsewhere."""
+    """Identity provider for users who sign in elsewhere (OpenID Connect)."""
 
     async def caller_of(self, token: str) -> Caller:
-        """Whose token it is. Raises Unauthenticated, Forbidden, Unavailable."""
+        """Return the caller that a token identifies.
+
+        Raises:
+            Unauthenticated: if the token is not valid.
+            Forbidden: if the user has no role here.
+            Unavailable: if the issuer's keys cannot be fetched.
+        """
 
 
 @dataclass(frozen=True)
 class ControlState:
-    """One application's parts, stores and limits; `control_of` finds it."""
+    """Parts, stores and limits of one application; obtained by `control_of`."""
 
     settings: ServiceSettings
     parts: Parts
@@ -50,27 +56,36 @@ class ControlState:
     viewers: ViewerCount
     storage: Storage
     persons: Persons | None = None
-    """Of an OpenID Connect issuer, where the settings name one."""
+    """OpenID Connect provider, if the settings configure one."""
     uploads_of: Counter[str] = field(default_factory=Counter)
-    """Uploads that run, by the key that makes them."""
+    """Running uploads per key."""
     draining: asyncio.Event = field(default_factory=asyncio.Event)
-    """Set when the server is asked to end: what has no end of its own then ends."""
+    """Set when the server starts to drain; endless responses then end."""
     repeated: Repeated = field(default_factory=Repeated)
-    """Answers to requests that may be sent again."""
+    """Answers cached for idempotent requests."""
     audit_reads: TokenBuckets = field(default_factory=lambda: TokenBuckets(1 / 60, 1))
-    """Readings of the audit log that are entries: the first of each key and filter in a minute."""
+    """Limits audit entries about reading the audit log to one per key and filter each minute."""
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
-    """What goes on after its request was answered."""
+    """Background tasks that outlive their request."""
 
 
 def control_of(connection: HTTPConnection) -> ControlState:
-    """The state of the application that serves a connection."""
+    """Return the state of the application that serves a connection."""
     state: ControlState = connection.app.state.control
     return state
 
 
 def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], name: str) -> Part:
-    """A part of this server; raises NotBuiltIn where it is absent."""
+    """Return a part of this server.
+
+    Args:
+        connection: current request or WebSocket.
+        choose: selects the part.
+        name: name of the part for the error message.
+
+    Raises:
+        NotBuiltIn: if the part is absent.
+    """
     found = choose(control_of(connection).parts)
     if found is None:
         raise NotBuiltIn(f"this server was started without {name}")
@@ -78,13 +93,13 @@ def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], nam
 
 
 def known_problem(control: ControlState, error: BaseException) -> type[Problem] | None:
-    """The problem that an error of a part is to a caller; None for a bug."""
+    """Return the problem type for an error of a part, or None for an unknown error (a bug)."""
     known = control.parts.errors
     return next((known[each] for each in type(error).__mro__ if each in known), None)
 
 
 async def is_missing(control: ControlState, look: Callable[[], object]) -> bool:
-    """Whether what `look` asks a part for is not there any more."""
+    """Return True if `look` raises an error that maps to Missing."""
     try:
         await asyncio.to_thread(look)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Free space and the audit log's last write: checks for /readyz, and metrics."""
+"""Disk space and audit log checks for /readyz and metrics."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from services.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
 SPARE_BYTES = 256 * 2**20
-"""Free space that uploads leave to the audit log and the database. With less the service is degraded."""
+"""Free bytes that uploads leave for the audit log and the database. With less the service is
+degraded."""
 
 
 def folders_of(settings: ServiceSettings) -> dict[str, Path]:
-    """The folders in which the service keeps data, by their name in the settings."""
+    """Return the data folders of the service, by name."""
     data = settings.data_dir
     return {
         "data": data,
@@ -33,13 +34,13 @@ def folders_of(settings: ServiceSettings) -> dict[str, Path]:
 
 
 class Storage(Collector):
-    """The disks under the service's folders, and whether its audit log can be written."""
+    """Disks under the service's folders, and the writability of the audit log."""
 
     def __init__(self, folders: Mapping[str, Path], audit: AuditLog) -> None:
         self._folders, self._audit = folders, audit
 
     def collect(self) -> Iterable[Metric]:
-        """See `Collector`."""
+        """Export free space, disk size and audit writability; see `Collector`."""
         free = GaugeMetricFamily("intrasplat_disk_free_bytes", "Free space under a folder.", labels=["folder"])
         size = GaugeMetricFamily("intrasplat_disk_bytes", "Size of the disk under a folder.", labels=["folder"])
         for name, folder in self._folders.items():
@@ -57,11 +58,12 @@ class Storage(Collector):
         return [free, size, writable]
 
     async def disk(self) -> CheckResult:
-        """Free space under each folder; less than `SPARE_BYTES` makes the service degraded."""
+        """Report free space per folder. Less than `SPARE_BYTES` makes the service degraded."""
         return await asyncio.to_thread(self._disk)
 
     async def audit(self) -> CheckResult:
-        """Whether an entry can be written. After a failure, an entry is written to find out whether the disk takes it again."""
+        """Report the audit log's writability. After a failure, append a test entry to detect
+        recovery."""
         if self._audit.failure is None:
             return CheckResult(True, "entries are written")
         try:
@@ -85,7 +87,7 @@ class Storage(Collector):
 
 
 def _existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that exists."""
+    """Return the folder, or its nearest existing ancestor."""
     while not os.path.lexists(folder) and folder != folder.parent:
         folder = folder.parent
     return folder

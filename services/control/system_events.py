@@ -1,4 +1,4 @@
-"""What the service does by itself and the audit log is to have: processes that ended, checks of models, rollbacks that nobody asked for."""
+"""Audit events not caused by a request: ended processes, version checks, automatic rollbacks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_WAITING = 1000
 
 @dataclass(frozen=True)
 class SystemEvent:
-    """An entry to be; see `Entry` for what may be in it."""
+    """Pending audit entry; the fields are those of `Entry`."""
 
     event: str
     subject: str
@@ -27,7 +27,7 @@ class SystemEvent:
 
 
 class SystemEvents:
-    """Events of one server, told in its event loop and written one after another, so that nobody waits for the disk."""
+    """Queue of system events. `tell` runs in the event loop and never blocks on the disk."""
 
     def __init__(self) -> None:
         self._waiting: deque[SystemEvent] = deque()
@@ -35,7 +35,14 @@ class SystemEvents:
         self._come = asyncio.Event()
 
     def tell(self, event: str, subject: str, outcome: Outcome = "done", **detail: str | int | None) -> None:
-        """Have an event written soon. When more wait than may, the newest are counted and left out."""
+        """Queue an event. If the queue is full, the event is dropped and counted.
+
+        Args:
+            event: event name, such as `certificate.reload`.
+            subject: name of the affected resource.
+            outcome: `done`, `refused` or `failed`.
+            detail: values for the entry.
+        """
         if len(self._waiting) >= MOST_WAITING:
             self._missed += 1
             return
@@ -44,7 +51,7 @@ class SystemEvents:
 
     @asynccontextmanager
     async def written_to(self, audit: AuditLog) -> AsyncIterator[None]:
-        """Write while the block lasts, and what is left when it ends."""
+        """Write queued events to the audit log while the block runs; flush the rest at its end."""
         writing = asyncio.create_task(self._write(audit), name="audit of system events")
         try:
             yield
@@ -70,5 +77,6 @@ class SystemEvents:
 def _append(audit: AuditLog, said: SystemEvent) -> None:
     try:
         audit.append(said.event, actor="system", subject=said.subject, outcome=said.outcome, detail=said.detail)
-    except (AuditUnwritable, ValueError) as error:  # nobody is there to be refused: the log and the metrics have it
+    # # no request to refuse: the failure goes to the log and the metrics
+    except (AuditUnwritable, ValueError) as error:
         log.error("%s of %s is not in the audit log: %s", said.event, said.subject, error)

@@ -1,4 +1,4 @@
-"""How many displays are open."""
+"""Bounded count of open displays."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class ViewerCount:
-    """A count with a bound."""
+    """Counter of open displays with an upper limit."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -15,12 +15,12 @@ class ViewerCount:
 
     @property
     def full(self) -> bool:
-        """Whether another one would be too many."""
+        """Return True if the limit is reached."""
         return self._open >= self._most
 
     @contextmanager
     def one_more(self) -> Iterator[None]:
-        """To be entered for as long as a display is open."""
+        """Count one display while the block runs."""
         self._open += 1
         try:
             yield

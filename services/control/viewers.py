@@ -1,4 +1,4 @@
-"""Viewers of a stream: a bounded number, each with a subscription that ends when the viewer, the stream or the server does."""
+"""Viewer subscriptions: limited in number, ended with the viewer, the stream or the server."""
 
 from __future__ import annotations
 
@@ -20,20 +20,35 @@ from services.control.state import ControlState, control_of, part
 
 log = logging.getLogger(__name__)
 LOOK_S = 1.0
-"""Time between two looks at a viewer's key."""
+"""Seconds between two checks of a viewer's key."""
 REFUSED = 1008
 REFUSED_WHY = "the key was revoked or has expired"
 
 
 class ViewerStalled(Exception):
-    """A viewer takes no pictures any more."""
+    """The viewer's connection accepts no more pictures."""
 
 
 @asynccontextmanager
 async def viewing(
     connection: HTTPConnection, transport: str, stream: str, kind: PictureKind, quality: int
 ) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
-    """The pictures for one viewer. Raises Unavailable when there are as many viewers as may be, Missing for a stream that is not there."""
+    """Subscribe a viewer to a stream.
+
+    Args:
+        connection: the viewer's connection.
+        transport: metrics label.
+        stream: name of the stream.
+        kind: picture to send.
+        quality: JPEG quality.
+
+    Yields:
+        The pictures.
+
+    Raises:
+        Unavailable: if the limit on open displays is reached.
+        Missing: if the stream does not exist.
+    """
     control = control_of(connection)
     display = part(connection, lambda parts: parts.display, "a display")
     streams = part(connection, lambda parts: parts.streams, "streams")
@@ -48,7 +63,7 @@ async def viewing(
 
 
 def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) -> Callable[[Any], Awaitable[None]]:
-    """`send`, which raises ViewerStalled when the viewer takes nothing for too long."""
+    """Wrap `send` with a timeout of `limits.viewer_stall_s`; the wrapper raises ViewerStalled."""
     control = control_of(connection)
     stall_s = control.settings.limits.viewer_stall_s
 
@@ -64,7 +79,7 @@ def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) 
 
 @dataclass
 class Ending:
-    """Why a display has ended, once it has."""
+    """Reason why a display ended; filled when the block ends."""
 
     refused: bool = False
     """The viewer's key was revoked or has expired."""
@@ -74,8 +89,23 @@ class Ending:
 async def until_ended(
     connection: HTTPConnection, left: Coroutine[Any, Any, None], caller: Caller
 ) -> AsyncIterator[Ending]:
-    """A block that is left when the server drains, when `left` returns, when the viewer's connection breaks, and when the caller would not be
-    let in any more. Raises ViewerStalled where nothing more can be sent: whoever waited for that would wait for ever."""
+    """Run a block until the display has to end.
+
+    The block is cancelled when the server drains, `left` returns, the connection breaks, or the
+    caller's key becomes invalid.
+
+    Args:
+        connection: the viewer's connection.
+        left: returns when the viewer has left.
+        caller: checked every `LOOK_S`.
+
+    Yields:
+        The reason, readable after the block.
+
+    Raises:
+        ViewerStalled: if the connection accepts nothing more; waiting for the close would block
+            forever.
+    """
     control = control_of(connection)
     stalled: ViewerStalled | None = None
     ending = Ending()
@@ -107,8 +137,11 @@ async def until_ended(
 
 
 async def _no_longer_admitted(control: ControlState, caller: Caller) -> None:
-    """Return when the caller would be refused. A key file that cannot be read refuses nobody who was let in: an error of the disk must not end
-    the pictures in a room, and no new caller gets in."""
+    """Return once the caller's key is revoked or expired.
+
+    An unreadable key file does not end running displays: a disk error must not interrupt the
+    pictures during a procedure. New callers are still refused.
+    """
     while True:
         await anyio.sleep(LOOK_S)
         try:
