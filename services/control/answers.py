@@ -87,7 +87,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
 
     async def on_http(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, HTTPException)
-        if isinstance(error.__cause__, Problem):  # # FastAPI wraps problems raised while it reads the body
+        if isinstance(error.__cause__, Problem):  # FastAPI wraps problems raised while it reads the body
             return await _answer(connection, error.__cause__)
         kind = OF_STATUS.get(error.status_code, OF_STATUS[500 if error.status_code >= 500 else 400])
         headers = dict(error.headers or {})

@@ -56,7 +56,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
         version=product_version(),
         summary="Live, deforming 3D reconstruction from endoscopic video.",
         description=ABOUT,
-        openapi_url=None, docs_url=None, redoc_url=None,  # # documents.py serves its own, without external resources
+        openapi_url=None, docs_url=None, redoc_url=None,  # documents.py serves its own, without external resources
         redirect_slashes=False,
         generate_unique_id_function=_operation_id,
         lifespan=_lifespan,
@@ -68,7 +68,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
     describe(app)
     limits = settings.limits
     by_address = TokenBuckets(limits.address_requests_per_s, limits.address_requests_per_s * limits.burst_s)
-    # # Each middleware wraps the ones added before it.
+    # Each middleware wraps the ones added before it.
     app.add_middleware(KnownHosts, server=settings.server, measures=control.measures)
     app.add_middleware(AddressRate, buckets=by_address, measures=control.measures)
     app.add_middleware(HeadLength, measures=control.measures)
@@ -86,7 +86,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
     for folder in (data, uploads):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     keep = settings.audit
-    # # Opened first: its lock proves that no other server uses these folders.
+    # Opened first: its lock proves that no other server uses these folders.
     audit = AuditLog(
         data / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days, parts.trusts_ages)
     )

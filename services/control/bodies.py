@@ -48,7 +48,7 @@ class BoundedBody:
 
     async def __call__(self) -> Message:
         if self._scope["state"].get("body_read"):
-            return await self._receive()  # # blocks until the client disconnects
+            return await self._receive()  # blocks until the client disconnects
         try:
             async with asyncio.timeout(self._limits.stall_s):
                 message = await self._receive()

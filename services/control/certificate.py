@@ -57,7 +57,7 @@ class ServerCertificate(Collector):
         def choose(connection: ssl.SSLObject | ssl.SSLSocket, name: str | None, _: ssl.SSLContext) -> None:
             connection.context = self._context
 
-        # # OpenSSL calls this for each handshake, with or without a server name.
+        # OpenSSL calls this for each handshake, with or without a server name.
         context.sni_callback = choose
 
     def look(self) -> bool:
@@ -151,10 +151,10 @@ def _loaded(certfile: Path, keyfile: Path) -> tuple[ssl.SSLContext, float]:
     for file in (certfile, keyfile):
         if not file.exists():
             raise FileNotFoundError(2, f"{file}: No such file or directory")
-        if not file.is_file():  # # opening a pipe would block
+        if not file.is_file():  # opening a pipe would block
             raise OSError(22, f"{file} is not a file")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certfile, keyfile, password="")  # # refuse a key with a passphrase instead of prompting
+    context.load_cert_chain(certfile, keyfile, password="")  # refuse a key with a passphrase instead of prompting
     try:
         text = certfile.read_text(encoding="ascii", errors="replace")
         expiries = [expiry_of(ssl.PEM_cert_to_DER_cert(each)) for each in _CERTIFICATE.findall(text)]
@@ -177,15 +177,15 @@ def expiry_of(der: bytes) -> float:
     fields = _content(der, certificate, _SEQUENCE)[0]
     if der[fields] == _VERSION:
         fields = _content(der, fields, _VERSION)[1]
-    for _ in range(3):  # # skip serial number, signature algorithm, issuer
+    for _ in range(3):  # skip serial number, signature algorithm, issuer
         fields = _content(der, fields)[1]
     validity = _content(der, fields, _SEQUENCE)[0]
-    at = _content(der, validity)[1]  # # skip notBefore
+    at = _content(der, validity)[1]  # skip notBefore
     start, end = _content(der, at)
     text = der[start:end].decode("ascii")
     form = "%y%m%d%H%M%SZ" if der[at] == _UTC_TIME else "%Y%m%d%H%M%SZ"
     time_ = datetime.strptime(text, form)
-    if der[at] == _UTC_TIME and time_.year >= 2050:  # # RFC 5280: two-digit years from 50 mean 1950 to 1999
+    if der[at] == _UTC_TIME and time_.year >= 2050:  # RFC 5280: two-digit years from 50 mean 1950 to 1999
         time_ = time_.replace(year=time_.year - 100)
     return time_.replace(tzinfo=UTC).timestamp()
 

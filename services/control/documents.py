@@ -129,6 +129,6 @@ def _add_common(document: dict[str, Any]) -> None:
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             responses = operation["responses"]
-            responses.pop("422", None)  # # FastAPI's own schema; this server answers with a Problem
+            responses.pop("422", None)  # FastAPI's own schema; this server answers with a Problem
             for status in sorted(_problems_of(path, method, operation)):
                 responses.setdefault(str(status), {"description": TITLES[status], "content": content})

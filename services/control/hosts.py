@@ -35,14 +35,14 @@ class KnownHosts:
         if scope["type"] == "lifespan":
             return await self._app(scope, receive, send)
         given = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"host"]
-        # # A request without a Host header does not come from a browser: HTTP/1.1 requires the
+        # A request without a Host header does not come from a browser: HTTP/1.1 requires the
         # header, and the parser refuses such requests.
         if len(given) < 2 and all(self.knows(host) for host in given):
             return await self._app(scope, receive, send)
         self._measures.refused.labels("host").inc()
         if scope["type"] == "websocket":
             await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1008})  # # before accept: the client gets 403
+            return await send({"type": "websocket.close", "code": 1008})  # before accept: the client gets 403
         named = f"{', '.join(given):.100}"
         problem = Misdirected(
             f"this server is not known as {named!r}; ask for its address, or add the name to server.allowed_hosts"

@@ -37,7 +37,7 @@ class TokenBuckets:
         enough = left >= tokens
         self._buckets[caller] = (left - tokens if enough else left, now_s)
         if len(self._buckets) > MOST_BUCKETS:
-            self._buckets.popitem(last=False)  # # least recently used: its bucket is full again, or nearly
+            self._buckets.popitem(last=False)  # least recently used: its bucket is full again, or nearly
         return 0.0 if enough else (tokens - left) / self._rate
 
 
@@ -59,7 +59,7 @@ class AddressRate:
         problem = TooManyRequests(f"too many requests from this address; wait {wait_s:.1f} s", wait_s)
         if scope["type"] == "websocket":
             await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1013})  # # before accept: the client gets 403
+            return await send({"type": "websocket.close", "code": 1013})  # before accept: the client gets 403
         await response_of(problem, scope)(scope, receive, send)
 
 

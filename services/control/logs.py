@@ -58,7 +58,7 @@ def log_to_stderr(settings: LogSettings) -> None:
     logging.captureWarnings(True)
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda raised: _log_uncaught(raised.exc_type, raised.exc_value, raised.exc_traceback)
-    logging.getLogger("uvicorn.access").disabled = True  # # its lines contain addresses with tickets
+    logging.getLogger("uvicorn.access").disabled = True  # its lines contain addresses with tickets
     logging.getLogger("uvicorn.error").addFilter(_is_no_refused_websocket)
     for chatty in ("websockets", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)

@@ -48,13 +48,13 @@ class Observed:
         started_s = time.monotonic()
         try:
             await self._app(scope, receive, send_numbered)
-        except Exception:  # # outermost handler: a bug becomes a plain 500, the traceback goes to the log
+        except Exception:  # outermost handler: a bug becomes a plain 500, the traceback goes to the log
             log.exception("a request failed by a bug in this program")
             if status == 0 and scope["type"] == "http":
                 problem = Internal(f"a bug in this server; its log has the cause under request {request_id}")
                 await response_of(problem, scope)(scope, receive, send_numbered)
             else:
-                raise  # # the answer has begun: the server closes the connection
+                raise  # the answer has begun: the server closes the connection
         finally:
             self._note(scope, status, time.monotonic() - started_s)
             REQUEST_ID.reset(token)

@@ -70,9 +70,9 @@ class ProbeListener:
                 async with asyncio.timeout(REQUEST_S):
                     await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            return  # # slow, gone, or too long: no client to answer
+            return  # slow, gone, or too long: no client to answer
         except asyncio.CancelledError:
-            return  # # evicted by a newer connection, or server shutdown
+            return  # evicted by a newer connection, or server shutdown
         finally:
             self._open.pop(task, None)
 
@@ -137,7 +137,7 @@ def _answers(path: Path) -> bool:
         try:
             client.connect(os.fspath(path))
         except OSError as error:
-            return error.errno == errno.EAGAIN  # # a busy listener exists
+            return error.errno == errno.EAGAIN  # a busy listener exists
         return True
 
 

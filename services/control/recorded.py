@@ -58,7 +58,7 @@ async def _write(request: Request, caller: Caller, event: str, subject: str, out
             request_id=request.state.request_id, detail=detail,
         )  # fmt: skip
 
-    # # The entry is written even if the caller disconnects now.
+    # The entry is written even if the caller disconnects now.
     await asyncio.shield(asyncio.to_thread(append))
 
 

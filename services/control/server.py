@@ -58,11 +58,11 @@ def serve(
     config = config_of(app, settings)
     try:
         config.load()
-    except OSError as error:  # # includes ssl.SSLError
+    except OSError as error:  # includes ssl.SSLError
         raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
     if certificate is not None and config.ssl is not None:
         certificate.attach(config.ssl)
-    # # uvicorn re-raises the signal for the previous handler after shutdown. A drained server must
+    # uvicorn re-raises the signal for the previous handler after shutdown. A drained server must
     # exit normally instead.
     signal.signal(signal.SIGTERM, _done)
     signal.signal(signal.SIGINT, _done)
@@ -90,7 +90,7 @@ def certificate_of(settings: ServiceSettings, events: SystemEvents) -> ServerCer
         return None
     try:
         return ServerCertificate(settings.server.certfile, settings.server.keyfile, events)
-    except OSError as error:  # # includes ssl.SSLError
+    except OSError as error:  # includes ssl.SSLError
         said = error.strerror or error
         raise CannotServe(f"TLS: {said}; check server.certfile and server.keyfile") from error
 
@@ -100,13 +100,13 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         http=with_head_limits(settings.limits.head_s),
-        loop="asyncio",  # # asyncio accepts through the listener's `accept`, which counts connections
+        loop="asyncio",  # asyncio accepts through the listener's `accept`, which counts connections
         ws=AnsweredHandshakes,
         ws_max_size=MOST_MESSAGE_BYTES,
-        ws_per_message_deflate=False,  # # the pictures are already compressed
+        ws_per_message_deflate=False,  # the pictures are already compressed
         log_config=None,
         access_log=False,
-        proxy_headers=False,  # # the application has its own list of trusted proxies
+        proxy_headers=False,  # the application has its own list of trusted proxies
         server_header=False,
         limit_concurrency=settings.limits.connections,
         timeout_graceful_shutdown=max(1, round(settings.server.drain_s)),
@@ -236,14 +236,14 @@ def bind(settings: ServiceSettings) -> socket.socket:
         raise CannotServe(
             f"cannot listen on {server.host} port {server.port}: {error.strerror}; give another server.host or server.port"
         ) from error
-    # # Accepted connections inherit these options. asyncio disables Nagle's algorithm only for
+    # Accepted connections inherit these options. asyncio disables Nagle's algorithm only for
     # sockets with an explicit
-    # # protocol, which this one lacks: an answer's body would wait 40 ms for the acknowledgement of
+    # protocol, which this one lacks: an answer's body would wait 40 ms for the acknowledgement of
     # its head.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    # # The kernel would buffer up to 4 MB per slow viewer, which is seconds of outdated pictures.
+    # The kernel would buffer up to 4 MB per slow viewer, which is seconds of outdated pictures.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MOST_UNSENT_BYTES)
-    # # The kernel drops a connection whose peer acknowledges nothing for this time.
+    # The kernel drops a connection whose peer acknowledges nothing for this time.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(settings.limits.viewer_stall_s * 1000))
     return listener
 

@@ -51,11 +51,11 @@ def _check_one(address: str, rules: SourceRules) -> None:
         )
     place = ("/" if match["slashes"] == "/" else "") + match[
         "rest"
-    ]  # # as the sources parse it: one slash begins an absolute path
+    ]  # as the sources parse it: one slash begins an absolute path
     if scheme in OF_NETWORKS:
         _check_host(address, rules)
     elif scheme in OF_FOLDERS:
-        # # Some sources treat `?` as the start of options, others as part of the path; both
+        # Some sources treat `?` as the start of options, others as part of the path; both
         # readings must be allowed.
         for path in (place, place.partition("?")[0]):
             _check_path(path, rules.folders, "sources.folders")
@@ -73,7 +73,7 @@ def _check_host(address: str, rules: SourceRules) -> None:
         host, _ = parts.hostname, parts.port
     except ValueError as error:
         raise Unprocessable(f"the source's address cannot be read: {error}") from error
-    # # URL parsers disagree on user info (first or last @), so an ambiguous authority is refused.
+    # URL parsers disagree on user info (first or last @), so an ambiguous authority is refused.
     authority = parts.netloc.rpartition("@")
     if host is None or parts.netloc.count("@") > 1 or not _HOST.fullmatch(authority[2]):
         raise Unprocessable("the source's address has no plain host in it; write scheme://host:port/path")

@@ -77,6 +77,6 @@ class SystemEvents:
 def _append(audit: AuditLog, said: SystemEvent) -> None:
     try:
         audit.append(said.event, actor="system", subject=said.subject, outcome=said.outcome, detail=said.detail)
-    # # no request to refuse: the failure goes to the log and the metrics
+    # no request to refuse: the failure goes to the log and the metrics
     except (AuditUnwritable, ValueError) as error:
         log.error("%s of %s is not in the audit log: %s", said.event, said.subject, error)
