@@ -1,1 +1,1 @@
-"""The processes of a stream, and who keeps them running."""
+"""Capture and engine processes of streams, and their supervision."""

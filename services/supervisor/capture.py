@@ -1,5 +1,7 @@
-"""The capture process of a stream, `python -m services.supervisor.capture --spec FILE`: owns the source, and publishes its frames whatever
-becomes of everybody else. It loads no torch.
+"""Capture process of a stream, `python -m services.supervisor.capture --spec FILE`.
+
+Owns the source and publishes its frames, independently of the engine and the control plane. Loads
+no torch.
 """
 
 from __future__ import annotations
@@ -32,37 +34,46 @@ from services.supervisor.worker import Worker, stream_folder_of
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.1
-"""How often the source is asked for its state while no frame comes."""
+"""Read timeout in seconds; the source state is reported at this interval while no frame arrives."""
 
 
 class Capture:
-    """Reads one source after another from the same address, and publishes what they give."""
+    """Reader of the source that publishes its frames and reopens the source after errors."""
 
     def __init__(self, spec: SourceSpec) -> None:
         self.spec = spec
         self._lock = threading.Lock()
         self._source: FrameSource | None = None
         self._run = time.time_ns()
-        """Tells readers that numbers and times begin anew."""
+        """Run id in the frame headers; a change tells readers that sequence numbers and timestamps
+        restart."""
         self.frames = 0
         self._last_ns: int | None = None
 
     def describe(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        """The command `describe`: what is known of the source. Raises CommandRefused while it is not open."""
+        """Handle the command `describe`: return the source description.
+
+        Raises:
+            CommandRefused: if the source is not open.
+        """
         with self._lock:
             if self._source is None:
                 raise CommandRefused("the source is not open")
             return {"description": description_to(self._source.description)}
 
     def figures(self) -> dict[str, Any]:
-        """For the heartbeats."""
+        """Return frame counts for the heartbeats."""
         with self._lock:
             source = self._source
             counts: dict[str, int] = dict(source.counts()) if isinstance(source, ReportingSource) else {}
         return {"frames": self.frames, "last_frame_ns": self._last_ns, "counts": counts}
 
     def publish(self, worker: Worker, publisher: PicturePublisher) -> None:
-        """Until the process is to end. Raises a UserError for an address that will never work."""
+        """Publish frames until the process is asked to stop.
+
+        Raises:
+            UserError: if the address can never work.
+        """
         backoff = Backoff()
         while not worker.stop_requested():
             try:
@@ -86,7 +97,8 @@ class Capture:
 
     def _options(self) -> SourceOptions:
         spec = self.spec
-        # This process exists for the source alone: when the source hangs or dies, the supervisor starts the process again.
+        # This process runs only the source. If the source hangs or dies, the supervisor restarts
+        # the process.
         return SourceOptions(scale=spec.scale, fps=spec.fps, loop=spec.loop, realtime=True, process=False)
 
     def _publish(self, source: FrameSource, worker: Worker, publisher: PicturePublisher, backoff: Backoff) -> None:
@@ -110,7 +122,7 @@ class Capture:
                         "the camera's driver has given nothing for %g s; the process ends to be started again",
                         stuck_after_s,
                     )
-                    os._exit(FAILED)  # the thread that waits for the driver cannot be ended otherwise
+                    os._exit(FAILED)  # the thread blocked in the driver cannot be ended otherwise
 
     def _send(self, frame: Frame, publisher: PicturePublisher) -> None:
         header = {**frame_header(frame), "run": self._run}
@@ -124,7 +136,11 @@ def _sentence(source: FrameSource) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until told to stop; returns the exit code."""
+    """Run until asked to stop.
+
+    Returns:
+        The exit code.
+    """
     keep_files_private()
     parser = argparse.ArgumentParser(description="Capture process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")

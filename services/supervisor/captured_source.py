@@ -1,4 +1,4 @@
-"""The frames of a stream's capture process, as a source of its engine."""
+"""Frame source of an engine process that receives the frames of the stream's capture process."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from services.bus.runtime import StreamFolder
 LOOK_MS = 50
 ASK_AGAIN_S = 0.1
 SILENT_S = 1.0
-"""A capture process that has said nothing for so long is gone, or hangs."""
+"""Seconds without a heartbeat after which the capture process counts as gone or hung."""
 WAITING = 4
 
 
 class CapturedSource(LiveSource):
-    """Frames that a capture process publishes, with the times at which they came in there.
+    """Live source that receives frames from a capture process, with their arrival times there.
 
-    It has no end: while there is no capture process, or its source gives nothing, `state` and `state_sentence` say so; numbers and times go on
-    when it is back.
+    The source never ends. While the capture process or its source gives no frames, `state` and
+    `state_sentence` report that. Numbering and timestamps continue after a reconnect.
     """
 
     def __init__(
@@ -47,8 +47,16 @@ class CapturedSource(LiveSource):
         stop_requested: Callable[[], bool] = lambda: False,
         scale_for: Callable[[SourceDescription], float] = lambda about: 1.0,
     ) -> None:
-        """Waits until the source is open there. scale_for: from the description of the source, what its pictures are scaled by. Raises
-        SourceUnavailable when it is told to stop before."""
+        """Block until the capture process has opened its source.
+
+        Args:
+            folder: runtime folder of the stream.
+            stop_requested: polled while waiting.
+            scale_for: returns the scale of the frames for a source description.
+
+        Raises:
+            SourceUnavailable: if a stop is requested before the source is open.
+        """
         super().__init__(waiting=WAITING, order=FrameOrder(trusted=True))
         self._folder = folder
         self._told: tuple[SourceState, str] | None = None
@@ -81,7 +89,7 @@ class CapturedSource(LiveSource):
         for socket in (pictures, status, ended):
             poller.register(socket, zmq.POLLIN)
         run: Any = None
-        self._heard_s = time.monotonic()  # before, nobody has listened
+        self._heard_s = time.monotonic()  # no subscription existed before, so earlier silence does not count
         try:
             while not self.wait(0):
                 found = dict(poller.poll(LOOK_MS))
@@ -109,7 +117,8 @@ class CapturedSource(LiveSource):
                 socket.close(0)
 
     def _begin_anew(self) -> None:
-        """The next frame is the first one of another process or of another connection there."""
+        """Restart frame numbering, because the next frame is from another capture process or source
+        connection."""
         if self._order is not None:
             self._order.restart()
 
@@ -125,7 +134,7 @@ class CapturedSource(LiveSource):
             return None
 
     def _note(self, data: bytes) -> None:
-        """A heartbeat of the capture process."""
+        """Evaluate a heartbeat of the capture process."""
         try:
             said = parsed_json(data)
         except BadMessage:
@@ -136,7 +145,8 @@ class CapturedSource(LiveSource):
         if state == "live":
             self._told = None
         elif state == SourceState.ENDED.value:
-            self._told = SourceState.STALLED, reason  # a stream without an end: it may be played again
+            # reported as stalled, because a played recording may start again
+            self._told = SourceState.STALLED, reason
         elif state == SourceState.STALLED.value:
             self._told = SourceState.STALLED, reason
         else:

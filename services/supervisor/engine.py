@@ -1,5 +1,6 @@
-"""The engine process of a stream, `python -m services.supervisor.engine --spec FILE [--again]`: reconstructs the frames of the stream's capture process
-live, and publishes what is shown.
+"""Engine process of a stream, `python -m services.supervisor.engine --spec FILE [--again]`.
+
+Reconstructs the frames of the stream's capture process live and publishes the rendered pictures.
 """
 
 from __future__ import annotations
@@ -43,11 +44,17 @@ from services.supervisor.specs import EngineSpec
 from services.supervisor.worker import Worker, stream_folder_of
 
 LOOK_S = 0.05
-"""How often it is asked whether the live reconstruction is to be shown again."""
+"""Seconds between checks for a switch back to the live reconstruction."""
 
 
 def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
-    """The settings of a live run without an end: nothing is written that grows with it."""
+    """Return settings for an endless live session; no output that grows with time is written.
+
+    Args:
+        spec: engine part of the stream specification.
+        out: output folder.
+        source: name of the source.
+    """
     return LiveSettings(
         source=source,
         out=out,
@@ -66,7 +73,11 @@ def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
 
 
 def started(settings: LiveSettings, source: CapturedSource, again: bool) -> LiveParts:
-    """Return the components of a live run. The first time everything is done once before the first frame; again, a picture soon counts for more."""
+    """Create the components of a live session.
+
+    The first start runs a full trial with synthetic frames to warm up every code path. A restart
+    skips the trial, to show a picture sooner.
+    """
     if again:
         return new_parts(settings, source)
     trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
@@ -76,8 +87,12 @@ def started(settings: LiveSettings, source: CapturedSource, again: bool) -> Live
 def reconstruct(
     worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, snapshots: LiveSnapshots, *, again: bool
 ) -> None:
-    """Reconstruct and show until the process is to end, or a finished model is to be shown. Raises a UserError for what cannot work, RunFailed when
-    a part failed."""
+    """Reconstruct live until the process is asked to stop or to show a finished model.
+
+    Raises:
+        UserError: if the configuration cannot work.
+        RunFailed: if an operator of the graph failed.
+    """
 
     def stop_requested() -> bool:
         return worker.stop_requested() or screen.wanted != "live"
@@ -116,7 +131,8 @@ def reconstruct(
 
 
 def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again: bool) -> None:
-    """Show the live reconstruction or a finished model, as it is asked for, until the process is to end."""
+    """Alternate between the live reconstruction and finished models until the process is asked to
+    stop."""
     check_device(spec.device)
     check_renderer(spec.renderer, spec.device)
     models = ModelShow(worker, spec, screen, layers)
@@ -143,7 +159,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
 
 
 def graph_figures(graph: LiveApplication) -> dict[str, object]:
-    """What a graph has done so far, by name; nothing before it runs."""
+    """Return the counters of a graph by name; empty before the graph runs."""
     if getattr(graph, "metrics", None) is None:
         return {}
     counts = graph.reconstruct.counts
@@ -161,7 +177,11 @@ def graph_figures(graph: LiveApplication) -> dict[str, object]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until told to stop; returns the exit code."""
+    """Run until asked to stop.
+
+    Returns:
+        The exit code.
+    """
     keep_files_private()
     parser = argparse.ArgumentParser(description="Engine process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")
@@ -180,7 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 show(worker, spec.engine, Screen(publisher), layers, given.again)
             finally:
                 publisher.close()
-    except SourceUnavailable as error:  # nothing is a reason for not trying again
+    except SourceUnavailable as error:  # stop requested before the source was open; a restart may succeed
         logging.getLogger(__name__).info("%s", error)
     except UserError as error:
         logging.getLogger(__name__).error("%s", error)

@@ -1,4 +1,4 @@
-"""Size of what an engine reconstructs, beside its stream's pictures."""
+"""Working size of an engine relative to its stream's pictures."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from services.bus.runtime import read_json, write_json
 from services.supervisor.specs import EngineSpec
 
 SHARE_OF_INTERVAL = 0.5
-"""Largest share of the time between two frames that a frame may take, while nobody watches. Viewers, commands and the capture process need
-the rest of the same cores."""
+"""Largest share of the frame interval that processing one frame may take without viewers. Viewers,
+commands and the capture process share the same cores."""
 
 
 def engine_scale(
     spec: EngineSpec, about: SourceDescription, kept: Path, measure: Callable[[SourceDescription, float], WorkingSize]
 ) -> float:
-    """Return what a stream's pictures are scaled by before they are reconstructed.
+    """Return the scale of a stream's pictures for reconstruction.
 
-    An engine on a CPU without `engine_scale` measures once what the machine keeps up with. One that is started again takes the size that the one
-    before it measured, so that its first picture comes soon.
+    An engine on a CPU without `engine_scale` measures once which size keeps up with the stream. A
+    restarted engine reuses the stored result, to show its first picture sooner.
 
     Args:
-        about: the stream's pictures.
-        kept: file in which the measured size is kept; it is written, and a file that is no such size is replaced.
-        measure: returns the largest size that takes a share of the time between frames.
+        spec: engine part of the stream specification.
+        about: description of the stream's pictures.
+        kept: file for the measured size. An invalid file is overwritten.
+        measure: returns the largest size that needs at most the given share of the frame interval.
     """
     if spec.engine_scale is not None:
         return spec.engine_scale
@@ -43,7 +44,7 @@ def engine_scale(
         if found["size"] == size and scale <= 1:
             return scale
     except (OSError, BadMessage, UserError, KeyError, TypeError, ValueError):
-        pass  # nothing was measured yet, or the file is damaged: the size is measured and written anew
+        pass  # nothing measured yet, or damaged file: measure again
     chosen = measure(about, SHARE_OF_INTERVAL)
     write_json(kept, {"size": size, "scale": chosen.scale, "frame_ms": round(1e3 * chosen.frame_s, 1)})
     return chosen.scale

@@ -1,6 +1,6 @@
-"""How the processes of a stream end."""
+"""Exit codes of capture and engine processes."""
 
 FINISHED = 0
 FAILED = 1
 NO_USE = 2
-"""What was asked for cannot be done: the process would end in the same way again."""
+"""The request cannot be fulfilled; a restart would fail in the same way."""

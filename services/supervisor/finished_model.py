@@ -1,4 +1,4 @@
-"""A finished model, ready to be shown at any time of a stream."""
+"""Finished model that can be rendered at any time of a stream."""
 
 from __future__ import annotations
 
@@ -21,13 +21,17 @@ from services.supervisor.layer_drawing import LayerScene
 
 
 class NotFinite(InvalidInput):
-    """A picture of a model holds values that are no numbers."""
+    """A rendered picture contains non-finite values."""
 
 
 class FinishedModel:
-    """A model from a bundle with a renderer of its own, which one thread at a time uses.
+    """Model from a bundle, with its own renderer. For use by one thread at a time.
 
-    Making it draws a picture, so that the first one that is shown takes no longer than others. Raises BundleError, CommandRefused.
+    The constructor renders a picture as warm-up.
+
+    Raises:
+        BundleError: if the bundle cannot be loaded.
+        CommandRefused: if the warm-up picture is not finite.
     """
 
     def __init__(self, folder: Path, name: str, version: int, *, device: str, renderer: str) -> None:
@@ -43,20 +47,38 @@ class FinishedModel:
             raise CommandRefused(str(error)) from None
 
     def at(self, stream_s: float) -> float:
-        """The model's time at a time of the stream: its window over and over."""
+        """Map a stream time to the model's time window, looping.
+
+        Args:
+            stream_s: time of the stream in seconds.
+
+        Returns:
+            Model time in seconds.
+        """
         start_s, end_s = self._model.time_window_s
         return start_s + math.fmod(max(0.0, stream_s), end_s - start_s) if end_s > start_s else start_s
 
     def scene(self, stream_s: float, header: Mapping[str, Any]) -> LayerScene:
-        """What the picture of that time shows, for drawing more of it. A bundle does not say what its unit is."""
+        """Return the scene at a stream time for the layer pictures. Not metric, because bundles
+        state no unit."""
         return LayerScene(self._model, self._camera, self.at(stream_s), header)
 
     def picture(self, stream_s: float) -> NDArray[np.uint8]:
-        """RGB uint8 [H, W, 3] by the model's camera. Raises NotFinite."""
+        """Render the model through its own camera.
+
+        Args:
+            stream_s: time of the stream in seconds.
+
+        Returns:
+            RGB uint8 [H, W, 3].
+
+        Raises:
+            NotFinite: if the picture or the Gaussians have non-finite values.
+        """
         time_s = self.at(stream_s)
         with torch.inference_mode():
             image = self._renderer.render(self._camera, time_s, ("image",)).result().image
-            # A renderer leaves out what is not finite: the Gaussians themselves tell more than the picture.
+            # The renderer skips non-finite Gaussians, so the picture alone would not show them.
             drawn = (image, *self._model.at(time_s).tensors().values())
             if not all(bool(torch.isfinite(values).all()) for values in drawn):
                 raise NotFinite(

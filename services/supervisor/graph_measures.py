@@ -1,4 +1,4 @@
-"""What a graph has measured, for the engine's heartbeats."""
+"""Metrics of a graph for the engine's heartbeats."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BOUNDS_NS = tuple(round(bound_s * 1e9) for bound_s in BOUNDS_S)
 
 
 def graph_measures(graph: Application) -> dict[str, Any]:
-    """Latencies of its paths, durations of its operators, and what waits in its queues and was dropped from them."""
+    """Return path latencies, operator durations, and queue lengths and drops of a graph."""
     tracker = graph.track()
     return {
         "paths": {name: _told(histogram) for name, histogram in tracker.paths().items()},
@@ -22,5 +22,5 @@ def graph_measures(graph: Application) -> dict[str, Any]:
 
 
 def _told(histogram: Histogram) -> dict[str, Any]:
-    """As `services.bus.durations.Durations` tells its own."""
+    """Return a histogram in the format of `services.bus.durations.Durations`."""
     return {"counts": histogram.between(BOUNDS_NS), "sum_s": round(histogram.sum_ns * 1e-9, 6)}

@@ -1,15 +1,18 @@
-"""The launcher, `python -m services.supervisor.launcher --folder RUNTIME`: has loaded everything that the processes of a stream need, and forks them.
+"""Launcher process, `python -m services.supervisor.launcher --folder RUNTIME`: forks capture and
+engine processes.
 
-Loading torch takes seconds, forking milliseconds: a process that has died is there again before anybody has looked twice. The launcher computes
-nothing, has one thread, and touches no GPU, so that what it forks begins as if newly started; its memory is shared with what it forks.
+The launcher has imported everything that these processes need. Importing torch takes seconds and
+forking takes milliseconds, so a crashed process is replaced quickly. The launcher computes nothing,
+has one thread and uses no GPU. A forked process therefore starts in a clean state and shares the
+launcher's memory.
 
-It takes one JSON object for each connection to its socket, and answers with one:
+Each connection to the launcher's socket carries one JSON request and one JSON answer:
 
-| request | answer |
-|---|---|
-| `{"command": "start", "module": NAME, "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
-| `{"command": "status", "pid": N}` | `{"ok": true, "status": "signal 9"}`, null while it runs or when it is not known |
-| `{"command": "ping"}`, `{"command": "stop"}` | `{"ok": true}` |
+ request | answer |
+---|---|
+ `{"command": "start", "module": NAME, "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
+ `{"command": "status", "pid": N}` | `{"ok": true, "status": "signal 9"}`; null if it still runs or is unknown |
+ `{"command": "ping"}`, `{"command": "stop"}` | `{"ok": true}` |
 """
 
 from __future__ import annotations
@@ -46,16 +49,17 @@ LOADED = (
     "operators.sources.synthetic",
     "operators.sources.zeromq",
 )
-"""Sources that capture processes are likely to load."""
+"""Source modules that capture processes are likely to import."""
 LOOK_S = 0.2
 REQUEST_S = 1.0
-"""A request takes no longer to be read."""
+"""Timeout for reading a request, in seconds."""
 MOST_REMEMBERED = 256
-"""Ends of processes that nobody has asked for."""
+"""Exit statuses kept for processes whose status was not queried yet."""
 
 
 class Launcher:
-    """Listens at its socket and forks until it is told to stop, nobody has asked for anything in `orphan_after_s`, or nobody can: the socket is gone."""
+    """Server on the launcher's socket. Ends on `stop`, after `orphan_after_s` without requests, or
+    when the socket file is removed."""
 
     def __init__(self, path: Path, orphan_after_s: float) -> None:
         self._path, self._orphan_after_s = path, orphan_after_s
@@ -68,11 +72,11 @@ class Launcher:
         self._heard_s = time.monotonic()
 
     def stop(self, *_: Any) -> None:
-        """End soon; also a signal's handler."""
+        """Request the end of `serve`. Also used as signal handler."""
         self._stopped = True
 
     def serve(self) -> None:
-        """Until the end."""
+        """Answer requests until the end."""
         while not self._stopped and time.monotonic() - self._heard_s < self._orphan_after_s:
             self._reap()
             if not self._path.exists():
@@ -82,7 +86,7 @@ class Launcher:
             connection, _ = self._listener.accept()
             with connection:
                 connection.settimeout(REQUEST_S)
-                with contextlib.suppress(OSError):  # whoever asked is gone
+                with contextlib.suppress(OSError):  # the client has disconnected
                     connection.sendall(packed_json(self._answer(connection)))
         self._listener.close()
         self._path.unlink(missing_ok=True)
@@ -121,7 +125,7 @@ class Launcher:
             os.close(output)
 
     def _reap(self) -> None:
-        """Take note of processes that have ended."""
+        """Collect the exit statuses of ended processes."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -135,7 +139,7 @@ class Launcher:
 
 
 def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str], output: int) -> NoReturn:
-    """The rest of the life of a forked process."""
+    """Run a module's `main` in a forked process; never returns."""
     code = 1
     try:
         os.setsid()
@@ -145,7 +149,7 @@ def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str
         os.dup2(output, 2)
         os.environ.update(environment)
         code = importlib.import_module(module).main(arguments)
-    except BaseException:  # noqa: BLE001 - nothing of this process may go on as the launcher
+    except BaseException:  # noqa: BLE001 - the forked process must never continue as the launcher
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -154,14 +158,19 @@ def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until told to stop; returns the exit code."""
+    """Run until asked to stop.
+
+    Returns:
+        The exit code.
+    """
     keep_files_private()
     parser = argparse.ArgumentParser(description="Forks the processes of streams.")
     parser.add_argument("--folder", required=True, help="runtime folder")
     parser.add_argument("--orphan-after-s", type=float, default=600.0)
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    # By NVML it can be asked whether there is a GPU without using it, after which no engine could.
+    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked engine
+    # could use CUDA.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     try:
         folder = RuntimeFolder(Path(given.folder))
@@ -174,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for module in (*FORKED, *LOADED):
         importlib.import_module(module)
     gc.collect()
-    gc.freeze()  # nobody searches what it was born with for garbage, and so it stays in shared memory
+    gc.freeze()  # excludes the imported objects from garbage collection, so their pages stay shared
 
     identity = ProcessIdentity.of(os.getpid())
     assert identity is not None

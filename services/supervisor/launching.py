@@ -1,4 +1,4 @@
-"""Starting processes: directly, or by the launcher where a start has to be quick."""
+"""Process start: directly, or by the launcher for a quick start."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from services.supervisor.process_end import status_of_child
 log = logging.getLogger(__name__)
 SOCKET, RECORD = "launcher", "launcher.json"
 FORKED = ("services.supervisor.capture", "services.supervisor.engine")
-"""What the launcher forks."""
+"""Modules that the launcher can fork."""
 LOADS_LONG = ("services.supervisor.engine",)
-"""What takes as long to load as the launcher itself: to wait for a launcher that is loading is no slower than to load it twice at once."""
+"""Modules that take as long to import as the launcher itself. Waiting for a starting launcher is no
+slower than importing twice at once."""
 LOADING_S = 60.0
 ANSWER_S = 5.0
 LOOK_S = 0.05
@@ -31,7 +32,7 @@ PING_S = 1.0
 
 
 class Start(Protocol):
-    """Starts a module of ours as a process."""
+    """Interface for starting a module of this package as a process."""
 
     async def start(
         self,
@@ -42,16 +43,30 @@ class Start(Protocol):
         *,
         fresh: bool = False,
     ) -> int:
-        """Its number. fresh: by a new interpreter, whatever is at hand. Raises OSError."""
+        """Start a process.
+
+        Args:
+            module: module to run.
+            arguments: command line arguments.
+            output: log file for standard output and standard error.
+            environment: additional environment variables.
+            fresh: use a new interpreter, never a fork.
+
+        Returns:
+            The process id.
+
+        Raises:
+            OSError: if the process cannot be started.
+        """
         ...
 
     async def how_ended(self, pid: int) -> str | None:
-        """How a process ended, in words; None where that is not known."""
+        """Return a description of how a process ended, or None if unknown."""
         ...
 
 
 class Direct:
-    """Starts a new interpreter, in a session of its own: it outlives this process."""
+    """Start in a new interpreter and a new session, so the process outlives this one."""
 
     async def start(
         self,
@@ -83,8 +98,11 @@ class Direct:
 
 
 class ByLauncher:
-    """Has processes forked by the launcher, which it starts, and starts again when it has died. While that one is loading engines wait for it, and
-    what loads quickly is started directly. One for each runtime folder; streams share it."""
+    """Start through the launcher, which this class starts and restarts if it dies.
+
+    While the launcher is loading, engines wait for it and quickly loading modules are started
+    directly. Streams of a runtime folder share one instance.
+    """
 
     def __init__(self, folder: RuntimeFolder, orphan_after_s: float = 600.0) -> None:
         self._folder, self._orphan_after_s = folder, orphan_after_s
@@ -92,15 +110,19 @@ class ByLauncher:
         self._own_pid: int | None = None
         self._keeping: asyncio.Task[None] | None = None
         self.ready = asyncio.Event()
-        """Whether the launcher takes requests."""
+        """Set while the launcher accepts requests."""
 
     def open(self) -> None:
-        """Take over the launcher of the runtime folder, or start one; without effect when that was done."""
+        """Adopt the launcher of the runtime folder or start one. No effect if already open."""
         if self._keeping is None:
             self._keeping = asyncio.create_task(self._keep(), name="launcher")
 
     async def close(self, *, stop: bool) -> None:
-        """Leave the launcher to the next one who opens, or with `stop` end it."""
+        """Stop supervising the launcher.
+
+        Args:
+            stop: also end the launcher; otherwise it stays for the next `open`.
+        """
         keeping, self._keeping = self._keeping, None
         if keeping is not None:
             keeping.cancel()
@@ -108,7 +130,7 @@ class ByLauncher:
         self.ready.clear()
         identity = recorded_launcher(self._folder)
         if identity is None and self._own_pid is not None:
-            identity = ProcessIdentity.of(self._own_pid)  # it is still loading
+            identity = ProcessIdentity.of(self._own_pid)  # the launcher is still loading
         if stop and identity is not None:
             identity.signal(signal.SIGTERM)
             if not await identity.ended(ANSWER_S):
@@ -155,14 +177,14 @@ class ByLauncher:
         return how
 
     async def _is_there(self, module: str) -> bool:
-        """Whether there is a launcher for a process, if need be after it has loaded."""
+        """Return True if the launcher is ready; for slow modules wait until it has loaded."""
         if not self.ready.is_set() and self._keeping is not None and module in LOADS_LONG:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self.ready.wait(), LOADING_S)
         return self.ready.is_set()
 
     async def _keep(self) -> None:
-        """Keep a launcher running."""
+        """Keep a launcher running: start it if needed, then ping it periodically."""
         while True:
             if recorded_launcher(self._folder) is None:
                 self.ready.clear()
@@ -206,7 +228,7 @@ class ByLauncher:
 
 
 def recorded_launcher(folder: RuntimeFolder) -> ProcessIdentity | None:
-    """The launcher that serves a runtime folder; None when none does."""
+    """Return the identity of the running launcher of a runtime folder, or None."""
     try:
         content = read_json(folder.path / RECORD)
     except (FileNotFoundError, BadMessage):

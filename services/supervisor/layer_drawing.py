@@ -1,4 +1,4 @@
-"""Draws the further pictures of an engine: depth, confidence, and the view of a virtual camera."""
+"""Renderer of an engine's additional pictures: depth, confidence and virtual camera view."""
 
 from __future__ import annotations
 
@@ -28,41 +28,42 @@ from operators.remembered import RememberedTissue
 from services.bus.runtime import Layer
 
 Picture = tuple[NDArray[np.uint8], dict[str, Any]]
-"""RGB uint8 [H, W, 3], and what is said about it beside the scene's header."""
+"""RGB uint8 [H, W, 3], and header entries in addition to the scene's header."""
 
 
 @dataclass(frozen=True)
 class LayerScene:
-    """What is on the screen, for drawing more of it."""
+    """Displayed scene, with the data needed to render additional layers."""
 
     model: Model | Snapshot
-    """Held only as long as this scene is."""
+    """Model of the scene; referenced only while the scene exists."""
     camera: Camera
-    """The endoscope's, or that of a finished model."""
+    """Camera of the endoscope or of the finished model."""
     time_s: float
     header: Mapping[str, Any]
-    """Of the picture on the screen: `seq`, `pts_ns`, `arrived_ns`, `state`, `show`, `new`."""
+    """Header of the displayed picture: `seq`, `pts_ns`, `arrived_ns`, `state`, `show`, `new`."""
     metric: bool = False
-    """Whether the scene's unit is known to be the millimetre."""
+    """True if the scene's unit is known to be the millimetre."""
     planes: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-    """Depth and opacity [H, W] from the camera, where they were drawn with the picture."""
+    """Depth and opacity [H, W] from the camera, if rendered with the picture."""
 
 
 class LayerDrawing:
-    """Draws scenes. For one thread, which makes it: on a GPU with a stream of its own, behind the pictures of the screen.
+    """Layer renderer for use in the thread that creates it. On a GPU it uses its own CUDA stream.
 
-    It renders without CUDA graphs, because capturing one holds up other threads, and always by alpha blending.
+    Renders without CUDA graphs, because capturing a graph blocks other threads, and always by alpha
+    blending.
     """
 
     def __init__(self, device: str) -> None:
         self.orbit = Orbit()
-        """Where the virtual camera is; may be replaced from any thread."""
+        """Position of the virtual camera; may be replaced from any thread."""
         self._depth = DepthColours()
         self._tissue = RememberedTissue()
         self._stream = torch.cuda.Stream() if device == "cuda" else None
 
     def draw(self, layer: Layer, scene: LayerScene) -> Picture:
-        """A picture of one kind."""
+        """Render one layer of a scene."""
         kinds: Mapping[Layer, Callable[[LayerScene], Picture]] = {
             "depth": self._draw_depth,
             "confidence": self._draw_confidence,
@@ -112,13 +113,15 @@ class LayerDrawing:
 
 
 def label(image: NDArray[np.uint8], layer: Layer, state: PictureState, age_ns: int) -> None:
-    """Draw state and age into a picture, in place. A virtual view never says LIVE: no camera has seen it."""
+    """Draw state and age into a picture, in place. A virtual view is never labelled LIVE, because
+    no camera observed it."""
     if layer != "orbit" or state is not PictureState.LIVE:
         draw_label(image, state, age_ns)
 
 
 def _at(scene: LayerScene) -> tuple[Gaussians, torch.Tensor | None]:
-    """The Gaussians at the scene's time, and how long each was not seen, where that is known."""
+    """Return the Gaussians at the scene's time and the unseen time of each in seconds, None if
+    unknown."""
     model = scene.model
     unseen_s = model.unseen_s() if isinstance(model, Snapshot) else model.unseen_s
     return model.at(scene.time_s), unseen_s
@@ -129,7 +132,8 @@ def _rendered(scene: LayerScene) -> RenderOutput:
 
 
 def _weighted(gaussians: Gaussians, unseen_s: torch.Tensor | None) -> Gaussians:
-    """The Gaussians with confidence as their colour: 1 for what is seen or of which nothing is known, less the longer it was not seen."""
+    """Return the Gaussians with confidence as colour: 1 if visible or unknown, decreasing with the
+    unseen time."""
     weight = gaussians.means.new_ones(gaussians.count)
     if unseen_s is not None:
         weight = certainty(unseen_s).to(gaussians.dtype)

@@ -1,4 +1,5 @@
-"""Further pictures beside what an engine shows: each kind is drawn only while somebody watches it, and never in the way of what is shown."""
+"""Thread for an engine's additional pictures (layers). A layer is drawn only while it has viewers,
+at limited cost to the main picture."""
 
 from __future__ import annotations
 
@@ -21,19 +22,21 @@ from services.supervisor.layer_drawing import LayerDrawing, LayerScene, label
 
 log = logging.getLogger(__name__)
 PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
-"""Pictures of one kind come no closer together."""
+"""Minimum time between two pictures of a layer, in seconds, by device."""
 MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
-"""Of the time, what drawing takes at most: a slow picture is followed by a longer rest."""
+"""Largest share of time spent on drawing, by device. A slow picture is followed by a longer pause.
+"""
 LOOK_S = 0.2
 
 Scene = Callable[[], LayerScene | None]
-"""Gives what is on the screen when it is drawn; None where that cannot be drawn."""
+"""Callable that creates the scene when it is drawn; None if it cannot be drawn."""
 
 
 class Layers:
-    """Draws what is watched, in a thread of its own. `offer` and `camera` may be called from any thread.
+    """Drawing thread for the watched layers. `offer` and `camera` are thread-safe.
 
-    It hears from its sockets whether anybody watches: without viewers nothing is drawn, and no scene is held.
+    The publishers' sockets report subscribers. Without subscribers nothing is drawn and no scene is
+    held.
     """
 
     def __init__(
@@ -43,9 +46,9 @@ class Layers:
         self._changed = threading.Condition()
         self._scene: Scene | None = None
         self._number = 0
-        """Counts what is offered."""
+        """Number of offered scenes."""
         self._drawn_of: dict[Layer, tuple[int, float]] = dict.fromkeys(LAYERS, (0, 0.0))
-        """Of each layer: which scene was drawn last, and when."""
+        """Last drawn scene number and its time, per layer."""
         self._watched: frozenset[Layer] = frozenset()
         self._drawn: Counter[Layer] = Counter()
         self._failed = ""
@@ -54,11 +57,11 @@ class Layers:
         self._thread = threading.Thread(target=self._run, name="layers", daemon=True)
 
     def open(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop drawing, and remove the sockets."""
+        """Stop drawing and remove the sockets."""
         with self._changed:
             self._over = True
             self._changed.notify()
@@ -66,7 +69,8 @@ class Layers:
             self._thread.join()
 
     def offer(self, scene: Scene) -> None:
-        """What is on the screen now; `scene` is called where it is drawn, and only if it is. It returns at once."""
+        """Offer the displayed scene. Returns at once; the drawing thread calls `scene` only if it
+        draws it."""
         if self._watched:
             with self._changed:
                 self._scene = scene
@@ -74,8 +78,19 @@ class Layers:
                 self._changed.notify()
 
     def camera(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """`camera {azimuth_deg?, elevation_deg?, zoom?}`: the virtual camera from the next picture on; what is left out is 0, 0 and 1. Raises
-        BadMessage, InvalidSetting."""
+        """Handle `camera {azimuth_deg?, elevation_deg?, zoom?}`: move the virtual camera. Defaults
+        are 0, 0 and 1.
+
+        Args:
+            arguments: arguments of the command.
+
+        Returns:
+            The new position.
+
+        Raises:
+            BadMessage: if a value is not a number.
+            InvalidSetting: if a value is out of range.
+        """
         given = {name: arguments.get(name, default) for name, default in vars(Orbit()).items()}
         for name, value in given.items():
             if isinstance(value, bool) or not isinstance(value, int | float):
@@ -84,7 +99,7 @@ class Layers:
         return dict(vars(self._orbit))
 
     def figures(self) -> dict[str, Any]:
-        """For the heartbeats."""
+        """Return viewer and picture counts for the heartbeats."""
         watched = self._watched
         layers = {layer: {"watched": layer in watched, "drawn": self._drawn[layer]} for layer in LAYERS}
         return {"layers": {**layers, **({"failed": self._failed} if self._failed else {})}}
@@ -112,7 +127,8 @@ class Layers:
                 publisher.close()
 
     def _next(self) -> tuple[Layer, Scene] | None:
-        """The layer that has waited longest for a scene that it has not shown, and that scene; None while there is none."""
+        """Return the watched layer that waited longest for an undrawn scene, and that scene. None
+        if no layer waits."""
         with self._changed:
             waiting = [each for each in LAYERS if each in self._watched and self._drawn_of[each][0] < self._number]
             if not waiting or self._scene is None:
@@ -129,7 +145,8 @@ class Layers:
             if scene is None:
                 return
             image, said = drawing.draw(layer, scene)
-        except Exception as error:  # what is shown goes on without it, and whoever looks at the figures learns of it
+        # the main picture continues without the layer; the heartbeat figures report the failure
+        except Exception as error:
             self._failed = f"{layer}: {type(error).__name__}: {error}"[:500]
             log.exception("the picture of %s was not drawn", layer)
             return
@@ -142,13 +159,14 @@ class Layers:
         self._drawn[layer] += 1
 
     def _state(self, screen: PictureState, age_ns: int) -> PictureState:
-        """Of a picture that is as old as that, where the screen is in a state: it is never better than the screen."""
+        """Return the state for a picture of this age; never better than the state of the main
+        picture."""
         own = DisplaySettings().state(age_ns, PERIOD_S[self._device] * 1e9, SourceState.LIVE)
         order = list(PictureState)
         return max(screen, own, key=order.index)
 
     def _rest(self, took_s: float) -> None:
-        """Leave the time between pictures, and most of all time, to the reconstruction."""
+        """Wait until the next picture, leaving most of the time to the reconstruction."""
         period_s = PERIOD_S[self._device] / max(1, len(self._watched))
         rest_s = max(period_s - took_s, took_s * (1 / MOST_SHARE[self._device] - 1))
         with self._changed:

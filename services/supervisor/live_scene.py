@@ -1,4 +1,4 @@
-"""What a live picture shows, for drawing more of it."""
+"""Scenes of live pictures for the layer renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from services.supervisor.screen import header_of
 
 
 def scene_of(shown: ShownPicture, newest: Model | Snapshot | None) -> LayerScene | None:
-    """The scene of a picture, with the newest model; None where that is not of the picture's size (another scene has begun)."""
+    """Return the scene of a live picture with the newest model. None if the sizes differ, because
+    another scene has begun."""
     rendered = shown.rendered
     frame = rendered.frame
     if newest is None or (newest.camera.width_px, newest.camera.height_px) != (frame.width_px, frame.height_px):

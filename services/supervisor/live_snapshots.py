@@ -1,4 +1,4 @@
-"""The command `snapshot` of an engine: the live model as it stands, written as a bundle."""
+"""Command `snapshot` of an engine: writes the current live model as a bundle."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from services.bus.commands import text_of
 from services.bus.errors import CommandRefused
 
 WAIT_S = 5.0
-"""How long to wait for the end of a frame; without frames there is none."""
+"""Seconds to wait for the end of a frame."""
 
 
 class LiveSnapshots:
-    """Writes the model of the reconstruction that runs now. The picture does not wait: the model is copied after a frame's picture is on its way,
-    and written in the thread of the commands, in pieces, so that the engine's other threads run."""
+    """Writer for the model of the running reconstruction.
+
+    Snapshots do not delay pictures. The model is copied after a frame's picture is published, and
+    written in the command thread in pieces, so that other threads can run.
+    """
 
     def __init__(self) -> None:
         self._graph: LiveApplication | None = None
@@ -33,7 +36,7 @@ class LiveSnapshots:
 
     @contextmanager
     def of(self, graph: LiveApplication) -> Iterator[None]:
-        """While entered, that graph is the reconstruction that runs."""
+        """Register the running reconstruction while the block runs."""
         self._graph = graph
         try:
             yield
@@ -41,7 +44,19 @@ class LiveSnapshots:
             self._graph = None
 
     def take(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """`snapshot {folder}`: write the model into a new folder. Raises BadMessage, BundleError, CommandRefused without a reconstruction."""
+        """Handle `snapshot {folder}`: write the model into a new folder.
+
+        Args:
+            arguments: arguments of the command.
+
+        Returns:
+            Header of the snapshot: sequence number, model version, Gaussian count and timings.
+
+        Raises:
+            BadMessage: if the folder is missing.
+            BundleError: if the bundle cannot be written.
+            CommandRefused: if no reconstruction runs or no frame arrives.
+        """
         folder = Path(text_of(arguments, "folder"))
         running: LiveReconstructOp | None = getattr(self._graph, "reconstruct", None)
         if running is None:
@@ -59,8 +74,14 @@ class LiveSnapshots:
         }
 
     def _asked(self, running: LiveReconstructOp) -> tuple[Model, int, int]:
-        """The model in memory of its own, the frame's number, the pause. A snapshot on a GPU is let go of here: while it is held, training needs
-        another slot."""
+        """Request the model after the next frame.
+
+        The GPU snapshot is released here, because training needs another slot while one is held.
+
+        Returns:
+            A copy of the model, the frame's sequence number and the pause of the training in
+            nanoseconds.
+        """
         request = running.request_model()
         answer = request.wait(WAIT_S)
         if answer is None:
@@ -69,7 +90,7 @@ class LiveSnapshots:
         return self._copied(answer.model), answer.frame.seq, answer.pause_ns
 
     def _copied(self, model: Model | Snapshot) -> Model:
-        """On a GPU it is copied there, on a stream of its own, which waits for what the model is made of and for nothing else."""
+        """Copy the model. On a GPU, use a separate stream that waits only for the model's tensors."""
         if model.device.type != "cuda":
             return model.as_model()
         if self._copies is None:

@@ -1,4 +1,5 @@
-"""Finished models in place of the live reconstruction: commands `show_model` and `show_live` of an engine."""
+"""Display of finished models in place of the live reconstruction: commands `show_model`,
+`show_live` and `show_previous`."""
 
 from __future__ import annotations
 
@@ -28,16 +29,17 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 REPEAT_NS = 200_000_000
 LATE_IN_A_ROW = 5
-"""So many pictures in a row that take longer than they may are a missed bound; one may be the machine's."""
+"""Consecutive late pictures that count as a missed time limit. A single one may be caused by the
+machine."""
 
 
 @dataclass(frozen=True)
 class Showing:
-    """A model and what was asked of it."""
+    """Displayed model and the command that requested it."""
 
     model: FinishedModel
     asked: Mapping[str, Any]
-    """The command's arguments."""
+    """Arguments of the command."""
     most_ms: float | None
 
     def __str__(self) -> str:
@@ -45,10 +47,12 @@ class Showing:
 
 
 class ModelShow:
-    """Shows one finished model, at the time of each frame that comes, and keeps the one before for going back.
+    """Display of one finished model at the time of each arriving frame. Keeps the previous model
+    for rollback.
 
-    Another model takes over between two pictures. One whose picture is not finite, or whose pictures take longer than `most_ms` again and
-    again, gives way to the one before it, or to the live reconstruction. What is shown outlasts the process: the next engine begins with it.
+    Models are swapped between two pictures. A model with non-finite pictures, or with repeatedly
+    more than `most_ms` per picture, is replaced by the previous model or the live reconstruction.
+    The selection is stored in a file, so the next engine process restores it.
     """
 
     def __init__(self, worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers | None = None) -> None:
@@ -60,11 +64,11 @@ class ModelShow:
         self._previous: Showing | None = None
         self._late = 0
         self._gave_way: list[dict[str, Any]] = []
-        """The newest models that were taken back, each with its reason."""
+        """Recent models that were rolled back, each with the reason."""
         self._thread: threading.Thread | None = None
 
     def begin(self) -> None:
-        """Take up what the engine before has shown."""
+        """Restore the model that the previous engine process displayed."""
         try:
             said = read_json(self._file)
             self.show(said)
@@ -75,8 +79,20 @@ class ModelShow:
             self._file.unlink()
 
     def show(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """`show_model {folder, version, name?, most_ms?}`: returns once the model is there and has drawn a picture. Raises as `FinishedModel`,
-        and BadMessage; what was shown before then goes on."""
+        """Handle `show_model {folder, version, name?, most_ms?}`: load a model and display it.
+        Returns after the model has rendered a picture; on errors the current display is unchanged.
+
+        Args:
+            arguments: arguments of the command.
+
+        Returns:
+            The version and the preparation time.
+
+        Raises:
+            BadMessage: if an argument is not valid.
+            BundleError: if the bundle cannot be loaded.
+            CommandRefused: if the model renders non-finite values.
+        """
         folder, version = text_of(arguments, "folder"), arguments.get("version")
         name, most_ms = arguments.get("name", ""), arguments.get("most_ms")
         if type(version) is not int or version < 1 or not isinstance(name, str):
@@ -97,12 +113,16 @@ class ModelShow:
             return {"version": version, "prepared_s": round(time.monotonic() - began_s, 3)}
 
     def show_live(self, _: Mapping[str, Any]) -> None:
-        """`show_live`: the live reconstruction again, from its first picture on."""
+        """Handle `show_live`: display the live reconstruction from its next picture on."""
         with self._changing, self._lock:
             self._to_live()
 
     def show_previous(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        """`show_previous`: the model before, which is still there. Raises CommandRefused where there is none."""
+        """Handle `show_previous`: display the previous model again.
+
+        Raises:
+            CommandRefused: if there is no previous model.
+        """
         with self._changing, self._lock:
             if self._current is None or self._previous is None:
                 raise CommandRefused("no model was shown before this one")
@@ -111,25 +131,26 @@ class ModelShow:
             return {"version": before.model.version}
 
     def figures(self) -> dict[str, Any]:
-        """For the heartbeats."""
+        """Return the displayed model and recent rollbacks for the heartbeats."""
         with self._lock:
             current = self._current
             shown = None if current is None else {"name": current.model.name, "version": current.model.version}
             return {"model": shown, "gave_way": list(self._gave_way)}
 
     def close(self) -> None:
-        """Wait for the end of the thread, once the process is to end."""
+        """Wait for the display thread to end. The process must already be stopping."""
         thread = self._thread
         if thread is not None:
             thread.join()
 
     def _show_models(self) -> None:
-        """Draw at the time of each frame, until the live reconstruction has taken over or the process is to end."""
+        """Render at the time of each frame until the live reconstruction takes over or the process
+        stops."""
         stop = self._worker.stop_requested
         try:
             source = CapturedSource(self._worker.folder, stop)
         except UserError:
-            return  # told to stop before there was a source
+            return  # stopped before the source was open
         source.open()
         frame: Frame | None = None
         repeated_ns = 0
@@ -153,7 +174,11 @@ class ModelShow:
             return True
 
     def _draw(self, frame: Frame, new: bool, source: SourceState) -> bool:
-        """One picture; False when it is not shown."""
+        """Render and publish one picture.
+
+        Returns:
+            False if it was not published.
+        """
         with self._lock:
             showing = self._current
         assert showing is not None
@@ -191,13 +216,17 @@ class ModelShow:
             self._give_way(showing, f"{showing} took {took_ms:.1f} ms for a picture, {LATE_IN_A_ROW} times in a row")
 
     def _give_way(self, showing: Showing, why: str) -> bool:
-        """Show what was shown before; False when that is the live reconstruction."""
+        """Return to the previous model or to the live reconstruction.
+
+        Returns:
+            False if the live reconstruction is next.
+        """
         log.error("%s; what was shown before is shown again", why)
         with self._lock:
             taken_back = {"name": showing.model.name, "version": showing.model.version, "reason": why}
             self._gave_way = [*self._gave_way[-7:], taken_back]
             if self._current is not showing:
-                return True  # another one has taken over meanwhile
+                return True  # another model was selected meanwhile
             before, self._previous = self._previous, None
             if before is not None:
                 self._put(before)
@@ -206,12 +235,13 @@ class ModelShow:
             return False
 
     def _put(self, showing: Showing) -> None:
-        """What the next picture shows; under the lock."""
+        """Select the model for the next picture. The caller holds the lock."""
         self._current, self._late = showing, 0
         write_json(self._file, showing.asked)
 
     def _to_live(self) -> None:
-        # The model goes on until the first live picture is there; then publishing it is refused, and its thread ends.
+        # The model stays on screen until the first live picture. Then publishing is refused and the
+        # thread ends.
         self._screen.want("live")
         self._previous = None
         self._file.unlink(missing_ok=True)

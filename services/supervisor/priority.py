@@ -1,4 +1,4 @@
-"""Which process waits when there is not enough of the machine for all."""
+"""Process priorities for machines under full load."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ import os
 from pathlib import Path
 
 ENGINE_ON_CPU = 5
-"""An engine that trains on the CPU takes all that it is given; frames, viewers and commands come first, and take little."""
+"""Nice value of an engine that trains on the CPU, which uses all available time. Capture, viewers
+and commands need little and run first."""
 
 
 def step_back(nice: int) -> None:
-    """Let processes of usual priority go first.
+    """Lower the priority of this process.
 
-    Where Linux groups processes by session (`sched_autogroup_enabled`), nice values count within a session only, and each process of a stream has one
-    of its own: the session steps back, too.
+    With `sched_autogroup_enabled` Linux applies nice values only within a session, and each stream
+    process has its own session. The session's priority is therefore lowered too.
+
+    Args:
+        nice: nice value to reach.
     """
     os.nice(max(0, nice - os.nice(0)))
-    with contextlib.suppress(OSError):  # no such groups here, or nothing may be written in this container
+    with contextlib.suppress(OSError):  # no autogroups on this system, or read-only in this container
         Path("/proc/self/autogroup").write_text(str(nice), encoding="ascii")

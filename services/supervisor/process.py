@@ -1,4 +1,5 @@
-"""One process of a stream, kept running: started or adopted, listened to, ended when it hangs, started again when it has ended."""
+"""Supervision of one process of a stream: start or adoption, heartbeats, hang detection and
+restart."""
 
 from __future__ import annotations
 
@@ -29,28 +30,29 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.25
 PING_S = 1.0
 PAUSED_S = 1.0
-"""When so much more time has passed between two looks, it is the supervisor that stood still."""
+"""Extra seconds between two checks that show that the supervisor itself was suspended."""
 MOST_LOG_BYTES = 1 << 20
 FRESH_AFTER = 3
-"""After so many ends in a row of a process that had not begun to work it is started by a new interpreter: what it was forked from may be what is
-wrong. One that has worked was forked well."""
+"""Consecutive failed starts after which a new interpreter is used, because the launcher's forked
+state may be the cause. A process that sent a good heartbeat started correctly."""
 WELL = ("live", "running")
 RATE_S = 3.0
-"""Time over which a process' rate is taken."""
+"""Window of the rate measurement, in seconds."""
 COUNTED: dict[Role, str] = {"capture": "frames", "engine": "pictures"}
-"""Figure of the heartbeats whose rate is told."""
+"""Heartbeat figure whose rate is measured, by role."""
 
 SOURCE_GONE = ("opening", "stalled", "reconnecting", "lost", "ended")
-"""States of a capture process that has no frames to give."""
+"""Capture process states without frames."""
 LOST_AFTER_S = 2.0
-"""Time without frames after which the source counts as lost: a short break is in the metrics alone."""
+"""Seconds without frames after which the source counts as lost. Shorter gaps appear in the metrics
+only."""
 
 Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left", "lost", "recovered"]
 
 
 @dataclass(frozen=True)
 class StreamEvent:
-    """Something that happened to a process of a stream; audit and metrics are told each."""
+    """State change of a stream process, reported to the audit log and the metrics."""
 
     stream: str
     role: Role
@@ -61,31 +63,33 @@ class StreamEvent:
 
 @dataclass(frozen=True)
 class ProcessState:
-    """What is known of a process now."""
+    """Current state of a stream process as known to the supervisor."""
 
     state: str
-    """What its heartbeat says (`starting`, `live`, `running`, ...), or `down`, `failed`, `stopped`."""
+    """State from the heartbeat (`starting`, `live`, `running`, ...), or `down`, `failed`,
+    `stopped`."""
     reason: str
     pid: int | None
     restarts: int
     figures: Mapping[str, Any]
     heard_s: float | None
-    """Seconds since its last heartbeat."""
+    """Seconds since the last heartbeat."""
     rate_hz: float | None = None
-    """Frames captured, or new pictures shown, a second over the last `RATE_S`."""
+    """Captured frames or new pictures per second over the last `RATE_S`."""
     lost: bool = False
-    """A capture process whose source has given no frames for `LOST_AFTER_S`."""
+    """True if the source of a capture process gave no frames for `LOST_AFTER_S`."""
 
 
 class Rate:
-    """Rate of a count that is told now and then."""
+    """Rate of a counter that is sampled irregularly."""
 
     def __init__(self, over_s: float = RATE_S) -> None:
         self._over_s = over_s
         self._told: deque[tuple[float, int]] = deque()
 
     def tell(self, count: int, now_s: float) -> None:
-        """Note the count at a moment. One that is smaller than before is that of a new process: the rate begins anew."""
+        """Add a sample. A smaller count than before is from a new process and restarts the
+        measurement."""
         if self._told and count < self._told[-1][1]:
             self._told.clear()
         self._told.append((now_s, count))
@@ -93,12 +97,12 @@ class Rate:
             self._told.popleft()
 
     def clear(self) -> None:
-        """Forget what was told."""
+        """Discard all samples."""
         self._told.clear()
 
     @property
     def hz(self) -> float | None:
-        """Counts a second; None until there are two moments at least half a second apart."""
+        """Return counts per second, or None until the samples span half a second."""
         if not self._told:
             return None
         (first_s, first), (last_s, last) = self._told[0], self._told[-1]
@@ -106,7 +110,7 @@ class Rate:
 
 
 class ManagedProcess:
-    """Keeps one process of a stream running until it is closed."""
+    """Supervisor of one stream process; keeps it running until closed."""
 
     def __init__(
         self,
@@ -125,17 +129,17 @@ class ManagedProcess:
         self._heartbeat: dict[str, Any] | None = None
         self._heard_s = self._well_s = 0.0
         self._shown: tuple[int, float] = 0, 0.0
-        """How much was published, and since when that is so."""
+        """Number of published pictures, and the time since which it is unchanged."""
         self._rate = Rate()
         self._gone_s: float | None = None
-        """Since when the source has given no frames."""
+        """Time since which the source has given no frames."""
         self._lost = False
-        """The loss of the source was told, and its return not yet."""
+        """True after a reported loss of the source, until its recovery is reported."""
         self._tasks: list[asyncio.Task[None]] = []
 
     @property
     def state(self) -> ProcessState:
-        """What is known now."""
+        """Return the current state."""
         identity, heartbeat = self._identity, self._heartbeat
         restarts = self._restarts.total
         if identity is None:
@@ -157,25 +161,30 @@ class ManagedProcess:
 
     @property
     def causes(self) -> Mapping[str, int]:
-        """How often the process has ended, by cause."""
+        """Return the number of process ends by cause."""
         return dict(self._causes)
 
     @property
     def measures(self) -> Mapping[str, Any]:
-        """What its newest heartbeat tells for Prometheus."""
+        """Return the Prometheus measures of the newest heartbeat."""
         heartbeat = self._heartbeat
         told = None if heartbeat is None else heartbeat.get("measures")
         return told if isinstance(told, dict) else {}
 
     def open(self) -> None:
-        """Take over the process that runs, or start one, and keep it running."""
+        """Adopt the running process or start one, and keep it running."""
         if not self._tasks:
             self._gone_s, self._lost = None, False
             each = (self._keep, self._listen, self._ping)
             self._tasks = [asyncio.create_task(task(), name=f"{self._spec.name} {self._role}") for task in each]
 
     async def close(self, *, stop: bool, reason: str) -> None:
-        """Look after it no more; with `stop` it is asked to finish, and killed when it does not."""
+        """Stop supervising the process.
+
+        Args:
+            stop: also end the process, by SIGKILL if it does not finish in time.
+            reason: text for the log and the state.
+        """
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
@@ -193,13 +202,18 @@ class ManagedProcess:
         self._say("stopped", reason, identity)
 
     async def restart(self, reason: str) -> None:
-        """Have the process finish; another one follows."""
+        """End the process; the supervision starts a new one."""
         if self._identity is not None:
             log.info("%s %s is started again: %s", self._spec.name, self._role, reason)
             await self._end(self._identity)
 
     async def command(self, command: str, timeout_s: float, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Send a command. Raises NoAnswer and CommandRefused."""
+        """Send a command to the process.
+
+        Raises:
+            NoAnswer: if the process does not run or does not answer.
+            CommandRefused: if the process refuses the command.
+        """
         if self._identity is None:
             raise NoAnswer(f"the {self._role} process of {self._spec.name} does not run: {self._down[1]}")
         return await ask_async(self._folder.commands(self._role), command, timeout_s=timeout_s, **arguments)
@@ -213,7 +227,7 @@ class ManagedProcess:
                 how = "it ended at once"
             self._identity, self._heartbeat = None, None
             if self._folder.record(self._role) is not None:
-                continue  # another one was there before, and serves the stream
+                continue  # another process already serves this role; adopt it
             self._folder.clean(self._role)
             well_s = time.monotonic() - self._well_s if self._well_s else 0.0
             wait_s = self._restarts.ended(well_s)
@@ -225,7 +239,8 @@ class ManagedProcess:
             await asyncio.sleep(wait_s)
 
     async def _running(self) -> ProcessIdentity | None:
-        """The process that serves the part: the one that runs already, where it was asked for the same, or a new one."""
+        """Return the process for this role: the running one if its settings match, otherwise a new
+        one. None if the start failed."""
         record = self._folder.record(self._role)
         digest = self._spec.digest(self._role)
         if record is not None and record.spec_digest != digest:
@@ -265,7 +280,11 @@ class ManagedProcess:
         return {"CUDA_VISIBLE_DEVICES": str(gpu)} if self._role == "engine" and gpu is not None else {}
 
     async def _watched(self, identity: ProcessIdentity) -> str:
-        """Wait for the end of the process, and bring it about where it hangs; how it ended."""
+        """Wait for the end of the process; kill it if it hangs.
+
+        Returns:
+            Description of how it ended.
+        """
         ended = asyncio.create_task(identity.ended())
         killed: str | None = None
         looked_s = time.monotonic()
@@ -274,7 +293,7 @@ class ManagedProcess:
                 await asyncio.wait({ended}, timeout=LOOK_S)
                 now_s = time.monotonic()
                 if now_s - looked_s > LOOK_S + PAUSED_S:
-                    self._heard_s = now_s  # nobody has listened meanwhile
+                    self._heard_s = now_s  # the supervisor was suspended and could not receive heartbeats
                     self._shown = self._shown[0], now_s
                 looked_s = now_s
                 hangs = None if killed or ended.done() else self._hangs(now_s)
@@ -287,7 +306,7 @@ class ManagedProcess:
         return killed or how or self._last_reason() or "it ended"
 
     def _hangs(self, now_s: float) -> str | None:
-        """Why the process is taken to hang; None where it is well."""
+        """Return the reason why the process counts as hung, or None."""
         limits = self._spec.limits
         silent_s = now_s - self._heard_s
         if self._heartbeat is None:
@@ -305,7 +324,7 @@ class ManagedProcess:
         return str(heartbeat.get("reason")) if heartbeat is not None and ended else None
 
     async def _listen(self) -> None:
-        """Take the heartbeats of whichever process serves the part."""
+        """Receive heartbeats and keep those of the current process."""
         socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), self._folder.status(self._role), waiting=16)
         try:
             while True:
@@ -335,7 +354,7 @@ class ManagedProcess:
             self._look_at_source(str(said.get("state")), str(said.get("reason")), now_s)
 
     def _look_at_source(self, state: str, reason: str, now_s: float) -> None:
-        """Tell once when the source is lost, and once when it gives frames again."""
+        """Report loss and recovery of the source once each."""
         if state == "live":
             self._gone_s = None
             if self._lost:
@@ -349,17 +368,18 @@ class ManagedProcess:
                 self._say("lost", reason, self._identity)
 
     async def _ping(self) -> None:
-        """Tell the process that somebody looks after it."""
+        """Ping the process periodically, so that it does not end itself as an orphan."""
         while True:
             await asyncio.sleep(PING_S)
             if self._identity is not None and self._heartbeat is not None:
                 try:
                     await ask_async(self._folder.commands(self._role), "ping")
                 except BusError as error:
-                    log.info("%s %s: %s", self._spec.name, self._role, error)  # its heartbeats say whether it is well
+                    # hang detection relies on the heartbeats, not on this ping
+                    log.info("%s %s: %s", self._spec.name, self._role, error)
 
     async def _end(self, identity: ProcessIdentity) -> None:
-        """Have a process finish, or kill it when it does not within its time."""
+        """Ask a process to finish; kill it after `drain_s`."""
         identity.signal(signal.SIGTERM)
         identity.signal(signal.SIGCONT)
         if not await identity.ended(self._spec.limits.drain_s):

@@ -1,4 +1,4 @@
-"""How a process has ended, in words."""
+"""Descriptions and causes of process ends."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from services.supervisor.exit_codes import NO_USE
 
 _TAIL_BYTES = 4096
 _LOGGED = re.compile(r"[\d-]+ [\d:,]+ (?P<level>[A-Z]+) [\w.]+: ")
-"""What the processes' log puts before a message."""
+"""Log line prefix of the stream processes."""
 
 
 def ended_how(status: int) -> str:
-    """From what `os.waitpid` gives."""
+    """Describe a wait status from `os.waitpid`."""
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         return f"killed by {signal.Signals(number).name}"
@@ -24,7 +24,7 @@ def ended_how(status: int) -> str:
 
 
 def status_of_child(pid: int) -> str | None:
-    """How a process that this one has started ended; None where another one has started it, or it has not ended."""
+    """Describe the end of a child process. None if the process still runs or is not a child."""
     try:
         found, status = os.waitpid(pid, os.WNOHANG)
     except ChildProcessError:
@@ -33,12 +33,12 @@ def status_of_child(pid: int) -> str | None:
 
 
 def is_of_no_use(how: str | None) -> bool:
-    """Whether the process would end in the same way again."""
+    """Return True if a restart would end in the same way."""
     return how == f"exit code {NO_USE}"
 
 
 def cause_of(how: str) -> str:
-    """An end in one or two words, of which there are few: for metrics."""
+    """Map the description of an end to one of few causes, for metric labels."""
     if how.endswith("it was killed"):
         return "hung"
     if how.startswith("killed by "):
@@ -49,7 +49,7 @@ def cause_of(how: str) -> str:
 
 
 def last_words(log: Path) -> str:
-    """The sentence of the last error that a process has logged, else its last line; empty where there is none."""
+    """Return the last logged error of a process, otherwise its last log line; empty without a log."""
     try:
         with open(log, "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))

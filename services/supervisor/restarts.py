@@ -1,4 +1,4 @@
-"""When a process that has ended is started again."""
+"""Delays before restarts of ended processes."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ SETTLED_S = 2.0
 
 
 class Restarts:
-    """Counts ends in a row. The first is followed by a new start at once, each further one by a longer wait, up to a cap: a stream is never given up,
-    since what is missing, a camera or a GPU, may come back.
+    """Restart back-off. The first restart is immediate; further ones wait longer, up to a cap.
+    Restarts never stop, because a missing camera or GPU may return.
 
-    The cap is low for a process that has worked, however shortly: something ends it from outside, or something in the stream does now and then,
-    and whoever watches waits for its pictures. One that never gets as far would only take the machine from the others.
+    The cap is low for a process that has worked, even briefly: the cause is external or occasional,
+    and viewers wait for pictures. A process that never worked would only take resources from the
+    others, so its cap is higher.
     """
 
     def __init__(
@@ -23,16 +24,30 @@ class Restarts:
         settled_s: float = SETTLED_S,
         most_worked_s: float = MOST_WORKED_S,
     ) -> None:
-        """settled_s: a process that was well for so long has worked; its end is the first one again."""
+        """Set the delays, all in seconds.
+
+        Args:
+            first_s: delay before the second restart in a row; doubles with each further one.
+            most_s: cap for processes that never worked.
+            settled_s: time in a good state after which the next end counts as the first in a row.
+            most_worked_s: cap for processes that worked.
+        """
         self._first_s, self._most_s, self._settled_s = first_s, most_s, settled_s
         self._most_worked_s = most_worked_s
         self.in_a_row = 0
         self.never_well = 0
-        """The newest of them that ended without having been well."""
+        """Consecutive ends without reaching a good state."""
         self.total = 0
 
     def ended(self, well_s: float) -> float:
-        """A process has ended that was well for so many seconds; the seconds to wait before the next start."""
+        """Count an end.
+
+        Args:
+            well_s: seconds for which the process was in a good state.
+
+        Returns:
+            Seconds to wait before the restart.
+        """
         self.total += 1
         self.in_a_row = 1 if well_s >= self._settled_s else self.in_a_row + 1
         self.never_well = 0 if well_s > 0 else self.never_well + 1

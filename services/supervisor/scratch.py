@@ -1,4 +1,5 @@
-"""Temporary files of an engine process, in a folder that goes with it: at its end, or after a kill with the next engine or the service's end."""
+"""Temporary folder of an engine process, removed at its end. After a kill, the next engine or the
+service's end removes it."""
 
 from __future__ import annotations
 
@@ -13,12 +14,13 @@ from pathlib import Path
 
 PREFIX = "intrasplat-engine-"
 NEW_S = 2.0
-"""Age below which a folder may belong to a process that has not locked it yet."""
+"""Age in seconds below which a folder may belong to a process that has not locked it yet."""
 
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Make a folder, and have every temporary file of this process made in it. Folders of engines that were killed are removed first."""
+    """Create a temporary folder and make it the default for this process. Folders of killed engines
+    are removed first."""
     remove_dead()
     before = tempfile.tempdir
     folder = Path(tempfile.mkdtemp(prefix=PREFIX))
@@ -34,12 +36,16 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def remove_dead() -> list[Path]:
-    """Remove the folders of this user that no process holds. Returns them."""
+    """Delete this user's folders that no process holds.
+
+    Returns:
+        The deleted folders.
+    """
     removed = []
     for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
         try:
             held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-        except OSError:  # of another user, a link, or removed meanwhile
+        except OSError:  # owned by another user, a symbolic link, or already removed
             continue
         try:
             found = os.fstat(held)

@@ -1,4 +1,4 @@
-"""What an engine shows, published with what is known about it."""
+"""Main picture output of an engine, published with its metadata."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from services.bus.pictures import PicturePublisher
 
 Shows = Literal["live", "model"]
 SCORES = ("psnr_db", "previous_frame_db", "next_frame_db")
-"""Tissue PSNR of the frame that was scored last: of the displayed picture (a training error), of the previous raw frame shown instead, and
-of the newest predicted frame, before the model was trained on it."""
+"""Score names. Tissue PSNR of the last scored frame: of the displayed picture (a training error),
+of the previous raw frame as a baseline, and of the newest predicted frame before training on it."""
 
 
 class Screen:
-    """The one place from which an engine's pictures go out, so that each is of one model as a whole.
+    """Single publisher of an engine's pictures, so each picture is rendered from one model.
 
-    It shows the live reconstruction or a finished model. From one to the other there is no moment without pictures: what was shown goes on
-    until the first picture of the other is there.
+    The screen shows the live reconstruction or a finished model. On a switch, the old pictures
+    continue until the first picture of the new kind.
     """
 
     def __init__(self, publisher: PicturePublisher) -> None:
@@ -35,43 +35,56 @@ class Screen:
         self._wanted: Shows = "live"
         self._shown: Shows = "live"
         self.pictures = 0
-        """New pictures that were shown."""
+        """Number of new pictures."""
         self.published = 0
-        """With those that were shown again, with another state or age."""
+        """Number of publications, including repeats of a picture with another state or age."""
         self.ages = Durations()
-        """Of new pictures, when they were shown."""
+        """Ages of new pictures at publication."""
         self._last: dict[str, Any] = {}
         self._scores: dict[str, float | None] = dict.fromkeys(SCORES)
 
     @property
     def wanted(self) -> Shows:
-        """What is to be shown."""
+        """Return the requested kind of picture."""
         return self._wanted
 
     def want(self, shows: Shows) -> None:
-        """Show the one or the other from its next picture on."""
+        """Switch to a kind of picture; takes effect with its next picture."""
         with self._lock:
             self._wanted = shows
 
     def show(self, shown: ShownPicture) -> bool:
-        """A picture of the live reconstruction; False when it is not shown."""
+        """Publish a picture of the live reconstruction.
+
+        Returns:
+            False if it was not published.
+        """
         return self.publish("live", {**header_of(shown), **self._scores}, shown.image)
 
     def scored(self, scored: ScoredFrame) -> None:
-        """Take the scores of the newest scored frame, which the headers of the following pictures state."""
+        """Store the scores of the newest scored frame for the following picture headers."""
         found = {
             "psnr_db": scored.quality.psnr_tissue_db,
             "previous_frame_db": scored.previous_frame_db,
             "next_frame_db": scored.next_frame_db,
         }
         known = {name: round(value, 3) if math.isfinite(value) else None for name, value in found.items()}
-        # Only some frames are predicted: the last prediction's score stays until the next one.
+        # Only some frames are predicted, so the last prediction score is kept until the next one.
         if known["next_frame_db"] is None:
             known["next_frame_db"] = self._scores["next_frame_db"]
         self._scores = known
 
     def publish(self, shows: Shows, header: Mapping[str, Any], image: NDArray[np.uint8]) -> bool:
-        """Publish a picture; False, without effect, when the other one is shown by now."""
+        """Publish a picture.
+
+        Args:
+            shows: kind of the picture.
+            header: metadata of the picture.
+            image: RGB uint8 [H, W, 3].
+
+        Returns:
+            False if the other kind is already displayed; nothing is published then.
+        """
         with self._lock:
             if shows != self._wanted and self._shown != shows:
                 return False
@@ -86,13 +99,13 @@ class Screen:
             return True
 
     def figures(self) -> dict[str, Any]:
-        """For the heartbeats."""
+        """Return picture counts and the last header for the heartbeats."""
         with self._lock:
             return {"pictures": self.pictures, "published": self.published, "picture": dict(self._last)}
 
 
 def header_of(shown: ShownPicture) -> dict[str, Any]:
-    """What is said of a picture of the live reconstruction (docs/design/processes.md)."""
+    """Return the header of a live picture (docs/design/processes.md)."""
     rendered = shown.rendered
     content = rendered.content or rendered.frame
     pose = rendered.frame.pose

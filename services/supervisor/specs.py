@@ -1,4 +1,4 @@
-"""What a stream is asked for."""
+"""Specification models of streams and their processes."""
 
 from __future__ import annotations
 
@@ -15,63 +15,65 @@ StreamName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,31
 
 
 class _Strict(BaseModel):
-    """Base class of the specifications: no unknown names, and no value that pydantic would convert, such as true for the number 1."""
+    """Base class of the specifications. Rejects unknown fields and type conversions, such as true
+    for the number 1."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class SourceSpec(_Strict):
-    """Where a stream's frames come from, and what is done to them in the capture process."""
+    """Source of a stream and the processing in the capture process."""
 
     address: Annotated[str, StringConstraints(min_length=1, max_length=4096)]
-    """As `intrasplat live` takes it."""
+    """Source address in the format of `intrasplat live`."""
     scale: float = Field(default=1.0, gt=0, le=4)
     fps: float | None = Field(default=None, gt=0, le=1000)
-    """Play a recording at this rate in place of its own."""
+    """Frame rate for playing a recording, in place of its own."""
     loop: bool = True
-    """Play a recording over and over."""
+    """Play a recording repeatedly."""
 
 
 class EngineSpec(_Strict):
-    """How a stream is reconstructed."""
+    """Reconstruction settings of a stream."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     gpu: int | None = Field(default=None, ge=0, le=1023)
-    """Which GPU (`CUDA_VISIBLE_DEVICES`); None: whichever is the first."""
+    """GPU index (`CUDA_VISIBLE_DEVICES`). None uses the first GPU."""
     engine_scale: float | None = Field(default=None, gt=0, le=1)
-    """Size of what is reconstructed beside the stream's pictures. None: the whole, and on a CPU what this machine keeps up with
-    (`services.supervisor.engine_size`)."""
+    """Scale of the reconstruction relative to the stream's pictures. None means full size on a GPU;
+    on a CPU the engine measures a size that keeps up (`services.supervisor.engine_size`)."""
     field: str = "auto"
     renderer: str = "alpha"
     seed: int = Field(default=0, ge=0, lt=2**31)
     budget_ms: float | None = Field(default=None, gt=0, le=10_000)
     tool_mask: str = "builtin"
     depth: Annotated[str, StringConstraints(min_length=1, max_length=4096)] = "auto"
-    """Where depth comes from, as `intrasplat live` takes it."""
+    """Depth source in the format of `intrasplat live`."""
     eyes: Literal["left", "both"] = "left"
-    """Which pictures of a stereo scope are trained on."""
+    """Pictures of a stereo endoscope used for training."""
     poses: Literal["given", "estimated"] = "given"
-    """Where the scope is: as the frames say, or as is estimated from the pictures."""
+    """Endoscope pose: taken from the frames, or estimated from the pictures."""
     out_of_body: Literal["withhold", "off"] = "withhold"
 
 
 class ProcessLimits(_Strict):
-    """How long processes may take, and how long they stay by themselves."""
+    """Time limits of stream processes, in seconds."""
 
     orphan_after_s: float = Field(default=600.0, gt=0)
-    """A process that no supervisor asks for anything ends after so long."""
+    """Time without supervisor requests after which a process ends itself."""
     drain_s: float = Field(default=10.0, gt=0)
-    """From being asked to stop to being killed."""
+    """Time from a stop request to the kill."""
     start_s: float = Field(default=120.0, gt=0)
-    """From the start of a process to its first heartbeat."""
+    """Time from the process start to the first heartbeat."""
     heartbeat_s: float = Field(default=3.0, gt=0)
-    """A process that says nothing for so long does not work any more."""
+    """Time without heartbeats after which a process counts as hung."""
     hung_s: float = Field(default=10.0, gt=0)
-    """Nor does an engine that has shown something and publishes nothing for so long: it would at least repeat its last picture with another age."""
+    """Time without publications after which an engine counts as hung, once it has shown a picture.
+    A working engine at least repeats its last picture."""
 
 
 class StreamSpec(_Strict):
-    """A stream. Raises pydantic's ValidationError for what cannot be one."""
+    """Specification of a stream. Construction raises pydantic's ValidationError for invalid values."""
 
     name: StreamName
     source: SourceSpec
@@ -79,7 +81,7 @@ class StreamSpec(_Strict):
     limits: ProcessLimits = ProcessLimits()
 
     def part(self, role: Role) -> dict[str, Any]:
-        """What one of its processes has to know."""
+        """Return the specification of one process."""
         about = self.source if role == "capture" else self.engine
         return {
             "stream": self.name,
@@ -89,18 +91,19 @@ class StreamSpec(_Strict):
         }
 
     def digest(self, role: Role) -> str:
-        """Changes when that process has to be started anew."""
+        """Return a digest that changes if the process has to be restarted."""
         return hashlib.sha256(repr(sorted(self.part(role).items())).encode()).hexdigest()
 
     def write(self, role: Role, folder: StreamFolder) -> Path:
-        """Write the file for that process; it may hold a password, and only its owner may read it."""
+        """Write the specification file of a process, readable by its owner only because the address
+        may contain a password."""
         path = folder.spec(role)
         write_json(path, {**self.part(role), "digest": self.digest(role)})
         return path
 
 
 class ProcessSpec(_Strict):
-    """What a process reads from its file."""
+    """Specification that a process reads from its file."""
 
     stream: StreamName
     role: Role
@@ -111,7 +114,11 @@ class ProcessSpec(_Strict):
 
     @staticmethod
     def read(path: Path) -> ProcessSpec:
-        """From a file that `StreamSpec.write` wrote. Raises InvalidSetting."""
+        """Read a file written by `StreamSpec.write`.
+
+        Raises:
+            InvalidSetting: if the file is unreadable or invalid.
+        """
         try:
             return ProcessSpec.model_validate(read_json(path))
         except OSError as error:
@@ -123,7 +130,15 @@ class ProcessSpec(_Strict):
 
 
 def assigned(specs: list[StreamSpec], gpus: int) -> list[StreamSpec]:
-    """The streams, each on CUDA with a GPU of its own as long as there are enough; those that name one keep it."""
+    """Assign GPUs to CUDA streams, least loaded first. Streams that name a GPU keep it.
+
+    Args:
+        specs: the streams.
+        gpus: number of GPUs.
+
+    Returns:
+        The streams with their GPUs.
+    """
     if gpus < 1:
         return specs
     load = [0] * gpus

@@ -1,4 +1,4 @@
-"""A stream: its capture process and its engine process, kept running."""
+"""Supervision of a stream: its capture process and its engine process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from services.supervisor.specs import StreamSpec
 
 @dataclass(frozen=True)
 class StreamState:
-    """What is known of a stream now."""
+    """Current state of a stream."""
 
     name: str
     capture: ProcessState
@@ -24,14 +24,15 @@ class StreamState:
 
 
 class StreamSupervisor:
-    """Keeps the processes of one stream running, in the event loop of the process that makes it; loads no torch.
+    """Supervisor of one stream's processes, run in the creator's event loop. Loads no torch.
 
         stream = StreamSupervisor(spec, RuntimeFolder(path), on_event=audit)
-        await stream.start()      # adopts what runs already
+        await stream.start()      # adopts running processes
         stream.state()
-        await stream.stop("…")    # or detach(): the processes go on, for the next supervisor to adopt
+        await stream.stop("…")    # or detach(): the processes continue for the next supervisor
 
-    Raises RuntimeFolderUnusable.
+    Raises:
+        RuntimeFolderUnusable: if the runtime folder cannot be used.
     """
 
     def __init__(
@@ -42,7 +43,15 @@ class StreamSupervisor:
         start: Start | None = None,
         on_event: Callable[[StreamEvent], None] = lambda event: None,
     ) -> None:
-        """start: how processes are started, `ByLauncher` for a quick return of engines, shared by the streams of a runtime folder."""
+        """Create a supervisor; `start` begins the supervision.
+
+        Args:
+            spec: the stream.
+            runtime: runtime folder of the service.
+            start: process starter. `ByLauncher` restarts engines quickly and is shared by the
+                streams of a runtime folder.
+            on_event: called for each state change of a process.
+        """
         self.spec = spec
         self._runtime = runtime
         self.folder: StreamFolder = runtime.stream(spec.name)
@@ -51,42 +60,48 @@ class StreamSupervisor:
         self._engine = ManagedProcess(spec, "engine", self.folder, start, on_event)
 
     async def start(self) -> None:
-        """Adopt the processes that run with the same settings, start those that do not, and look after them."""
+        """Adopt running processes with the same settings, start the missing ones, and supervise
+        them."""
         self.folder = self._runtime.stream(self.spec.name)
         self._capture.open()
         self._engine.open()
 
     async def stop(self, reason: str = "it was asked for") -> None:
-        """Have both processes finish; nothing of the stream is left."""
+        """End both processes and remove the stream's runtime folder."""
         await self._engine.close(stop=True, reason=reason)
         await self._capture.close(stop=True, reason=reason)
         if self.folder.path.exists():
             self.folder.remove()
 
     async def detach(self, reason: str = "the control plane ends") -> None:
-        """Look after the processes no more; they go on."""
+        """Stop supervising; the processes continue."""
         await asyncio.gather(*(each.close(stop=False, reason=reason) for each in (self._engine, self._capture)))
 
     async def restart(self, role: Role, reason: str = "it was asked for") -> None:
-        """Have a process finish and start it again."""
+        """Restart one process."""
         await self._process(role).restart(reason)
 
     def state(self) -> StreamState:
-        """What is known now."""
+        """Return the current state."""
         return StreamState(self.spec.name, self._capture.state, self._engine.state)
 
     def measures(self, role: Role) -> Mapping[str, Any]:
-        """What a process tells for Prometheus."""
+        """Return the Prometheus measures of a process."""
         return self._process(role).measures
 
     def causes(self, role: Role) -> Mapping[str, int]:
-        """How often a process has ended, by cause."""
+        """Return the number of process ends by cause."""
         return self._process(role).causes
 
     async def command(
         self, role: Role, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any
     ) -> dict[str, Any]:
-        """Send a command to a process (docs/design/processes.md lists them). Raises NoAnswer and CommandRefused."""
+        """Send a command to a process (docs/design/processes.md lists them).
+
+        Raises:
+            NoAnswer: if the process does not run or does not answer.
+            CommandRefused: if the process refuses the command.
+        """
         return await self._process(role).command(command, timeout_s, arguments)
 
     def _process(self, role: Role) -> ManagedProcess:

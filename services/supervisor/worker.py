@@ -1,4 +1,5 @@
-"""What the capture and the engine process have in common: one of them a stream, heartbeats, commands, an orderly end, an end without a supervisor."""
+"""Runtime of capture and engine processes: exclusive role, heartbeats, commands, orderly stop, and
+self-termination without a supervisor."""
 
 from __future__ import annotations
 
@@ -23,16 +24,24 @@ MEASURED_EVERY_S = 1.0
 
 
 class Worker:
-    """This process as part of a stream, while entered.
+    """Context manager that runs this process in its role.
 
-    `say` sets what the heartbeats tell; `stop_requested` answers whether the process is to finish: after a command, after a signal, or when no
-    supervisor has asked for anything in `orphan_after_s`. One that does not finish within `drain_s` is ended.
+    `say` sets the state in the heartbeats. `stop_requested` returns True after a stop command, a
+    signal, or `orphan_after_s` without supervisor requests. A process that does not finish within
+    `drain_s` is terminated.
 
-    Raises AlreadyRunning where another process serves this part.
+    Raises:
+        AlreadyRunning: if another process serves this role.
     """
 
     def __init__(self, folder: StreamFolder, spec: ProcessSpec, handlers: Mapping[str, Handler] | None = None) -> None:
-        """handlers: commands beside `ping` and `stop`."""
+        """Prepare the runtime.
+
+        Args:
+            folder: runtime folder of the stream.
+            spec: specification of this process.
+            handlers: commands in addition to `ping` and `stop`.
+        """
         self.folder, self.spec, self.role = folder, spec, spec.role
         own: dict[str, Handler] = {"ping": lambda _: {"pid": os.getpid()}, "stop": self._told_to_stop}
         self._handlers = {**own, **(handlers or {})}
@@ -74,11 +83,12 @@ class Worker:
         os.close(self._lock)
 
     def take(self, handlers: Mapping[str, Handler]) -> None:
-        """Answer these commands, too."""
+        """Add command handlers."""
         self._handlers.update(handlers)
 
     def say(self, state: str, reason: str) -> None:
-        """What the process is doing, and why, in a sentence."""
+        """Set the state and its reason for the heartbeats; a changed state is logged and sent at
+        once."""
         with self._saying:
             changed = self._said["state"] != state or (state == "starting" and self._said["reason"] != reason)
             self._said = {"state": state, "reason": reason[:2000]}
@@ -87,19 +97,19 @@ class Worker:
             self._heartbeats.say_now()
 
     def tell_figures(self, part: str, figures: Callable[[], Mapping[str, Any]]) -> None:
-        """What each heartbeat tells of a part of the process besides; called in its thread."""
+        """Add figures to each heartbeat. `figures` is called in the heartbeat thread."""
         self._figures[part] = figures
 
     def tell_measures(self, part: str, measures: Callable[[], Mapping[str, Any]]) -> None:
-        """What heartbeats tell for Prometheus besides: made once a second."""
+        """Add Prometheus measures to the heartbeats. `measures` is called once per second."""
         self._measures[part] = measures
 
     def stop_requested(self) -> bool:
-        """Whether the process is to finish what it has and to end."""
+        """Return True if the process should finish."""
         return self._stop.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Wait; True at once when the process is to end."""
+        """Wait for a time in seconds. Returns True as soon as a stop is requested."""
         return self._stop.wait(seconds)
 
     def request_stop(self, reason: str) -> None:
@@ -143,7 +153,15 @@ class Worker:
 
 
 def stream_folder_of(spec_file: Any, role: Role) -> tuple[StreamFolder, ProcessSpec]:
-    """The folder of the stream and the specification, from the specification's file. Raises InvalidSetting and RuntimeFolderUnusable."""
+    """Read the specification file of a process.
+
+    Returns:
+        The stream's runtime folder and the specification.
+
+    Raises:
+        InvalidSetting: if the file is invalid or for another role.
+        RuntimeFolderUnusable: if the runtime folder cannot be used.
+    """
     from pathlib import Path
 
     from gsplat_core.errors import InvalidSetting
