@@ -1,1 +1,2 @@
-"""Replays as jobs: kept in the database, claimed with a lease, run by a bounded pool or on Ray, each result published once."""
+"""Replay jobs: stored in the database, claimed with a lease, run by a process pool or on Ray, each
+result published once."""

@@ -1,4 +1,5 @@
-"""A folder of recordings as one batch, without a service: jobs in an SQLite file beside the results, and a pool in this process."""
+"""Batch replay of a folder of recordings without a service. Jobs are in an SQLite file next to the
+results, and the pool runs in this process."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ DATABASE = BATCH_DATABASE
 WHO = "batch"
 SAY_S = 0.5
 RECORDINGS = ".recordings.json"
-"""Fingerprints of the recordings, by name."""
+"""File with the fingerprints of the recordings, by name."""
 MOST_NOTES_BYTES = 1 << 26
 FINGERPRINT_BYTES = 4096
 Counts = Mapping[str, int]
@@ -38,24 +39,29 @@ Counts = Mapping[str, int]
 
 @dataclass(frozen=True)
 class Summary:
-    """What a batch has come to."""
+    """Result of a batch."""
 
     counts: Counts
     already: int
-    """Results that were there before."""
+    """Number of results from earlier runs."""
     failed: Sequence[JobRecord]
     seconds: float
     unusable: Sequence[tuple[str, str]] = ()
-    """Recordings that were not begun: their names, and why."""
+    """Names of skipped recordings, with the reason."""
 
     @property
     def is_whole(self) -> bool:
-        """Whether every recording has its result."""
+        """Return True if every recording has its result."""
         return sum(self.counts.values()) == self.counts["done"] and not self.unusable
 
 
 class Batch:
-    """The recordings of a folder and their results in another one. Raises InvalidSetting where that makes no sense, StoreUnavailable."""
+    """Batch of one folder of recordings and one output folder.
+
+    Raises:
+        InvalidSetting: if the folders do not fit.
+        StoreUnavailable: if the output folder or the database cannot be used.
+    """
 
     def __init__(self, folder: Path, out: Path, options: ReplayOptions) -> None:
         recordings, self.unusable = recordings_in(folder)
@@ -69,7 +75,15 @@ class Batch:
     def run(
         self, runner: Runner, settings: PoolSettings, say: Callable[[Counts], None], stop_requested: Callable[[], bool]
     ) -> Summary:
-        """Work until every recording has its result or has failed, or until a stop is asked for; what runs then is begun anew another time."""
+        """Run until every recording has a result or has failed, or a stop is requested. Interrupted
+        jobs restart in a later run.
+
+        Args:
+            runner: runner of the attempts.
+            settings: settings of the pool.
+            say: called with the job counts every `SAY_S`.
+            stop_requested: polled.
+        """
         began_s, said_s = time.monotonic(), 0.0
         left = True
 
@@ -91,7 +105,7 @@ class Batch:
             self._store.close()
 
     def _submit(self, recordings: Sequence[Path]) -> None:
-        """Queue what is new, and what has failed before: its recording may have been mended."""
+        """Queue new recordings, and retry failed ones because they may have been repaired."""
         known = self._known()
         self._check_same(recordings)
         self._store.retry([JobState.FAILED, JobState.CANCELLED])
@@ -110,14 +124,18 @@ class Batch:
                         " give another --out"
                     )
                 if job.state == JobState.DONE and not self._has_result(job.folder):
-                    self._store.forget(job.id)  # its result was removed: it is made anew
+                    self._store.forget(job.id)  # its result was removed: run the job again
                 else:
                     known.add(job.folder)
             before = page[-1].number
         return known
 
     def _has_result(self, name: str) -> bool:
-        """Return True for a whole result, False for none. Raises InvalidSetting for one of which files were removed."""
+        """Return True if the result is complete, False if absent.
+
+        Raises:
+            InvalidSetting: if files of the result are missing.
+        """
         folder = self._results.folder / name
         if not os.path.lexists(folder):
             return False
@@ -126,7 +144,11 @@ class Batch:
         raise InvalidSetting(f"files of the result {folder} are missing; remove that folder, and it is made anew")
 
     def _check_same(self, recordings: Sequence[Path]) -> None:
-        """Raise InvalidSetting where a recording is another one than that of its result. What is new is noted."""
+        """Compare recordings with the noted fingerprints and note new ones.
+
+        Raises:
+            InvalidSetting: if a recording with a result was replaced.
+        """
         notes = self._results.folder / RECORDINGS
         try:
             noted = json.loads(read_regular(notes, MOST_NOTES_BYTES)) if notes.exists() else {}
@@ -149,7 +171,8 @@ class Batch:
 
 
 def fingerprint_of(recording: Path) -> str:
-    """Return a digest of the names, sizes, beginnings and ends of a recording's files, which takes far less time than reading all of it."""
+    """Return a digest of the names, sizes, first and last bytes of a recording's files. Much faster
+    than hashing all content."""
     digest = hashlib.sha256()
     for path in sorted(each for each in recording.rglob("*") if each.is_file()) if recording.is_dir() else [recording]:
         try:
@@ -166,7 +189,11 @@ def fingerprint_of(recording: Path) -> str:
 
 
 def _check_no_recording(folder: Path) -> None:
-    """Raise InvalidSetting for a folder that is one recording itself, whose parts would be taken for recordings."""
+    """Check that a folder is not itself one recording, whose parts would be taken for recordings.
+
+    Raises:
+        InvalidSetting: if the folder is a recording.
+    """
     names = sorted(entry.name for entry in folder.iterdir())
     videos = [folder / name for name in names if Path(name).suffix.lower() in VIDEO_SUFFIXES and name[0] != "."]
     eyes = split_eyes(videos)
@@ -180,9 +207,13 @@ def _check_no_recording(folder: Path) -> None:
 
 
 def recordings_in(folder: Path) -> tuple[list[Path], list[tuple[str, str]]]:
-    """Return the videos and folders in a folder, by name, and those whose names cannot be used, with the reason.
+    """List the videos and folders in a folder, by name.
 
-    Raises InvalidSetting where there are none, and for a folder that is a recording itself.
+    Returns:
+        The usable recordings, and the unusable names with the reason.
+
+    Raises:
+        InvalidSetting: if there are none, or the folder is itself a recording.
     """
     if not folder.is_dir():
         raise InvalidSetting(f"{folder} is no folder; give one with recordings in it")
@@ -203,7 +234,12 @@ def recordings_in(folder: Path) -> tuple[list[Path], list[tuple[str, str]]]:
 
 
 def _check_out(out: Path, folder: Path) -> None:
-    """Raises InvalidSetting for a folder that is no batch's: results must not go among somebody's files."""
+    """Check that the output folder is empty or from an earlier batch, so results never mix with
+    other files.
+
+    Raises:
+        InvalidSetting: if it is not usable.
+    """
     inside, outside = Path(os.path.realpath(out)), Path(os.path.realpath(folder))
     if inside == outside or outside in inside.parents or inside in outside.parents:
         raise InvalidSetting(f"{out} is in, or around, the folder of the recordings; choose another --out")

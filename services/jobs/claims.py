@@ -1,7 +1,8 @@
-"""Who runs which job. A claim is a row's owner and the end of its lease; the owner alone may write the job's end.
+"""Claims on jobs. A claim is an owner and a lease end in the job's row; only the owner may record
+the job's end.
 
-Whoever is killed renews nothing, so that its jobs are free again when the lease is over. Times of leases are of the wall clock: machines that share a
-database must agree on it to a few seconds.
+The leases of a killed pool expire, so its jobs become free. Leases use wall-clock time: machines
+that share a database must agree within a few seconds.
 """
 
 from __future__ import annotations
@@ -23,26 +24,39 @@ MOST_REASON = 1000
 
 @dataclass(frozen=True)
 class Heard:
-    """What an owner learns when it renews its claims."""
+    """Result of renewing claims."""
 
     lost: frozenset[str]
-    """Jobs that it has no more: somebody else took them, or they are gone."""
+    """Jobs that this owner lost: taken over by another owner, or deleted."""
     cancelled: Mapping[str, str]
-    """Jobs that are to be ended, and who wants that."""
+    """Jobs to cancel, with the caller that requested the cancellation."""
 
 
 class Claims:
-    """The claims of one owner."""
+    """Claims of one owner (a pool)."""
 
     def __init__(
         self, database: Database, owner: str, lease_s: float, most_attempts: int, is_published: Callable[[str], bool]
     ) -> None:
-        """is_published: whether the result that belongs into a folder is there, which whoever put it there had no time to write down."""
+        """Set up the claims.
+
+        Args:
+            database: database of the jobs.
+            owner: id of the pool.
+            lease_s: length of a lease in seconds.
+            most_attempts: attempts before a job counts as failed.
+            is_published: returns True if a folder has a result. Finds results of a pool that died
+                before recording them.
+        """
         self._database, self.owner, self._lease_ms = database, owner, int(lease_s * 1000)
         self._most, self._is_published = most_attempts, is_published
 
     def take(self) -> Claimed | None:
-        """The oldest job that nobody runs; None where there is none. One that was begun too often, because all who ran it died, has failed."""
+        """Claim the oldest free job. Jobs with too many attempts are marked as failed.
+
+        Returns:
+            The job, or None.
+        """
         at_ms = _now_ms()
         free = sa.or_(
             JOBS.c.state == str(JobState.QUEUED),
@@ -69,7 +83,7 @@ class Claims:
                 return Claimed(row["id"], row["recording"], row["source"], row["folder"], dict(row["options"]), attempt)
 
     def renew(self, progress: Mapping[str, JobProgress]) -> Heard:
-        """Hold the jobs that are named for another lease, and say how far each has come."""
+        """Extend the leases of running jobs and store their progress."""
         until_ms = _now_ms() + self._lease_ms
         lost, cancelled = set(), {}
         with self._database.writing() as connection:
@@ -88,7 +102,11 @@ class Claims:
         return Heard(frozenset(lost), cancelled)
 
     def end(self, job_id: str, state: JobState, reason: str | None = None) -> bool:
-        """Write how a job ended; False where it is not this owner's any more, and nothing is written."""
+        """Record the end of a job.
+
+        Returns:
+            False if this owner has lost the job; nothing is written then.
+        """
         values: dict[str, Any] = {
             "state": str(state), "reason": reason and reason[:MOST_REASON], "owner": None, "lease_until_ms": None,
             "ended_at": now().isoformat(),
@@ -98,12 +116,17 @@ class Claims:
         return self._write(job_id, values)
 
     def give_back(self, job_id: str, *, counts: bool) -> bool:
-        """Queue a job again. counts: whether the attempt did; one that was ended together with its pool did not."""
+        """Return a job to the queue.
+
+        Args:
+            job_id: the job.
+            counts: count the attempt. An attempt that was stopped with its pool does not count.
+        """
         values = {"state": str(JobState.QUEUED), "owner": None, "lease_until_ms": None, "frames_done": 0}
         return self._write(job_id, values if counts else {**values, "attempts": JOBS.c.attempts - 1})
 
     def free(self, owners: list[str]) -> None:
-        """Queue the jobs of owners that are known to have died, in place of waiting for the end of their leases."""
+        """Requeue the jobs of dead owners without waiting for their leases."""
         values = {"state": str(JobState.QUEUED), "owner": None, "lease_until_ms": None, "frames_done": 0}
         theirs = (JOBS.c.owner.in_(owners), JOBS.c.state == str(JobState.RUNNING))
         with self._database.writing() as connection:

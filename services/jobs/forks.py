@@ -1,7 +1,8 @@
-"""Attempts as processes of this machine, each forked from one that has loaded everything.
+"""Attempts as forked processes of this machine.
 
-Loading torch takes seconds and forking milliseconds, so that every job has a process of its own, with memory of its own, and a kill ends it cleanly. The
-process that forks computes nothing, has one thread, and touches no GPU. When it dies, however, what it has forked notices by a pipe and ends.
+Importing torch takes seconds and forking takes milliseconds. Every attempt thus has its own process
+and memory, and a kill ends it cleanly. The forking process computes nothing, has one thread and
+uses no GPU. A pipe tells the forked processes when the pool dies, so they exit.
 """
 
 from __future__ import annotations
@@ -20,26 +21,28 @@ from services.jobs.task import Task
 from services.supervisor.process_end import ended_how
 
 ORPHANED = 3
-"""Exit code of a process whose pool is gone."""
+"""Exit code of a process whose pool has died."""
 
 
 def load() -> None:
-    """Load what every attempt needs; called before the first fork, in a process that has one thread."""
-    # By NVML it can be asked whether there is a GPU without using it, after which no forked process could.
+    """Import everything that attempts need. Call before the first fork, in a single-threaded
+    process."""
+    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked process
+    # could use CUDA.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     import services.jobs.work  # noqa: F401
 
     gc.collect()
-    gc.freeze()  # nobody searches what it was born with for garbage, and so it stays in shared memory
+    gc.freeze()  # excludes the imported objects from garbage collection, so their pages stay shared
 
 
 class Forks:
-    """See `Runner`. `load` was called."""
+    """Runner that forks attempts. Requires an earlier call to `load`."""
 
     def __init__(self) -> None:
         self._life_read, self._life_write = os.pipe()
         self._pids: dict[int, str] = {}
-        """The job of each process."""
+        """Job id per process."""
 
     def start(self, task: Task) -> None:
         """See `Runner`."""
@@ -62,7 +65,7 @@ class Forks:
         """See `Runner`."""
         for pid, job in self._pids.items():
             if job == job_id:
-                os.kill(pid, signal.SIGKILL)  # ours, and not waited for: the number is no other's
+                os.kill(pid, signal.SIGKILL)  # a child that was not reaped, so the id is not reused
 
     def close(self) -> None:
         """See `Runner`."""
@@ -76,7 +79,7 @@ class Forks:
 
 
 def _become(task: Task, life: int) -> NoReturn:
-    """The rest of the life of a forked process."""
+    """Run an attempt in a forked process; never returns."""
     code = 1
     try:
         os.setsid()
@@ -84,13 +87,13 @@ def _become(task: Task, life: int) -> NoReturn:
             signal.signal(number, signal.SIG_DFL)
         _print_into(task)
         threading.Thread(target=_end_with_the_pool, args=(life,), name="life", daemon=True).start()
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file with a patient's pictures in it
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a core file would contain patient images
         os.nice(task.niceness)
         from services.jobs.work import work
 
         work(task)
         code = 0
-    except BaseException:  # noqa: BLE001 - nothing of this process may go on as the pool
+    except BaseException:  # noqa: BLE001 - the forked process must never continue as the pool
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -106,6 +109,7 @@ def _print_into(task: Task) -> None:
 
 
 def _end_with_the_pool(life: int) -> None:
-    """The pipe's other end is the pool's alone: it reads as closed when the pool has ended, whichever way."""
+    """Exit when the pool has ended. Only the pool holds the pipe's write end, so a read returns
+    after its death."""
     os.read(life, 1)
     os._exit(ORPHANED)

@@ -1,5 +1,8 @@
-"""Attempts on a Ray cluster (extra `ray`). Its machines see the recordings and the results under the same paths as the pool, and have this program
-installed; what an attempt says goes through its folder, as on one machine."""
+"""Attempts on a Ray cluster (extra `ray`).
+
+All machines need this program and must see recordings and results under the same paths as the pool.
+Attempts report through their folders, as on one machine.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,11 @@ from services.private_files import keep_files_private
 from services.registry.errors import StoreUnavailable
 
 ATTEMPTS_OF_A_PROCESS = 20
-"""Then Ray starts a new one: nothing that leaks grows for ever."""
+"""Attempts after which Ray starts a new worker process, which bounds memory leaks."""
 
 
 def _attempt(values: dict[str, Any]) -> None:
-    """Runs in a process of Ray's."""
+    """Run an attempt in a Ray worker process."""
     from services.jobs.work import work
 
     keep_files_private()
@@ -25,10 +28,18 @@ def _attempt(values: dict[str, Any]) -> None:
 
 
 class OnRay:
-    """See `Runner`. Raises StoreUnavailable where there is no Ray at that address."""
+    """Runner on a Ray cluster.
+
+    Raises:
+        StoreUnavailable: if Ray is missing or does not answer.
+    """
 
     def __init__(self, address: str) -> None:
-        """address: that of a cluster's head, or `local` for one of this process."""
+        """Connect to Ray.
+
+        Args:
+            address: head of a cluster, or `local` for a cluster in this process.
+        """
         try:
             import ray
         except ImportError as error:
@@ -36,17 +47,17 @@ class OnRay:
                 "jobs.ray is set and Ray is not installed; install the extra `ray`, or leave it out"
             ) from error
         self._ray = ray
-        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # nothing is sent to anybody
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # no usage statistics are sent
         try:
             ray.init(address, log_to_driver=False, include_dashboard=False if address == "local" else None)
         except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
             raise StoreUnavailable(f"Ray at {address} cannot be used: {error}; check that it runs") from error
         self._attempts: dict[Any, str] = {}
-        """The job of each attempt."""
+        """Job id per attempt."""
 
     def start(self, task: Task) -> None:
         """See `Runner`."""
-        # An attempt is never made again by Ray: the pool does that, when it has the claim.
+        # Ray never retries an attempt; the pool does, if it still holds the claim.
         remote = self._ray.remote(
             max_retries=0, max_calls=ATTEMPTS_OF_A_PROCESS,
             num_cpus=task.threads, num_gpus=1 if task.options.get("device") == "cuda" else 0,

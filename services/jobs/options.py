@@ -1,4 +1,4 @@
-"""Options of a replay that a caller may choose: those of `intrasplat replay`, by the same names."""
+"""Replay options that a caller may choose, named as in `intrasplat replay`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DEPTH_CHOICES = ("auto", *(WITH_ADDRESS.get(name, name) for name in DEPTHS))
 
 
 class ReplayOptions(BaseModel):
-    """How a recording is replayed; what is left out is as `intrasplat replay` has it."""
+    """Replay options. Omitted options have the defaults of `intrasplat replay`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -53,12 +53,12 @@ class ReplayOptions(BaseModel):
         raise ValueError(f"there is no depth {choice!r:.60}; choose {', '.join(DEPTH_CHOICES)}")
 
     def chosen(self) -> dict[str, Any]:
-        """Those that differ from the defaults: what is kept with the job."""
+        """Return the options that differ from the defaults, as stored with the job."""
         return self.model_dump(exclude_defaults=True)
 
 
 class RemoteReplayOptions(ReplayOptions):
-    """Options of a replay that a caller of the API may choose: those that name no file of the server's machine."""
+    """Replay options for API callers, without options that name files on the server."""
 
     @field_validator("depth")
     @classmethod

@@ -1,7 +1,7 @@
-"""The pool: claims jobs, has a runner make attempts at them, and publishes what comes of it.
+"""Job pool: claims jobs, runs attempts and publishes their results.
 
-Only the pool publishes, and only what it still has a claim on; a result is put in its place by one rename, which fails where one is there. So an
-attempt whose pool died, or that lost its claim, leaves nothing behind.
+Only the pool publishes, and only while it holds the claim. One rename moves a result into place and
+fails if a result exists. An attempt whose pool died or lost its claim thus leaves no result.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from services.registry.errors import StoreUnavailable
 
 log = logging.getLogger(__name__)
 STEP_S = 0.02
-"""Between two looks at the attempts that run."""
+"""Seconds between checks of running attempts."""
 DATABASE_S = 0.5
-"""Between two questions to the database: claims are renewed with the progress, and a new job is looked for."""
+"""Seconds between database accesses: claims are renewed and new jobs are looked up."""
 AGAIN_S = 2.0
-"""After the database has not answered."""
+"""Pause in seconds after a database failure."""
 
 
 @dataclass(frozen=True)
 class PoolSettings:
-    """How a pool works."""
+    """Settings of a pool."""
 
     workers: int = 1
     threads: int = 1
-    """Of each attempt."""
+    """Threads per attempt."""
     lease_s: float = 15.0
     most_attempts: int = 5
     niceness: int = 0
@@ -44,7 +44,7 @@ class PoolSettings:
 
 
 class JobPool:
-    """A bounded number of attempts beside each other, until `run` ends. One thread."""
+    """Bounded number of concurrent attempts, managed by one thread."""
 
     def __init__(self, database: Database, results: Results, runner: Runner, settings: PoolSettings) -> None:
         pool = secrets.token_hex(8)
@@ -61,11 +61,12 @@ class JobPool:
 
     @property
     def idle_s(self) -> float:
-        """For how long there has been nothing to do."""
+        """Return the seconds since the last job ended, or 0 while jobs run."""
         return 0.0 if self._running else time.monotonic() - self._busy_s
 
     def run(self, is_over: Callable[[], bool]) -> None:
-        """Work until `is_over`, then end what runs and give it back. What the database does not take is written down as soon as it answers."""
+        """Run until `is_over` returns True, then stop running attempts and requeue their jobs.
+        Database failures are retried."""
         try:
             while not is_over():
                 try:
@@ -78,7 +79,11 @@ class JobPool:
             self._close()
 
     def step(self) -> None:
-        """Look at everything once. Raises StoreUnavailable."""
+        """Do one round: settle ended attempts, renew claims and start new attempts.
+
+        Raises:
+            StoreUnavailable: if the database does not answer.
+        """
         self._ended.update(self._runner.ended())
         for job_id, how in list(self._ended.items()):
             self._settle(*self._running[job_id], how)
@@ -91,7 +96,7 @@ class JobPool:
             self._fill()
 
     def _fill(self) -> None:
-        """Begin attempts while there are jobs and room."""
+        """Start attempts while jobs are queued and worker slots are free."""
         while len(self._running) < self._settings.workers:
             claimed = self._claims.take()
             if claimed is None:
@@ -107,13 +112,13 @@ class JobPool:
             claimed.id, claimed.source, str(folder), claimed.options,
             threads=settings.threads, niceness=settings.niceness, pack_model=settings.pack_models,
         )  # fmt: skip
-        self._database.close()  # a connection must not be shared with a process that is forked
+        self._database.close()  # a database connection must not be shared with a forked process
         self._running[claimed.id] = claimed, task
         self._runner.start(task)
         log.info("%s began, attempt %d", claimed.id, claimed.attempt)
 
     def _renew_claims(self) -> None:
-        """Renew the claims and hear what became of the jobs meanwhile."""
+        """Renew the claims; kill attempts whose job was lost or cancelled."""
         heard = self._claims.renew({job_id: task.progress() for job_id, (_, task) in self._running.items()})
         for job_id in heard.lost:
             log.warning("%s is another's now; this attempt is ended", job_id)
@@ -123,22 +128,23 @@ class JobPool:
             self._claims.end(job_id, JobState.CANCELLED, f"cancelled by {who}")
 
     def _settle(self, claimed: Claimed, task: Task, how: str) -> None:
-        """Publish what an attempt has made, or say why there is nothing."""
+        """Publish the result of an ended attempt, or record its failure."""
         self._busy_s = time.monotonic()
         outcome = task.outcome()
         if outcome is None:
-            # Its process died of something, or was killed: somebody begins anew, unless it was cancelled or begun too often.
+            # The process died or was killed: requeue, unless the job was cancelled or had too many
+            # attempts.
             if self._claims.give_back(claimed.id, counts=True):
                 log.warning("%s: its process died: %s", claimed.id, how)
         elif outcome[0] is JobState.DONE:
-            # Whoever has lost its claim must not publish any more: renewing says so.
+            # A pool that lost its claim must not publish; renewing detects the loss.
             if claimed.id not in self._claims.renew({claimed.id: task.progress()}).lost:
                 self._publish(claimed, task)
         else:
             self._claims.end(claimed.id, *outcome)
             log.info("%s is %s", claimed.id, outcome[0])
         self._workspace.remove(Path(task.folder))
-        self._searched_s -= DATABASE_S  # there is room: look for the next one at once
+        self._searched_s -= DATABASE_S  # a slot is free: look for the next job at once
 
     def _publish(self, claimed: Claimed, task: Task) -> None:
         self._results.publish(task.out, claimed.folder)

@@ -1,6 +1,9 @@
-"""The pool as a process: `python -m services.jobs.process`. Its first line of standard input is its `PoolProcess` in JSON, which may hold the password of
-a database; when the input ends, because whoever started it says so or has died, it gives its jobs back and ends. It also ends when there has been nothing
-to do for a while, and is started again when there is: what it has loaded takes memory.
+"""Job pool as a process: `python -m services.jobs.process`.
+
+The first line of standard input is its `PoolProcess` in JSON, which may hold a database password.
+When the input closes, because the server stops the pool or has died, the pool requeues its jobs and
+exits. It also exits after an idle time to free memory; the server starts a new pool when jobs are
+queued.
 """
 
 from __future__ import annotations
@@ -27,28 +30,32 @@ MOST_LINE = 1 << 16
 
 @dataclass(frozen=True)
 class PoolProcess:
-    """What the process is told."""
+    """Configuration of the pool process."""
 
     database: str
     results: str
     pool: PoolSettings = field(default_factory=PoolSettings)
     ray: str | None = None
-    """Address of a Ray cluster; None: processes of this machine."""
+    """Address of a Ray cluster; None runs local processes."""
     idle_s: float = 60.0
 
     def line(self) -> bytes:
-        """As it is written to the process."""
+        """Return the configuration as an input line."""
         return json.dumps(asdict(self)).encode() + b"\n"
 
     @classmethod
     def of_line(cls, line: str) -> PoolProcess:
-        """As it was written."""
+        """Parse an input line."""
         values: dict[str, Any] = json.loads(line)
         return cls(**{**values, "pool": PoolSettings(**values["pool"])})
 
 
 def new_runner(ray: str | None) -> Runner:
-    """What runs the attempts. Raises StoreUnavailable where Ray was asked for and cannot be used."""
+    """Create the runner.
+
+    Raises:
+        StoreUnavailable: if Ray is configured and cannot be used.
+    """
     if ray is not None:
         from services.jobs.on_ray import OnRay
 
@@ -60,7 +67,11 @@ def new_runner(ray: str | None) -> Runner:
 
 
 def main() -> int:
-    """Run until the input ends; returns the exit code."""
+    """Run until the input closes.
+
+    Returns:
+        The exit code.
+    """
     keep_files_private()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("alembic").setLevel(logging.WARNING)

@@ -1,4 +1,4 @@
-"""What callers get to know of a job."""
+"""Records of jobs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import sqlalchemy as sa
 
 
 class JobState(StrEnum):
-    """`queued` → `running` → `done`, `failed` or `cancelled`; back to `queued` where whoever ran it has died."""
+    """State of a job: `queued` → `running` → `done`, `failed` or `cancelled`. Back to `queued` if
+    the pool died."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -21,16 +22,16 @@ class JobState(StrEnum):
 
 
 OPEN = (JobState.QUEUED, JobState.RUNNING)
-"""States of jobs that have not ended."""
+"""States of unfinished jobs."""
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """A job."""
+    """Replay job."""
 
     id: str
     number: int
-    """Counts up with each job of the database."""
+    """Ascending number, unique in the database."""
     batch: str
     recording: str
     folder: str
@@ -41,11 +42,11 @@ class JobRecord:
     frames_done: int
     frames: int | None
     psnr_db: float | None
-    """Tissue PSNR of the newest displayed frame: its training error."""
+    """Tissue PSNR of the newest displayed frame (training error)."""
     previous_frame_db: float | None
-    """Tissue PSNR of the raw frame before it, shown instead."""
+    """Baseline: tissue PSNR of the previous raw frame."""
     next_frame_db: float | None
-    """Tissue PSNR of the newest frame that was predicted before it was trained on."""
+    """Tissue PSNR of the newest predicted frame, before training on it."""
     created_by: str
     created_at: str
     started_at: str | None
@@ -53,13 +54,13 @@ class JobRecord:
 
     @property
     def is_open(self) -> bool:
-        """Whether it has not ended."""
+        """Return True if the job has not ended."""
         return self.state in OPEN
 
 
 @dataclass(frozen=True)
 class Claimed:
-    """A job that one owner has for the length of a lease."""
+    """Job claimed by one owner for the length of a lease."""
 
     id: str
     recording: str
@@ -71,27 +72,27 @@ class Claimed:
 
 @dataclass(frozen=True)
 class NewJob:
-    """A recording to be replayed, and where its result goes; None: into a folder named after the job."""
+    """Recording to replay. Without `folder`, the result folder is named after the job."""
 
     recording: str
     source: str | None = None
-    """Where it lies; None: where the store of recordings has it."""
+    """Path of the recording; None looks it up in the recording store."""
     folder: str | None = None
 
 
 @dataclass(frozen=True)
 class Submission:
-    """What came of a request: one job for each recording, in order."""
+    """Result of a submission: one job per recording, in order."""
 
     batch: str
     ids: Sequence[str]
     is_new: bool = True
-    """False: an earlier request with the same idempotency key has made them."""
+    """False if an earlier request with the same idempotency key created the jobs."""
 
 
 @dataclass(frozen=True)
 class JobProgress:
-    """How far a running job has come."""
+    """Progress of a running job."""
 
     frames_done: int
     frames: int | None
@@ -101,7 +102,7 @@ class JobProgress:
 
 
 def job_record(row: sa.RowMapping) -> JobRecord:
-    """From the row."""
+    """Convert a row to a job record."""
     return JobRecord(
         id=row["id"], number=row["number"], batch=row["batch"], recording=row["recording"], folder=row["folder"],
         options=dict(row["options"]), state=JobState(row["state"]), reason=row["reason"], attempts=row["attempts"],

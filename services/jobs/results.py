@@ -25,11 +25,15 @@ FILES = {
     "reconstruction.mp4": "video/mp4",
     "model.isplat": "application/octet-stream",
 }
-"""What a result may hold that is handed out, and its type."""
+"""Downloadable result files and their content types."""
 
 
 class Results:
-    """A folder of results. Raises StoreUnavailable where it cannot be used."""
+    """Folder of results.
+
+    Raises:
+        StoreUnavailable: if the folder cannot be used.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -41,15 +45,19 @@ class Results:
             ) from error
 
     def is_published(self, folder: str) -> bool:
-        """Whether a result is there."""
+        """Return True if the result exists."""
         return (self.folder / folder / REPORT).is_file()
 
     def files(self, folder: str) -> list[str]:
-        """The files of a result that are handed out."""
+        """Return the names of the downloadable files of a result."""
         return [name for name in FILES if (self.folder / folder / name).is_file()]
 
     def publish(self, made: Path, folder: str) -> bool:
-        """Put the folder `made` in its place, by one rename; False where something is there already, which stays as it is."""
+        """Move the folder `made` into place by one rename.
+
+        Returns:
+            False if the target already exists; it stays unchanged.
+        """
         sync_folder(made)
         try:
             os.rename(made, self.folder / folder)
@@ -61,7 +69,7 @@ class Results:
         return True
 
     def remove(self, folder: str) -> None:
-        """Remove a result: from here on it is not there, even where its files are removed later."""
+        """Delete a result. It disappears at once, by a rename, before its files are deleted."""
         gone = self.folder / RUNNING / f"removed-{folder}"
         try:
             os.rename(self.folder / folder, gone)
@@ -71,7 +79,7 @@ class Results:
 
 
 class Workspace:
-    """Where one pool makes its results; removed when it is closed."""
+    """Working folder of one pool; deleted when closed."""
 
     def __init__(self, results: Results, pool: str) -> None:
         self._running = results.folder / RUNNING
@@ -81,26 +89,26 @@ class Workspace:
         fcntl.flock(self._lock, fcntl.LOCK_EX)
 
     def attempt(self, job_id: str, number: int) -> Path:
-        """A new folder for one attempt."""
+        """Create the folder of an attempt."""
         folder = self.folder / f"{job_id}-{number}"
         folder.mkdir(mode=0o700)
         return folder
 
     def remove(self, folder: Path) -> None:
-        """Remove an attempt's folder; its process has ended."""
+        """Delete the folder of an ended attempt."""
         shutil.rmtree(folder, ignore_errors=True)
 
     def close(self) -> None:
-        """Remove everything, and let go of the lock."""
+        """Delete the folder and release the lock."""
         shutil.rmtree(self.folder, ignore_errors=True)
         os.close(self._lock)
 
     def dead(self) -> list[str]:
-        """Pools that have died: nobody holds their locks."""
+        """Return the ids of dead pools, whose locks are free."""
         return [path.name for path in self._running.iterdir() if not _is_locked(path / LOCK)]
 
     def remove_dead(self, pools: list[str]) -> None:
-        """Remove what they have left."""
+        """Delete the folders of dead pools."""
         for pool in pools:
             shutil.rmtree(self._running / pool, ignore_errors=True)
 

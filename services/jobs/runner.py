@@ -1,4 +1,4 @@
-"""What runs the attempts of a pool: processes of this machine (`forks`), or Ray (`on_ray`)."""
+"""Runner interface for attempts: local processes (`forks`) or Ray (`on_ray`)."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from services.jobs.task import Task
 
 
 class Runner(Protocol):
-    """Runs tasks beside each other. An attempt says what it does in its folder (`Task`); here it only lives and ends."""
+    """Runner of concurrent tasks. Attempts report through their folder (`Task`); the runner only
+    starts and ends them."""
 
     def start(self, task: Task) -> None:
-        """Begin an attempt."""
+        """Start an attempt."""
 
     def ended(self) -> Mapping[str, str]:
-        """Attempts that have ended since this was asked last, by the job's id: how, in words."""
+        """Return the attempts that ended since the last call: job id and description of the end."""
         ...
 
     def kill(self, job_id: str) -> None:
-        """End an attempt at once; `ended` tells of it. Without effect on one that has ended."""
+        """Kill an attempt; `ended` reports it. No effect on an ended attempt."""
 
     def close(self) -> None:
-        """End all of them."""
+        """Kill all attempts."""

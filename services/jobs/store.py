@@ -1,4 +1,4 @@
-"""The store of jobs, as those see it who submit, watch and cancel them."""
+"""Job store for submission, monitoring and cancellation."""
 
 from __future__ import annotations
 
@@ -24,10 +24,20 @@ FindSource = Callable[[sa.Connection, str], Path]
 
 
 class JobStore:
-    """Jobs in the database. Synchronous; any thread may call it, and several processes may have the same one open. Raises StoreUnavailable."""
+    """Jobs in the database. Synchronous and thread-safe; several processes may open the same store.
+
+    Raises:
+        StoreUnavailable: if the database does not answer.
+    """
 
     def __init__(self, database_url: str, find_source: FindSource | None = None) -> None:
-        """find_source: where a recording lies by its name, asked in the transaction that makes the job; raises NotFound, Conflict."""
+        """Open the store and migrate its schema.
+
+        Args:
+            database_url: URL of the database.
+            find_source: returns the path of a recording by name, called in the submission's
+                transaction; raises NotFound or Conflict.
+        """
         self.database = Database(database_url, SCHEMA)
         self._find_source = find_source
         self.database.migrate()
@@ -35,9 +45,19 @@ class JobStore:
     def submit(
         self, jobs: Sequence[NewJob], options: Mapping[str, Any], by: str, idempotency_key: str | None = None
     ) -> Submission:
-        """Queue a job for each recording, all of them or none. A second request with the same key and by the same caller gets what the first one got.
+        """Queue one job per recording, all or none. A repeated request of the same caller with the
+        same key returns the first submission.
 
-        Raises NotFound and Conflict for a recording that cannot be read, Rejected for a key that came with another request.
+        Args:
+            jobs: the recordings.
+            options: replay options.
+            by: the caller, for the record.
+            idempotency_key: key of the request, or None.
+
+        Raises:
+            NotFound: if a recording does not exist.
+            Conflict: if a recording is not ready.
+            Rejected: if the key was used for a different request.
         """
         if not 1 <= len(jobs) <= MOST_AT_ONCE:
             raise Rejected(f"{len(jobs)} recordings were named; name 1 to {MOST_AT_ONCE} at once")
@@ -56,14 +76,18 @@ class JobStore:
         return Submission(batch, [row["id"] for row in rows])
 
     def get(self, job_id: str) -> JobRecord:
-        """One job. Raises NotFound."""
+        """Return one job.
+
+        Raises:
+            NotFound: if the job does not exist.
+        """
         with self.database.reading() as connection:
             return job_record(job_row(connection, job_id))
 
     def newest(
         self, count: int = 100, *, before: int | None = None, batch: str | None = None, state: str | None = None
     ) -> list[JobRecord]:
-        """Up to `count` jobs, the newest first; those whose number is under `before`."""
+        """Return up to `count` jobs, newest first, numbered below `before`."""
         query = sa.select(JOBS).order_by(JOBS.c.number.desc()).limit(count)
         for column, value in ((JOBS.c.batch, batch), (JOBS.c.state, state)):
             if value is not None:
@@ -74,7 +98,7 @@ class JobStore:
             return [job_record(row) for row in connection.execute(query).mappings()]
 
     def counts(self, batch: str | None = None) -> dict[str, int]:
-        """How many jobs are in each state, of one batch or of all."""
+        """Return the number of jobs per state, of one batch or all."""
         query = sa.select(JOBS.c.state, sa.func.count()).group_by(JOBS.c.state)
         if batch is not None:
             query = query.where(JOBS.c.batch == batch)
@@ -83,7 +107,12 @@ class JobStore:
         return {str(state): found.get(str(state), 0) for state in JobState}
 
     def cancel(self, job_id: str, by: str) -> JobRecord:
-        """Cancel a job: at once where it is queued, and within a second where it runs. Raises NotFound, Conflict for one that has ended."""
+        """Cancel a job: a queued one at once, a running one within a second.
+
+        Raises:
+            NotFound: if the job does not exist.
+            Conflict: if the job has ended.
+        """
         with self.database.writing() as connection:
             row = job_row(connection, job_id)
             state = JobState(row["state"])
@@ -100,7 +129,12 @@ class JobStore:
             return job_record(job_row(connection, job_id))
 
     def forget(self, job_id: str) -> JobRecord:
-        """Remove the row of a job that has ended; its files are the caller's. Raises NotFound, Conflict."""
+        """Delete the row of an ended job; the caller deletes its files.
+
+        Raises:
+            NotFound: if the job does not exist.
+            Conflict: if the job has not ended.
+        """
         with self.database.writing() as connection:
             record = job_record(job_row(connection, job_id))
             if record.is_open:
@@ -109,7 +143,12 @@ class JobStore:
         return record
 
     def surplus(self, max_age_s: float | None, most: int | None) -> list[tuple[str, str]]:
-        """Jobs that ended longer ago than that, and the oldest beyond so many that have ended: their ids, and why."""
+        """Return ended jobs beyond the retention limits: ids and reasons.
+
+        Args:
+            max_age_s: age in seconds to keep; None is unlimited.
+            most: number of ended jobs to keep; None is unlimited.
+        """
         ended = sa.select(JOBS.c.id, JOBS.c.ended_at).where(JOBS.c.state.not_in([str(state) for state in OPEN]))
         with self.database.reading() as connection:
             rows = connection.execute(ended.order_by(JOBS.c.ended_at.desc(), JOBS.c.number.desc())).all()
@@ -124,7 +163,11 @@ class JobStore:
         return found
 
     def retry(self, states: Sequence[JobState]) -> int:
-        """Queue jobs anew that ended in these states; returns how many."""
+        """Requeue jobs that ended in the given states.
+
+        Returns:
+            Number of jobs.
+        """
         fresh = {"state": str(JobState.QUEUED), "reason": None, "cancelled_by": None, "attempts": 0, "ended_at": None}
         with self.database.writing() as connection:
             query = sa.update(JOBS).where(JOBS.c.state.in_([str(state) for state in states]))
@@ -150,13 +193,17 @@ class JobStore:
 
 
 def uses_recording(connection: sa.Connection, recording: str) -> bool:
-    """Whether a job that has not ended reads this recording."""
+    """Return True if an unfinished job reads this recording."""
     query = sa.select(JOBS.c.id).where(JOBS.c.recording == recording, JOBS.c.state.in_([str(state) for state in OPEN]))
     return connection.execute(query.limit(1)).first() is not None
 
 
 def job_row(connection: sa.Connection, job_id: str) -> sa.RowMapping:
-    """The row of a job; raises NotFound."""
+    """Return the row of a job.
+
+    Raises:
+        NotFound: if the job does not exist.
+    """
     row = connection.execute(sa.select(JOBS).where(JOBS.c.id == job_id)).mappings().one_or_none()
     if row is None:
         raise NotFound(f"there is no replay {job_id[:40]!r}; GET /v1/replays lists those that are there")

@@ -1,4 +1,4 @@
-"""The jobs' tables. A change here needs a new file in `migrations/versions`."""
+"""Tables of the jobs. Each change here needs a new file in `migrations/versions`."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ JOBS = sa.Table(
     sa.Column("started_at", sa.String(40), nullable=True),
     sa.Column("ended_at", sa.String(40), nullable=True),
 )
-"""`folder` is where the result goes, below the folder of results: no two jobs have the same. `owner` is who runs it, until `lease_until_ms` (of the
-wall clock) at the latest; `cancelled_by` asks the owner to end it."""
+"""Jobs. `folder` is the unique result folder. `owner` is the pool that runs the job, until
+`lease_until_ms` (wall clock). `cancelled_by` asks the owner to end the job."""
 
 SUBMISSIONS = sa.Table(
     "submissions",
@@ -54,4 +54,5 @@ SUBMISSIONS = sa.Table(
     sa.Column("batch", sa.String(32), nullable=False),
     sa.Column("created_at", sa.String(40), nullable=False),
 )
-"""What was asked for under an idempotency key (its digest, with who asked), and the batch that came of it."""
+"""Submissions by idempotency key (a digest with the caller), with the request digest and the
+resulting batch."""

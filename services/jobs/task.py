@@ -1,4 +1,5 @@
-"""One attempt at a job, as its process gets it, and what the process says while it runs: in files, so that it may run anywhere."""
+"""Attempt at a job and its reports. All communication is by files, so an attempt may run on any
+machine."""
 
 from __future__ import annotations
 
@@ -17,43 +18,43 @@ PROGRESS, OUTCOME, LOG = "progress.json", "outcome.json", "log"
 
 @dataclass(frozen=True)
 class Task:
-    """What to do, and where; all of it is JSON."""
+    """Work order of an attempt; JSON-serialisable."""
 
     id: str
     source: str
     folder: str
-    """Of this attempt."""
+    """Folder of this attempt."""
     options: Mapping[str, Any] = field(default_factory=dict)
     threads: int = 1
     niceness: int = 0
     pack_model: bool = False
-    """Leave the model as one file for the registry, in place of a folder."""
+    """Pack the model into one file for the registry, in place of a folder."""
 
     @property
     def out(self) -> Path:
-        """Where the result is made."""
+        """Return the folder for the result."""
         return Path(self.folder) / OUT
 
     @property
     def log(self) -> Path:
-        """What its process prints."""
+        """Return the log file of the process."""
         return Path(self.folder) / LOG
 
     def say_progress(self, reached: JobProgress) -> None:
-        """Say how far it has come."""
+        """Report the progress."""
         _write(Path(self.folder) / PROGRESS, asdict(reached))
 
     def say_outcome(self, state: JobState, reason: str | None = None) -> None:
-        """Say how it ended, once everything is written."""
+        """Report the outcome, after everything is written."""
         _write(Path(self.folder) / OUTCOME, {"state": str(state), "reason": reason})
 
     def progress(self) -> JobProgress:
-        """How far it has come."""
+        """Return the reported progress."""
         said = _read(Path(self.folder) / PROGRESS)
         return JobProgress(**said) if said else JobProgress(0, None, None)
 
     def outcome(self) -> tuple[JobState, str | None] | None:
-        """How it ended; None where its process has not said so, because it died."""
+        """Return the reported outcome; None if the process died before reporting."""
         said = _read(Path(self.folder) / OUTCOME)
         return (JobState(said["state"]), said["reason"]) if said else None
 

@@ -1,4 +1,5 @@
-"""What the process of a job does: a replay, its reports, and its model packed. The only part of the jobs that loads torch."""
+"""Body of a job process: replay, reports and packed model. Only this module of the jobs loads
+torch."""
 
 from __future__ import annotations
 
@@ -25,14 +26,15 @@ MODEL = "model"
 
 
 def work(task: Task) -> None:
-    """Make one attempt and say how it ended. A mistake in this program is an outcome, too: the same would happen again."""
+    """Run one attempt and report its outcome. A bug is reported as failure too, because a retry
+    would fail again."""
     torch.set_num_threads(task.threads)
     try:
         settings = ReplaySettings(recording=Path(task.source), out=task.out, **task.options)
         require_shown(replay(settings, _Teller(task), report=_write_reports))
         if task.pack_model:
             _pack(task.out)
-    except Exception as error:  # noqa: BLE001 - whoever waits for this job gets to know it as its reason
+    except Exception as error:  # noqa: BLE001 - the error becomes the reason of the failed job
         traceback.print_exc(file=sys.stderr)
         sentence = user_sentence(error, [task.source])
         reason = (
@@ -44,7 +46,7 @@ def work(task: Task) -> None:
 
 
 class _Teller:
-    """Says how far a replay has come, a few times a second."""
+    """Progress callback that reports a few times per second."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._said_s = task, 0.0
@@ -55,7 +57,7 @@ class _Teller:
         if now_s - self._said_s >= SAY_S or progress.done == progress.total:
             self._said_s = now_s
             next_db = progress.next_frame_db
-            self._next_db = self._next_db if next_db is None else next_db  # the last frame has no next one
+            self._next_db = self._next_db if next_db is None else next_db  # the last frame has no prediction score
             self._task.say_progress(
                 JobProgress(
                     progress.done, progress.total, progress.psnr_tissue_db, progress.previous_frame_db, self._next_db

@@ -1,4 +1,5 @@
-"""The model registry: versioned models, which one is served, and their files (docs/service.md). `models.ModelRegistry` is its door.
+"""Model registry: versioned models, their files and the served version (docs/service.md).
+`models.ModelRegistry` is the entry point.
 
-Nothing here loads torch but `check`, which runs in a process of its own.
+Only `check` imports torch, and it runs in a separate process.
 """

@@ -1,4 +1,4 @@
-"""Which version is served: activation, rollback and deletion, each within the transaction of the only writer."""
+"""Activation, rollback and deletion of versions, each inside a write transaction."""
 
 from __future__ import annotations
 
@@ -21,11 +21,15 @@ from services.registry.rows import (
 from services.registry.tables import ACTIVATIONS, VERSIONS
 
 Reached = Callable[[str], None]
-"""Told the name of each step of a change as it is reached."""
+"""Callback that receives the name of each completed step of a change."""
 
 
 def check_activatable(record: VersionRecord) -> None:
-    """Raises Conflict unless the version is in a state from which it can be activated."""
+    """Check that a version can be activated.
+
+    Raises:
+        Conflict: if its state does not permit activation.
+    """
     if record.state not in ACTIVATABLE:
         why = f" ({record.reason})" if record.state is State.REJECTED else ""
         raise Conflict(
@@ -37,7 +41,12 @@ def check_activatable(record: VersionRecord) -> None:
 def activate(
     connection: sa.Connection, name: str, version: int, expected: int | None, by: str, reached: Reached
 ) -> Change:
-    """Let a version be served in place of `expected`. Raises NotFound, Conflict."""
+    """Activate a version in place of `expected`.
+
+    Raises:
+        NotFound: if the model or the version does not exist.
+        Conflict: if another version than `expected` is active, or the version is not activatable.
+    """
     before = _active_as_expected(connection, name, expected)
     check_activatable(version_record(version_row(connection, name, version)))
     at = now()
@@ -57,9 +66,14 @@ def activate(
 def rollback(
     connection: sa.Connection, name: str, expected: int | None, by: str, reason: str | None, reached: Reached
 ) -> Change:
-    """Serve again what was served before the active version. expected: the one that must be active; None: whichever is.
+    """Activate the previously active version again.
 
-    Raises NotFound, Conflict where nothing was active before or another version is active.
+    Args:
+        expected: version that must be active; None accepts any.
+
+    Raises:
+        NotFound: if the model does not exist.
+        Conflict: if there is no earlier version, or another version than `expected` is active.
     """
     before = model_row(connection, name)["active"]
     if expected is not None:
@@ -82,7 +96,12 @@ def rollback(
 
 
 def delete(connection: sa.Connection, name: str, version: int, by: str) -> Change:
-    """Forget a version. Raises NotFound, StillActive."""
+    """Delete a version's row and its activations.
+
+    Raises:
+        NotFound: if the version does not exist.
+        StillActive: if the version is active.
+    """
     active = model_row(connection, name)["active"]
     facts = {"by": by, "at": now(), "active_before": active, "active_after": active}
     change = _change(connection, "delete", name, version, **facts)
@@ -95,7 +114,11 @@ def delete(connection: sa.Connection, name: str, version: int, by: str) -> Chang
 
 
 def _change(connection: sa.Connection, action: str, name: str, version: int, **facts: Any) -> Change:
-    """A version as it is now, with what was done to it. Raises NotFound."""
+    """Return the change record with the version's current row.
+
+    Raises:
+        NotFound: if the version does not exist.
+    """
     return Change(**vars(version_record(version_row(connection, name, version))), action=action, **facts)
 
 

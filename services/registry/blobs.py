@@ -1,4 +1,5 @@
-"""Where uploaded files are kept: a folder, or an object store by URL (fsspec). A key names a whole file or nothing."""
+"""Storage for uploaded files: a folder, or an object store by URL (fsspec). A key refers to a
+complete file or to nothing."""
 
 from __future__ import annotations
 
@@ -16,14 +17,16 @@ from gsplat_core.io.files import beside, sync_folder
 from services.registry.errors import StoreUnavailable
 
 PART_SUFFIX = ".part"
-"""What half-written files and folders end in."""
+"""Suffix of incomplete files and folders."""
 OTHERS_UPLOAD_S = 3600.0
-"""A remote file that belongs to no version is left alone for so long: another machine may be about to name it."""
+"""Age in seconds below which unreferenced remote files are kept, because another machine may be
+about to reference them."""
 
 
 @dataclass(frozen=True)
 class StoredBlob:
-    """A file in a store. `abandoned`: nobody can be about to name it in the database any more."""
+    """File in a blob store. `abandoned` is True if no process can still be about to reference the
+    file in the database."""
 
     key: str
     size: int
@@ -31,27 +34,36 @@ class StoredBlob:
 
 
 class BlobStore(Protocol):
-    """Files under keys. Everything raises StoreUnavailable where the store does not answer or take it."""
+    """Key-to-file storage. Every method raises StoreUnavailable if the store fails or does not
+    answer."""
 
     def publish(self, staged: Path, key: str) -> None:
-        """Store the complete, synced local file under a new key, in one step: afterwards it is there whole, before not at all. The local
-        file may be gone."""
+        """Store a complete, synced local file under a new key, atomically. The local file may be
+        moved away."""
 
     def local_file(self, key: str, folder: Path) -> contextlib.AbstractContextManager[Path]:
-        """The file on this machine's disk while entered; one that lies elsewhere is fetched into `folder`."""
+        """Provide the file as a local path inside the block. A remote file is downloaded into
+        `folder`."""
 
     def remove(self, key: str) -> None:
-        """Remove it; nothing happens where it is not there."""
+        """Delete the file; no effect if it does not exist."""
 
     def stored(self) -> list[StoredBlob]:
-        """Every file of the store."""
+        """List every file of the store."""
 
 
 def open_blobs(url: str | None, folder: Path, options: dict[str, Any] | None = None) -> BlobStore:
-    """The store at a URL such as `s3://bucket/prefix`; without one the folder. options: those of the fsspec file system.
+    """Open the blob store at a URL such as `s3://bucket/prefix`, or in `folder` without a URL.
 
-    Credentials come from the environment, as the store's own tools read them (AWS_ACCESS_KEY_ID and so on). Raises StoreUnavailable for an
-    unknown kind of URL and where the package for it is not installed.
+    Credentials come from the store's usual environment variables (AWS_ACCESS_KEY_ID and so on).
+
+    Args:
+        url: address of the store, or None.
+        folder: local folder.
+        options: options of the fsspec file system.
+
+    Raises:
+        StoreUnavailable: if the URL scheme is unknown or its package is not installed.
     """
     if url is None:
         return FolderBlobs(folder)
@@ -59,7 +71,7 @@ def open_blobs(url: str | None, folder: Path, options: dict[str, Any] | None = N
 
 
 class FolderBlobs:
-    """A folder on the machine's disk."""
+    """Blob store in a local folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -80,7 +92,7 @@ class FolderBlobs:
             (self.folder / key).unlink(missing_ok=True)
 
     def stored(self) -> list[StoredBlob]:
-        # Only this machine writes here, and whoever asks holds the registry's lock.
+        # Only this machine writes here, and the caller holds the registry's lock.
         with _store_errors(str(self.folder)):
             return [
                 StoredBlob(path.name, path.stat().st_size, abandoned=True) for path in sorted(self.folder.iterdir())
@@ -88,7 +100,7 @@ class FolderBlobs:
 
 
 class RemoteBlobs:
-    """An object store: an object is there when all of it has arrived, and not before."""
+    """Blob store in an object store, where an object appears only after its complete upload."""
 
     def __init__(self, url: str, options: dict[str, Any], others_upload_s: float = OTHERS_UPLOAD_S) -> None:
         self._others_upload_s = others_upload_s
@@ -130,7 +142,7 @@ class RemoteBlobs:
             try:
                 found = self._files.ls(self._root, detail=True)
             except FileNotFoundError:
-                return []  # a prefix that holds nothing yet
+                return []  # empty prefix
         return [
             StoredBlob(
                 each["name"].rsplit("/", 1)[-1],
@@ -146,7 +158,8 @@ class RemoteBlobs:
 
 
 def _written_before(described: dict[str, Any], moment_s: float) -> bool:
-    """Return True if a file is older than a moment, False where its store does not say. Stores give a datetime, or a Unix time in seconds."""
+    """Return True if a file is older than a Unix time in seconds; False if the store reports no
+    time. Stores report a datetime or a Unix time."""
     written = described.get("LastModified", described.get("created"))
     if written is None:
         return False
@@ -155,7 +168,8 @@ def _written_before(described: dict[str, Any], moment_s: float) -> bool:
 
 @contextlib.contextmanager
 def _store_errors(where: str) -> Iterator[None]:
-    """What a store or its package raises, as StoreUnavailable. botocore's errors derive from Exception alone."""
+    """Convert exceptions of a store or its package to StoreUnavailable. botocore's errors derive
+    from Exception directly."""
     try:
         yield
     except FileNotFoundError as error:

@@ -1,8 +1,9 @@
-"""The upload format `.isplat`: a model bundle as one file, read without torch.
+"""Upload format `.isplat`: a model bundle in one file, readable without torch.
 
-It is an uncompressed POSIX tar archive (ustar) of exactly two plain files, `manifest.json` and then `model.safetensors`. Tar, because it can be
-written and read front to back, says each size before the bytes, has one list of its files and not two that may disagree, and cannot be compressed.
-The names in the archive are compared and never used as a path, and whatever the headers say about owners, rights or times is ignored.
+The file is an uncompressed POSIX tar archive (ustar) of exactly two regular files, `manifest.json`
+and `model.safetensors`, in this order. Tar is readable and writable sequentially, states each size
+before the content, and has no second index that could disagree. Member names are compared but never
+used as paths. Owner, permission and time fields are ignored.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ MANIFEST, TENSORS = "manifest.json", "model.safetensors"
 MOST_MANIFEST_BYTES = 1 << 20
 BLOCK = 512
 MOST_END_BYTES = 22 * BLOCK
-"""Two empty blocks end an archive, and programs fill it up to a multiple of 20 blocks."""
+"""Maximum trailer: two empty blocks, padded by tar programs to a multiple of 20 blocks."""
 PIECE_BYTES = 1 << 20
 
 _USTAR = (b"ustar\x0000", b"ustar  \x00")
@@ -42,7 +43,7 @@ _REMEDY = "make it with `intrasplat pack`"
 
 @dataclass(frozen=True)
 class Member:
-    """A file within the archive: `size` bytes from `offset` on."""
+    """File in the archive: `size` bytes starting at `offset`."""
 
     name: str
     offset: int
@@ -50,9 +51,15 @@ class Member:
 
 
 def members_of(file: BinaryIO, size: int) -> tuple[Member, Member]:
-    """Manifest and tensors of an archive of `size` bytes, which is read header by header.
+    """Locate manifest and tensors in an archive by reading its headers.
 
-    Raises Rejected, with one sentence, for anything but the two files in their order: other names, links, compression, hidden or missing bytes.
+    Args:
+        file: the archive.
+        size: its length in bytes.
+
+    Raises:
+        Rejected: if the archive has anything but the two files in order: other names, links,
+            compression, hidden or missing bytes.
     """
     file.seek(0)
     start = file.read(BLOCK)
@@ -75,7 +82,11 @@ def members_of(file: BinaryIO, size: int) -> tuple[Member, Member]:
 
 
 def read_pieces(file: BinaryIO, member: Member) -> Iterator[bytes]:
-    """The bytes of a member, in pieces. Raises Rejected when the file ends within."""
+    """Read a member in pieces.
+
+    Raises:
+        Rejected: if the file ends inside the member.
+    """
     file.seek(member.offset)
     left = member.size
     while left:
@@ -87,7 +98,11 @@ def read_pieces(file: BinaryIO, member: Member) -> Iterator[bytes]:
 
 
 def digest_of(file: BinaryIO, member: Member) -> str:
-    """SHA-256 of a member. Raises Rejected when the file ends within."""
+    """Return the SHA-256 of a member in hex.
+
+    Raises:
+        Rejected: if the file ends inside the member.
+    """
     sha256 = hashlib.sha256()
     for piece in read_pieces(file, member):
         sha256.update(piece)
@@ -95,15 +110,25 @@ def digest_of(file: BinaryIO, member: Member) -> str:
 
 
 def unpack(file: BinaryIO, size: int, folder: Path) -> None:
-    """Write the two files of an archive into a folder, under names of ours. Raises Rejected, or OSError where the folder does not take them."""
+    """Extract the two files of an archive into a folder, under fixed names.
+
+    Raises:
+        Rejected: if the archive is not valid.
+        OSError: if a file cannot be written.
+    """
     for member, name in zip(members_of(file, size), (MANIFEST, TENSORS), strict=True):
         write_durably(folder / name, read_pieces(file, member))
 
 
 def pack(folder: Path, target: Path, *, overwrite: bool = False) -> int:
-    """Write the bundle in `folder` to one file, the same bytes every time; returns their number.
+    """Pack the bundle in `folder` into one file. The output is deterministic.
 
-    Raises FileExistsError where `target` is there and may not be replaced, other OSErrors where something cannot be read or written.
+    Returns:
+        Size of the file in bytes.
+
+    Raises:
+        FileExistsError: if `target` exists and `overwrite` is False.
+        OSError: if a file cannot be read or written.
     """
     with PartialFile(target, overwrite=overwrite) as partial:
         for name in (MANIFEST, TENSORS):
@@ -127,7 +152,7 @@ def _append(archive: BinaryIO, name: str, source: BinaryIO) -> None:
 
 
 def _header(name: str, size: int) -> bytes:
-    """A ustar header (POSIX.1-1988): rights 0644, owner 0, time 0."""
+    """Return a ustar header (POSIX.1-1988) with mode 0644, owner 0 and time 0."""
     if size >= 8**11:
         raise OSError(f"{name} has {size} bytes; an archive holds files below 8 GiB")
     fields = f"{name:\0<100}0000644\0{0:07o}\0{0:07o}\0{size:011o}\0{0:011o}\0{'':8}0{'':\0<100}ustar\x0000"
@@ -137,7 +162,7 @@ def _header(name: str, size: int) -> bytes:
 
 
 def _member(block: bytes, name: str, start: int, size: int) -> Member:
-    """The member that a header describes, which has to be the plain file `name`."""
+    """Parse a header that must describe the regular file `name`."""
     if len(block) < BLOCK:
         raise Rejected(f"the file ends where the header of {name} should be; upload it again")
     if block[257:265] not in _USTAR or _octal(block[148:156]) != sum(block[:148]) + 8 * 32 + sum(block[156:]):
@@ -155,7 +180,7 @@ def _member(block: bytes, name: str, start: int, size: int) -> Member:
 
 
 def _end_of(file: BinaryIO, member: Member) -> int:
-    """Where the next header begins; what fills the last block up must be empty."""
+    """Return the offset of the next header. The padding must be empty."""
     end = member.offset + member.size
     file.seek(end)
     if any(file.read(-end % BLOCK)):

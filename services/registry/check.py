@@ -1,10 +1,14 @@
-"""The check of an unpacked model, run as a program of its own: `python -m services.registry.check FOLDER --json`.
+"""Check of an unpacked model as a separate program: `python -m services.registry.check FOLDER
+--json`.
 
-It reads the bundle by the same code as everything else (`gsplat_core.io.bundle`: header limits, allowed keys, shapes and types, finite values),
-holds it against the budgets, and renders it at its own camera. With `--json` each step is one line: `{"stage": "validated", …}`, then
-`{"stage": "ready", …}`, or `{"stage": "rejected", "reason": …}`. Exit code 0: there is a verdict. Anything else: the check itself failed.
+Loads the bundle with `gsplat_core.io.bundle` (header limits, allowed keys, shapes, types, finite
+values), checks it against the budgets, and renders it at its own camera. With `--json` each step
+prints one line: `{"stage": "validated", …}`, then `{"stage": "ready", …}` or `{"stage": "rejected",
+"reason": …}`. Exit code 0 means that there is a verdict; any other code means that the check itself
+failed.
 
-Nothing else of the registry imports this module: it loads torch, before the limits are set, which are for the model.
+The registry never imports this module, because it loads torch. Torch is loaded before the resource
+limits are set, so the limits apply to the model alone.
 """
 
 from __future__ import annotations
@@ -31,16 +35,21 @@ from services.private_files import keep_files_private
 from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
 
 FAINTEST = 1 / 255
-"""An opacity below it changes no pixel of a picture."""
+"""Smallest opacity that changes an 8-bit pixel."""
 _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc")
 
 
 class Unusable(Exception):
-    """A model takes more than it may, or cannot be shown; the text is the sentence."""
+    """The model exceeds a budget or cannot be displayed. The message is the reason for the
+    rejection."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Check one folder and print what was found."""
+    """Check one folder and print the result.
+
+    Returns:
+        The exit code.
+    """
     keep_files_private()
     options = _options(arguments)
     say = _say_json if options.json else _say_words
@@ -52,14 +61,15 @@ def main(arguments: list[str] | None = None) -> int:
     except (BundleCorrupt, UnknownFormatVersion, Unusable) as error:
         say({"stage": "rejected", "reason": str(error).replace(f"{options.folder}/", "")})
     except UserError as error:
-        # The files were whole a moment ago, so that this is about the machine: memory that others have taken, rights.
+        # The files were intact at unpacking, so the cause is the machine: memory used by other
+        # processes, or permissions.
         sys.stderr.write(f"{error}\n")
         return 1
-    except torch.OutOfMemoryError as error:  # of a GPU, which others use too
+    except torch.OutOfMemoryError as error:  # GPU memory is shared with other processes
         sys.stderr.write(f"{str(error).splitlines()[0]}\n")
         return 1
     except (MemoryError, RuntimeError) as error:
-        # torch's allocators raise RuntimeError.
+        # torch's allocators raise RuntimeError when out of memory.
         if isinstance(error, RuntimeError) and not any(words in str(error).lower() for words in _MEMORY_WORDS):
             raise
         most = options.memory_bytes
@@ -81,9 +91,9 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def _limit_resources(options: argparse.Namespace) -> None:
-    """No more processor time and memory than allowed beyond what torch itself has taken, and no core file with a model in it.
+    """Limit processor time and memory beyond what torch uses at startup, and disable core files.
 
-    On CUDA memory is not limited: it maps far more than it takes.
+    Memory is not limited on CUDA, which maps far more address space than it uses.
     """
     os.nice(NICENESS)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -93,7 +103,12 @@ def _limit_resources(options: argparse.Namespace) -> None:
 
 
 def _read(options: argparse.Namespace) -> Model:
-    """The model, once its manifest is within the budgets. Raises BundleError, Unusable."""
+    """Load the model after checking its manifest against the budgets.
+
+    Raises:
+        BundleError: if the bundle is damaged.
+        Unusable: if the model exceeds a budget.
+    """
     with open_model_file(options.folder / MANIFEST, options.folder) as file:
         manifest = parse_manifest(file.read(MAX_MANIFEST_BYTES + 1), MANIFEST)
     camera = manifest.camera
@@ -122,7 +137,11 @@ def _description(model: Model) -> dict[str, Any]:
 
 
 def _render(model: Model, device: str) -> dict[str, Any]:
-    """Pictures at the beginning, the middle and the end of what the model has seen. Raises Unusable where one is not finite, or all are empty."""
+    """Render the model at the start, middle and end of its time window.
+
+    Raises:
+        Unusable: if a picture is not finite or all pictures are empty.
+    """
     start_s, end_s = model.time_window_s
     renderer = AlphaRenderer(model.camera, torch.device(device))
     covered, visible, took_s = 0.0, 0.0, 0.0

@@ -1,4 +1,4 @@
-"""What a process that reads an upload may take of the machine."""
+"""Resource limits of processes that read uploads."""
 
 from __future__ import annotations
 
@@ -6,17 +6,24 @@ import resource
 from pathlib import Path
 
 NICENESS = 10
-"""Streams that run on this machine go before a check."""
+"""Nice value of a check; running streams have priority."""
 
 
 def taken_bytes() -> int:
-    """What the system counts for RLIMIT_DATA at this moment."""
+    """Return the current size in bytes counted for RLIMIT_DATA."""
     fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":" in line)
     return int(fields["VmData"].split()[0]) * 1024
 
 
 def lower_limit(kind: int, wanted: int, spare: int = 0) -> None:
-    """Set a limit, unless there is a lower one. spare: between the warning (of processor time: SIGXCPU) and the end."""
+    """Lower a resource limit; a lower existing limit is kept.
+
+    Args:
+        kind: resource, such as `resource.RLIMIT_CPU`.
+        wanted: soft limit.
+        spare: distance of the hard limit above the soft limit. For processor time, SIGXCPU comes at
+            the soft limit.
+    """
     _, hard = resource.getrlimit(kind)
     allowed = [wanted, wanted + spare]
     if hard != resource.RLIM_INFINITY:

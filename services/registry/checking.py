@@ -1,4 +1,5 @@
-"""Running the check of a model in a process of its own, within bounds, and reading its verdict. Nothing of the model enters this process."""
+"""Runner of the model check in a separate, limited process. No content of the model is loaded into
+this process."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ _PASSED_ON = (
     "OMP_NUM_THREADS",
     "INTRASPLAT_ISA",
 )
-"""What the check gets of the environment: no credentials are among it."""
+"""Environment variables passed to the check; none holds credentials."""
 _OF_THE_MODEL = {
     signal.SIGKILL,
     signal.SIGSEGV,
@@ -43,23 +44,24 @@ _OF_THE_MODEL = {
     signal.SIGFPE,
     signal.SIGXCPU,
 }
-"""Signals that end a check because of what it checked: too much memory or time, or a fault. Others come from people."""
+"""Signals attributed to the checked model: memory, processor time or a fault. Other signals come
+from administrators."""
 
 
 class BroughtDown(Exception):
-    """A check was ended by what it checked; the text says how."""
+    """The checked content terminated the check. The message describes how."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a check came to. `reason` says why a version is rejected; None: it is ready."""
+    """Result of a check. `reason` is the reason for a rejection, or None if the version is ready."""
 
     reason: str | None = None
     description: dict[str, Any] = field(default_factory=dict)
 
 
 class RunningChecks:
-    """The processes of the checks that run now. Any thread may use it."""
+    """Registry of running check processes. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -68,7 +70,8 @@ class RunningChecks:
 
     @contextlib.contextmanager
     def counted(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
-        """While entered, `end` ends this process. One that comes after `end` is ended at once."""
+        """Register a process while the block runs, so `end` can kill it. After `end`, the process
+        is killed at once."""
         with self._lock:
             self._processes.add(process)
             if self.ended:
@@ -80,7 +83,7 @@ class RunningChecks:
                 self._processes.discard(process)
 
     def end(self) -> None:
-        """End every check that runs, and every one that is begun from now on; each raises CheckFailed."""
+        """Kill all running checks and every later one; each raises CheckFailed."""
         with self._lock:
             self.ended = True
             for process in self._processes:
@@ -95,10 +98,19 @@ def run_check(
     program: tuple[str, ...] = PROGRAM,
     running: RunningChecks | None = None,
 ) -> Verdict:
-    """Check the model in `folder`; blocks until there is a verdict.
+    """Check the model in `folder`; blocks until there is a verdict. A check that exceeds its limits
+    or crashes because of the model is a verdict too.
 
-    A check that takes too much processor time or memory, or that a model brings down, is a verdict too. validated: called once the contents are in order.
-    running: where the process is counted while it runs. Raises CheckFailed where the check could not be run at all, or was ended with the others.
+    Args:
+        folder: unpacked model.
+        limits: budgets of the check.
+        device: device for the warm-up picture, cpu or cuda.
+        validated: called with the description once the contents are valid.
+        program: command that runs the check.
+        running: registry in which the process is listed.
+
+    Raises:
+        CheckFailed: if the check could not run or was killed by `RunningChecks.end`.
     """
     command = [*program, str(folder), "--json", "--device", device, *_budgets(limits)]
     verdict, description = None, dict[str, Any]()
@@ -131,9 +143,14 @@ def run_program(
     device: str = "cpu",
     running: RunningChecks | None = None,
 ) -> str:
-    """Run a check, hand each object that it prints to `take`; returns its last words when it has ended well.
+    """Run a check program and pass each printed JSON object to `take`.
 
-    Raises BroughtDown where what it checked has ended it, CheckFailed where it could not be run at all, or was ended with the others.
+    Returns:
+        The last line that the program wrote to standard error.
+
+    Raises:
+        BroughtDown: if the checked content terminated the program.
+        CheckFailed: if the program could not run or was killed by `RunningChecks.end`.
     """
     running = running or RunningChecks()
     with tempfile.TemporaryFile() as said, _started(command, said, device) as process, running.counted(process):
@@ -160,7 +177,7 @@ def _budgets(limits: RegistryLimits) -> list[str]:
 
 @contextlib.contextmanager
 def _started(command: list[str], said: Any, device: str) -> Iterator[subprocess.Popen[bytes]]:
-    """The running process; it does not outlive this context."""
+    """Start the process and kill it at the end of the block."""
     environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     if device == "cpu":
         environment["CUDA_VISIBLE_DEVICES"] = ""
@@ -188,7 +205,7 @@ def _started(command: list[str], said: Any, device: str) -> Iterator[subprocess.
 
 @contextlib.contextmanager
 def _time_limit(process: subprocess.Popen[bytes], seconds: float) -> Iterator[threading.Event]:
-    """Ends the process when the time is over; the event says that it came to that."""
+    """Kill the process after `seconds`; the yielded event is then set."""
     late = threading.Event()
 
     def end() -> None:
@@ -204,26 +221,32 @@ def _time_limit(process: subprocess.Popen[bytes], seconds: float) -> Iterator[th
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End the process and what it started; it leads a session of its own. One that was waited for is gone, and its number may be another's."""
+    """Kill the process group of a check, which leads its own session. A reaped process is skipped,
+    because its id may be reused."""
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
 
 
 def _lines(process: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
-    """The objects that the check prints, until it ends."""
+    """Yield the JSON objects that the check prints, until it ends."""
     assert process.stdout is not None
     while line := process.stdout.readline(MOST_LINE_BYTES):
         try:
             values = json.loads(line)
         except ValueError:
-            continue  # a library's own words; without a verdict the exit code speaks
+            continue  # output of a library; the exit code decides if there is no verdict
         if isinstance(values, dict):
             yield values
 
 
 def _raise_for_the_end(code: int, late: bool, passed_s: float, said: Any) -> NoReturn:
-    """Raises BroughtDown or CheckFailed for a check that ended badly."""
+    """Raise the error for a check that ended with a non-zero code.
+
+    Raises:
+        BroughtDown: if the checked content is the cause.
+        CheckFailed: otherwise.
+    """
     if late:
         raise CheckFailed(f"the check lasted longer than {passed_s:g} s; check again when this machine is less busy")
     if code < 0 and -code in _OF_THE_MODEL:

@@ -1,6 +1,7 @@
-"""The service's database: SQLite in a file by default, PostgreSQL by URL. One writer at a time on either, in a transaction each.
+"""Database of the service: SQLite file by default, PostgreSQL by URL. Writers are serialised, each
+in a transaction.
 
-The registry, the recordings and the jobs have tables of their own in it, each with its own row of migrations (`Schema`).
+The registry, the recordings and the jobs have separate tables and migrations (`Schema`).
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from services.registry.errors import SchemaTooNew, StoreUnavailable
 
 BUSY_TIMEOUT_S = 10.0
-"""How long a writer waits for another one."""
+"""Seconds that a writer waits for another one."""
 _WRITERS_LOCK = 0x1_5B1A7
-"""The advisory lock that writers to PostgreSQL take; SQLite has its own."""
+"""Key of the PostgreSQL advisory lock for writers; SQLite locks the file itself."""
 
 
 @dataclass(frozen=True)
 class Schema:
-    """One package's tables: where its migrations lie, and the table that says which of them were made."""
+    """Tables of one package: folder of its migrations, and the table that records the applied ones."""
 
     migrations: Path
     version_table: str
@@ -40,10 +41,18 @@ REGISTRY = Schema(Path(__file__).parent / "migrations", "alembic_version")
 
 
 class Database:
-    """Connections to the database. Any thread may use it."""
+    """Database connections. Thread-safe."""
 
     def __init__(self, url: str, schema: Schema = REGISTRY) -> None:
-        """url: `sqlite:///PATH` or `postgresql://USER@HOST/NAME`; nothing is connected yet. Raises StoreUnavailable for what cannot be one."""
+        """Create the engine without connecting.
+
+        Args:
+            url: `sqlite:///PATH` or `postgresql://USER@HOST/NAME`.
+            schema: tables to migrate.
+
+        Raises:
+            StoreUnavailable: if the URL is invalid or its driver is missing.
+        """
         self._schema = schema
         try:
             self._url = _with_driver(sa.make_url(url))
@@ -55,20 +64,35 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """A connection of which every statement sees what is committed at that moment. Raises StoreUnavailable."""
+        """Provide a connection in autocommit mode, so each statement sees the newest committed
+        state.
+
+        Raises:
+            StoreUnavailable: if the database does not answer.
+        """
         with self._errors(), self._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             yield connection
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """A transaction of the only writer; committed to the disk at the end, undone by an exception. Raises StoreUnavailable."""
+        """Provide an exclusive write transaction; committed at the end of the block, rolled back on
+        an exception.
+
+        Raises:
+            StoreUnavailable: if the database does not answer.
+        """
         with self._errors(), self._engine.connect() as connection, connection.begin():
             if self._url.get_backend_name() == "postgresql":
                 connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_WRITERS_LOCK)))
             yield connection
 
     def migrate(self) -> None:
-        """Bring the schema to this program's, in one transaction. Raises SchemaTooNew, StoreUnavailable."""
+        """Migrate the schema to this program's version, in one transaction.
+
+        Raises:
+            SchemaTooNew: if a later version of the program wrote the database.
+            StoreUnavailable: if the database does not answer.
+        """
         config = alembic.config.Config()
         config.set_main_option("script_location", str(self._schema.migrations).replace("%", "%%"))
         options = {"version_table": self._schema.version_table}
@@ -83,7 +107,7 @@ class Database:
                 alembic.command.upgrade(config, "head")
 
     def close(self) -> None:
-        """Close every connection; the next use opens new ones."""
+        """Close all connections. Later use opens new ones."""
         self._engine.dispose()
 
     def _check_known(self, script: alembic.script.ScriptDirectory, revision: str) -> None:
@@ -110,7 +134,7 @@ class Database:
 
 
 def _with_driver(url: sa.URL) -> sa.URL:
-    """PostgreSQL through psycopg, whichever way the URL is written."""
+    """Select the psycopg driver for every spelling of a PostgreSQL URL."""
     if url.drivername in ("postgres", "postgresql"):
         return url.set(drivername="postgresql+psycopg")
     if url.get_backend_name() not in ("sqlite", "postgresql"):
@@ -128,7 +152,8 @@ def _new_engine(url: sa.URL) -> sa.Engine:
 
 
 def _prepare_sqlite(connection: Any, _: object) -> None:
-    """WAL: readers go on beside the writer. FULL: what was committed survives a power cut."""
+    """Set the SQLite pragmas. WAL allows readers during a write; FULL makes commits survive a power
+    failure."""
     cursor = connection.cursor()
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")
@@ -136,6 +161,7 @@ def _prepare_sqlite(connection: Any, _: object) -> None:
 
 
 def _begin_sqlite(connection: sa.Connection) -> None:
-    """Take the writer's place at once, so that two writers wait for each other in place of failing later."""
+    """Take the write lock at the start of a transaction, so concurrent writers wait and do not fail
+    later."""
     if connection.get_execution_options().get("isolation_level") != "AUTOCOMMIT":
         connection.exec_driver_sql("BEGIN IMMEDIATE")

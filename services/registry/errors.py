@@ -17,36 +17,36 @@ from gsplat_core.errors import UserError
 
 
 class RegistryError(UserError):
-    """Base of everything the registry raises on purpose."""
+    """Base class of the registry's errors."""
 
 
 class NotFound(RegistryError):
-    """There is no such model or version."""
+    """The model or version does not exist."""
 
 
 class Conflict(RegistryError):
-    """Somebody else was first, or the version is not in a state that allows this."""
+    """A concurrent change was first, or the version's state does not permit the operation."""
 
 
 class StillActive(Conflict):
-    """The active version is never deleted."""
+    """The active version cannot be deleted."""
 
 
 class Rejected(RegistryError):
-    """An upload is not what it has to be; nothing of it was kept."""
+    """The upload is invalid; nothing was stored."""
 
 
 class StoreUnavailable(RegistryError):
-    """Database or files cannot be used now; nothing was changed."""
+    """Database or file storage is unavailable; nothing was changed."""
 
 
 class SchemaTooNew(StoreUnavailable):
-    """The database belongs to a later version of this program."""
+    """A later version of this program wrote the database."""
 
 
 class BlobDamaged(StoreUnavailable):
-    """The stored file of a version is gone or is not what was uploaded."""
+    """The stored file of a version is missing or altered."""
 
 
 class CheckFailed(StoreUnavailable):
-    """The check of a version could not be run; that says nothing about the version."""
+    """The check of a version could not run. The version itself may be valid."""

@@ -1,6 +1,7 @@
-"""Who is writing into the registry's folder: everybody who publishes shares the lock, whoever cleans up has it alone.
+"""Lock on the registry's folder: shared by publishing processes, exclusive for cleanup.
 
-The system lets go of it when a process ends, however it ends, so that what a dead process left behind is never taken for a living one's.
+The kernel releases the lock when a process ends, so leftovers of a dead process are never
+attributed to a running one.
 """
 
 from __future__ import annotations
@@ -16,21 +17,25 @@ _RETRY_S = 0.05
 
 
 class FolderLock:
-    """A lock file. Every use opens it anew, so that threads of one process count as well as processes."""
+    """File lock that is opened for each use, so threads of one process exclude each other too."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     @contextlib.contextmanager
     def shared(self) -> Iterator[None]:
-        """Hold it beside others; waits while somebody cleans up."""
+        """Hold the lock in shared mode; blocks during a cleanup."""
         with self._opened() as descriptor:
             fcntl.flock(descriptor, fcntl.LOCK_SH)
             yield
 
     @contextlib.contextmanager
     def alone(self, wait_s: float) -> Iterator[bool]:
-        """Hold it alone. False after `wait_s` in which others held it; then nothing is held."""
+        """Try to hold the lock exclusively for up to `wait_s` seconds.
+
+        Yields:
+            True if the lock is held, False after the timeout.
+        """
         until = time.monotonic() + wait_s
         with self._opened() as descriptor:
             while not _taken(descriptor):

@@ -1,4 +1,4 @@
-"""How much an upload and its check may take."""
+"""Resource budgets of uploads and their checks."""
 
 from __future__ import annotations
 
@@ -9,24 +9,26 @@ GIB = 1 << 30
 
 @dataclass(frozen=True)
 class RegistryLimits:
-    """Budgets of one version. Every bound is included."""
+    """Inclusive budgets of one version."""
 
     upload_bytes: int = 4 * GIB
-    """The uploaded file."""
+    """Largest upload in bytes."""
     gaussians: int = 2_000_000
     model_bytes: int = 4 * GIB
-    """The tensors of the model, as they lie in memory."""
+    """Largest total size of the tensors in memory, in bytes."""
     pixels: int = 4096 * 4096
-    """The picture of the model's camera."""
+    """Largest picture of the model's camera, in pixels."""
     check_memory_bytes: int = 12 * GIB
-    """What the checking process may take beside torch itself."""
+    """Memory of the checking process beyond torch itself, in bytes."""
     check_s: float = 120.0
-    """Processor time of the check beside the start of torch. More rejects the version."""
+    """Processor time of the check in seconds, without the start of torch. Exceeding it rejects the
+    version."""
     check_passed_s: float = 600.0
-    """How long a check may last, the start of its process included. More says that the machine is too busy, and nothing about the version."""
+    """Wall-clock time of a check in seconds, including process start. Exceeding it means that the
+    machine is too busy, and the version is not rejected."""
 
     checks_at_once: int = 1
-    """Further checks wait for their turn."""
+    """Number of concurrent checks; further checks wait."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -1,4 +1,4 @@
-"""The registry of versioned models: uploads, checks, and which version is served."""
+"""Registry of versioned models: uploads, checks, activation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from services.registry.unpacked import UnpackedModels, folder_name
 
 DATABASE_FILE = "registry.sqlite"
 CHECKER = "registry"
-"""Who brings versions into the states that a check leads to."""
+"""`changed_by` value for states set by a check."""
 RECOVERY_WAIT_S = 5.0
 
 
@@ -45,10 +45,11 @@ def _nothing(_: str) -> None:
 
 
 class ModelRegistry:
-    """Versioned models. Synchronous; any thread may call it, and several processes may have the same registry open.
+    """Versioned models. Synchronous and thread-safe; several processes may open the same registry.
 
-    A version is immutable. A change is a transaction that is on the disk when the call returns, whatever happens to the process: before it
-    the old state holds, after it the new one. Every method raises StoreUnavailable where database or files do not answer.
+    Versions are immutable. Each change is one durable transaction: after a crash either the old or
+    the new state holds. Every method raises StoreUnavailable if the database or the files are
+    unavailable.
     """
 
     def __init__(
@@ -63,17 +64,20 @@ class ModelRegistry:
         reached: Callable[[str], None] = _nothing,
         check_program: tuple[str, ...] = PROGRAM,
     ) -> None:
-        """Open the registry in `folder`, which is made, and bring its database to this program's schema.
+        """Open the registry in `folder`, create it if missing, and migrate its database.
 
         Args:
-            database_url: None: SQLite in the folder; or `postgresql://…`.
-            blobs_url: None: uploaded files lie in the folder; or `s3://BUCKET/PREFIX`.
-            blob_options: further options of the fsspec file system, such as an endpoint's URL.
-            device: where checks render, cpu or cuda.
-            reached: told the name of each step of a change, in the thread that makes it.
-            check_program: what runs the check of a folder.
+            folder: folder of the registry.
+            database_url: `postgresql://…`, or None for SQLite in the folder.
+            blobs_url: `s3://BUCKET/PREFIX`, or None to store uploads in the folder.
+            blob_options: further options of the fsspec file system, such as an endpoint URL.
+            limits: budgets of uploads and checks.
+            device: device on which checks render, cpu or cuda.
+            reached: called with the name of each completed step, in the calling thread.
+            check_program: command that checks a folder.
 
-        Raises SchemaTooNew where a later version of the program has written the database.
+        Raises:
+            SchemaTooNew: if a later version of the program wrote the database.
         """
         self._folder, self._limits, self._device = folder, limits, device
         self._reached, self._check_program = reached, check_program
@@ -96,14 +100,18 @@ class ModelRegistry:
     def upload(
         self, name: str, file: Path, digest: str | None, by: str, *, version: int | None = None
     ) -> VersionRecord:
-        """Store an `.isplat` file as a new version of a model, in the state `uploaded`. The file is copied and stays where it is.
+        """Store a copy of an `.isplat` file as a new version in the state `uploaded`.
 
         Args:
-            digest: SHA-256 of the file as its sender states it, in hexadecimal; None: it was not stated.
-            by: who uploads.
-            version: the number that it must get; None: the next one.
+            name: the model.
+            file: path of the upload; the file stays in place.
+            digest: SHA-256 stated by the sender, in hex, or None.
+            by: the caller, for the record.
+            version: required version number; None takes the next one.
 
-        Raises Rejected (name, size, digest, not the format), Conflict (the number was given before).
+        Raises:
+            Rejected: if name, size, digest or format is invalid.
+            Conflict: if the version number was already used.
         """
         check_name(name)
         check_by(by)
@@ -119,10 +127,16 @@ class ModelRegistry:
                 staged.path.unlink(missing_ok=True)
 
     def check(self, name: str, version: int) -> VersionRecord:
-        """Check an uploaded version in a process of its own; blocks until it is `ready`, or `rejected` with a reason.
+        """Check an uploaded version in a separate process; blocks until it is `ready` or `rejected`
+        with a reason.
 
-        Checks wait for each other, `RegistryLimits.checks_at_once` run. A version that was checked before is answered as it is. Raises NotFound, BlobDamaged, and CheckFailed where the check could not be run:
-        the version then waits for another one.
+        At most `RegistryLimits.checks_at_once` checks run concurrently. A version that was already
+        checked is returned unchanged.
+
+        Raises:
+            NotFound: if the version does not exist.
+            BlobDamaged: if its file is missing or altered.
+            CheckFailed: if the check could not run; the version stays unchecked.
         """
 
         def validated(description: dict[str, Any]) -> None:
@@ -142,9 +156,18 @@ class ModelRegistry:
         return self._after_check(name, version, state, verdict)
 
     def activate(self, name: str, version: int, expected_current: int | None, by: str) -> Change:
-        """Let a version be served in place of `expected_current` (None: no version is active). The one before becomes `retired`.
+        """Activate a version in place of `expected_current`; the previous one becomes `retired`.
 
-        Raises NotFound, Conflict (another version is active than expected, or this one is not ready), BlobDamaged (it could not be served).
+        Args:
+            name: the model.
+            version: version to activate.
+            expected_current: version that must be active; None if none may be.
+            by: the caller, for the record.
+
+        Raises:
+            NotFound: if the version does not exist.
+            Conflict: if another version is active or this one is not ready.
+            BlobDamaged: if its file is missing or altered.
         """
         check_by(by)
         with self._database.reading() as connection:
@@ -158,13 +181,19 @@ class ModelRegistry:
         return change
 
     def rollback(self, name: str, by: str, *, expected_current: int | None = None, reason: str | None = None) -> Change:
-        """Serve again what was served before the active version; called again it goes back further.
+        """Activate the previously active version. Repeated calls go further back.
 
         Args:
-            expected_current: the version that must be active, so that nobody's newer choice is undone; None: whichever is.
-            reason: why; it stays with the version that is rolled back.
+            name: the model.
+            by: the caller, for the record.
+            expected_current: version that must be active, which protects newer changes; None
+                accepts any.
+            reason: reason stored with the rolled back version.
 
-        Raises NotFound, Conflict (nothing was active before, or another version is active), BlobDamaged.
+        Raises:
+            NotFound: if the model does not exist.
+            Conflict: if there is no earlier version, or another version is active.
+            BlobDamaged: if the file of the target version is missing or altered.
         """
         check_by(by)
         with self._lock.shared(), self._database.writing() as connection:
@@ -174,7 +203,12 @@ class ModelRegistry:
         return change
 
     def delete(self, name: str, version: int, by: str) -> Change:
-        """Remove a version and its file; its number is not given again. Raises NotFound, StillActive."""
+        """Delete a version and its file. Its number is not reused.
+
+        Raises:
+            NotFound: if the version does not exist.
+            StillActive: if the version is active.
+        """
         check_by(by)
         with self._database.reading() as connection:
             row = version_row(connection, name, version)
@@ -190,24 +224,36 @@ class ModelRegistry:
         return change
 
     def models(self) -> list[ModelRecord]:
-        """Every model, by name."""
+        """Return every model, ordered by name."""
         with self._database.reading() as connection:
             rows = connection.execute(sa.select(MODELS).order_by(MODELS.c.name)).mappings()
             return [model_record(row) for row in rows]
 
     def versions(self, name: str) -> list[VersionRecord]:
-        """The versions of a model, the oldest first. Raises NotFound."""
+        """Return the versions of a model, oldest first.
+
+        Raises:
+            NotFound: if the model does not exist.
+        """
         with self._database.reading() as connection:
             model_row(connection, name)
             return [version_record(row) for row in version_rows(connection, name)]
 
     def version(self, name: str, number: int) -> VersionRecord:
-        """One version. Raises NotFound."""
+        """Return one version.
+
+        Raises:
+            NotFound: if the version does not exist.
+        """
         with self._database.reading() as connection:
             return version_record(version_row(connection, name, number))
 
     def active(self, name: str) -> VersionRecord | None:
-        """The version that is served; None where no one has been activated. Raises NotFound."""
+        """Return the active version, or None.
+
+        Raises:
+            NotFound: if the model does not exist.
+        """
         for _ in range(3):
             with self._database.reading() as connection:
                 number = model_row(connection, name)["active"]
@@ -216,13 +262,16 @@ class ModelRegistry:
                 try:
                     return version_record(version_row(connection, name, number))
                 except NotFound:
-                    continue  # replaced and deleted in between
+                    continue  # replaced and deleted between the two queries
         raise Conflict(f"the active version of model {name!r} changes all the time; ask again")
 
     def folder_of(self, name: str, version: int) -> Path:
-        """The folder with a version's `manifest.json` and `model.safetensors`, for `load_bundle`; both have the digests of the upload.
+        """Return the folder with a version's `manifest.json` and `model.safetensors`, for
+        `load_bundle`. The digests are verified, and the folder stays until the version is deleted.
 
-        It stays until the version is deleted. Raises NotFound, BlobDamaged.
+        Raises:
+            NotFound: if the version does not exist.
+            BlobDamaged: if its file is missing or altered.
         """
         with self._database.reading() as connection:
             row = version_row(connection, name, version)
@@ -230,9 +279,12 @@ class ModelRegistry:
             return self._unpacked.folder_of(row)
 
     def recover(self, wait_s: float = RECOVERY_WAIT_S) -> Recovery:
-        """Called at start: remove what processes that died left half-written, and say what else is not as it should be. Nothing is repaired.
+        """Delete leftovers of dead processes and report damage. Called at start; nothing is
+        repaired.
 
-        wait_s: how long to wait for others that are writing; after that nothing is removed, and `skipped` says so.
+        Args:
+            wait_s: seconds to wait for other writers. After that nothing is deleted, and `skipped`
+                is set.
         """
         with self._lock.alone(wait_s) as alone:
             stored = self._blobs.stored()
@@ -251,7 +303,7 @@ class ModelRegistry:
         return findings(rows, stored, removed, None)
 
     def close(self) -> None:
-        """End the checks that run, whose versions wait for another one, and close the connections to the database."""
+        """Kill running checks, whose versions stay unchecked, and close the database."""
         self._running.end()
         self._database.close()
 
@@ -269,12 +321,13 @@ class ModelRegistry:
         except Conflict:
             self._blobs.remove(blob)
             raise
-        # After StoreUnavailable nobody knows whether the row is there: `recover` removes the file if it is not.
+        # After StoreUnavailable the row may or may not exist: `recover` removes the file if there
+        # is no row.
         self._reached("upload committed")
         return record
 
     def _after_check(self, name: str, version: int, state: State, verdict: Verdict) -> VersionRecord:
-        """Write what a check found, unless another check of the same version was faster."""
+        """Store the result of a check unless a concurrent check of the version was faster."""
         with self._database.writing() as connection:
             if State(version_row(connection, name, version)["state"]) in UNCHECKED:
                 found = {"reason": verdict.reason, "description": verdict.description}

@@ -1,4 +1,4 @@
-"""The rows of an upload: written last, when the file is already stored whole."""
+"""Database rows of an upload, written after the file is completely stored."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ MOST_BY = 200
 
 
 def check_name(name: str) -> None:
-    """Raises Rejected for what cannot be the name of a model."""
+    """Check a model name.
+
+    Raises:
+        Rejected: if the name is not valid.
+    """
     if not MODEL_NAME.fullmatch(name):
         raise Rejected(
             f"{name[:80]!r} cannot be the name of a model; take up to 64 of a-z, 0-9, dot, dash and underscore, with a letter or digit at both ends"
@@ -26,7 +30,11 @@ def check_name(name: str) -> None:
 
 
 def check_by(by: str) -> None:
-    """Raises Rejected for what cannot say who did something."""
+    """Check the name of the acting caller.
+
+    Raises:
+        Rejected: if the name is empty, too long or not printable.
+    """
     if not by or len(by) > MOST_BY or not by.isprintable():
         raise Rejected(f"`by` must be 1 to {MOST_BY} printable characters that say who asks, got {by[:80]!r}")
 
@@ -34,9 +42,13 @@ def check_by(by: str) -> None:
 def add_version(
     connection: sa.Connection, name: str, wanted: int | None, upload: StagedUpload, blob: str, by: str
 ) -> VersionRecord:
-    """Write the row of a stored upload, and that of its model where it is the first one.
+    """Insert the row of a stored upload, and the model's row for its first version.
 
-    wanted: the number that it must get; None: the next one. Raises Conflict where the number was given before.
+    Args:
+        wanted: required version number; None takes the next one.
+
+    Raises:
+        Conflict: if the number was already used.
     """
     at = now().isoformat()
     last = _last_version(connection, name, at)
@@ -65,7 +77,7 @@ def add_version(
 
 
 def _last_version(connection: sa.Connection, name: str, at: str) -> int:
-    """The highest number that was given to this model, which is made when it is not there."""
+    """Return the highest version number of the model, creating the model if it does not exist."""
     try:
         return int(model_row(connection, name)["last_version"])
     except NotFound:

@@ -1,4 +1,4 @@
-"""What the registry knows and answers: frozen records of versions, models and changes."""
+"""Immutable records of versions, models and changes."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from typing import Any
 
 
 class State(StrEnum):
-    """Where a version stands: uploaded → validated → ready → active → retired, or rejected with a reason."""
+    """State of a version: uploaded → validated → ready → active → retired, or rejected with a
+    reason."""
 
     UPLOADED = "uploaded"
-    """Its file is stored, and nobody has looked inside."""
+    """File stored, content not checked yet."""
     VALIDATED = "validated"
-    """Its contents are in order; the warm-up picture is being made."""
+    """Content valid; the warm-up picture is being rendered."""
     READY = "ready"
-    """It can be activated."""
+    """Ready for activation."""
     ACTIVE = "active"
-    """It is the one that is served."""
+    """Currently served."""
     RETIRED = "retired"
-    """It was active, and can be again."""
+    """Active earlier; can be activated again."""
     REJECTED = "rejected"
-    """It cannot be used; the reason says why."""
+    """Unusable, with a reason."""
 
 
 UNCHECKED = (State.UPLOADED, State.VALIDATED)
@@ -31,44 +32,45 @@ ACTIVATABLE = (State.READY, State.RETIRED)
 
 @dataclass(frozen=True)
 class VersionRecord:
-    """One version of a model. Name, number, digests and size never change."""
+    """Version of a model. Name, number, digests and size never change."""
 
     name: str
     version: int
     state: State
     reason: str | None
-    """Why it is rejected, or why it was rolled back."""
+    """Reason of a rejection or a rollback."""
     digest: str
-    """SHA-256 of the uploaded file, in hexadecimal."""
+    """SHA-256 of the uploaded file in hex."""
     size_bytes: int
-    """Of the uploaded file."""
+    """Size of the uploaded file."""
     uploaded_by: str
     uploaded_at: datetime
     changed_by: str
-    """Who brought it into its present state."""
+    """Caller that caused the present state."""
     changed_at: datetime
     description: dict[str, Any] = field(default_factory=dict)
-    """What the check found: gaussians, parameters, field, width_px, height_px, time_window_s, model_sha256, render_ms. Empty before."""
+    """Results of the check: gaussians, parameters, field, width_px, height_px, time_window_s,
+    model_sha256, render_ms. Empty before the check."""
 
 
 @dataclass(frozen=True)
 class ModelRecord:
-    """A model: its versions have consecutive numbers, which are never given twice."""
+    """Model. Its version numbers increase and are never reused."""
 
     name: str
     created_at: datetime
     active: int | None
-    """The version that is served."""
+    """Active version number."""
     last_version: int
-    """The highest number that was ever given, deleted versions included."""
+    """Highest version number used so far, including deleted versions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Change(VersionRecord):
-    """A version after something was done to it (after delete: as it was), and everything that an entry in an audit log needs."""
+    """Version after a change (before it, for a deletion), with the data of an audit entry."""
 
     action: str
-    """activate, rollback or delete."""
+    """Kind of change: activate, rollback or delete."""
     by: str
     at: datetime
     active_before: int | None
@@ -76,7 +78,7 @@ class Change(VersionRecord):
     why: str | None = None
 
     def entry(self) -> dict[str, Any]:
-        """The same in values of JSON; `object_digest` ties the entry to the uploaded file."""
+        """Return the audit entry in JSON types. `object_digest` identifies the uploaded file."""
         return {
             "action": f"model.{self.action}",
             "model": self.name,
@@ -93,13 +95,14 @@ class Change(VersionRecord):
 
 @dataclass(frozen=True)
 class Recovery:
-    """What `recover` found at start. Only `removed` was changed; the rest is for people to decide."""
+    """Result of `recover`. Only `removed` items were changed; the rest needs an administrator's
+    decision."""
 
     removed: tuple[str, ...] = ()
-    """Half-written files, and files that belong to no version."""
+    """Incomplete files and files without a version."""
     unchecked: tuple[tuple[str, int], ...] = ()
-    """Versions whose check has not ended; `check` takes it up again."""
+    """Versions whose check did not finish; `check` repeats it."""
     damaged: tuple[tuple[str, int, str], ...] = ()
-    """Versions whose stored file is gone or has another size, and the sentence that says so."""
+    """Versions whose stored file is missing or has another size, with a message."""
     skipped: str | None = None
-    """Why nothing was removed, where that is so."""
+    """Reason if nothing was removed."""

@@ -1,4 +1,4 @@
-"""What is looked after when the registry starts: leftovers of processes that died are removed, damage is reported and left as it is."""
+"""Recovery at registry start: leftovers of dead processes are deleted, damage is reported only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.registry.unpacked import UnpackedModels, folder_name
 
 _log = logging.getLogger(__name__)
 _BLOB = re.compile(rf"[0-9a-f]{{64}}-[0-9a-f]{{16}}{re.escape(SUFFIX)}")
-"""Keys that we give. Whatever else lies in the store is not ours."""
+"""Format of keys created by this program. Other files in the store are left alone."""
 
 Row = Mapping[Any, Any]
 
@@ -23,9 +23,13 @@ Row = Mapping[Any, Any]
 def remove_leftovers(
     rows: Sequence[Row], stored: Sequence[StoredBlob], blobs: BlobStore, incoming: Path, unpacked: UnpackedModels
 ) -> tuple[str, ...]:
-    """Remove half-written uploads, files that no version names, and folders of versions that are gone; returns what was removed.
+    """Delete incomplete uploads, files without a version, and folders of deleted versions. Called
+    under the exclusive lock.
 
-    Called while nobody else writes. `stored` was listed before `rows` were read, so that a file whose row came in between is kept.
+    `stored` was listed before `rows` were read, so a file whose row was added in between is kept.
+
+    Returns:
+        Descriptions of the deleted items.
     """
     removed = []
     for path in sorted(incoming.iterdir()):
@@ -45,7 +49,7 @@ def remove_leftovers(
 def findings(
     rows: Sequence[Row], stored: Sequence[StoredBlob], removed: tuple[str, ...], skipped: str | None
 ) -> Recovery:
-    """What was removed, which versions are still to be checked, and whose file is not as it was."""
+    """Report removed items, unchecked versions and damaged files."""
     sizes = {blob.key: blob.size for blob in stored}
     unchecked, damaged = [], []
     for row in rows:

@@ -1,4 +1,4 @@
-"""From the registry's rows to its records: the few queries that everything else is made of."""
+"""Queries that convert between the registry's rows and records."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from services.registry.tables import ACTIVATIONS, MODELS, VERSIONS
 
 
 def now() -> datetime:
-    """The wall clock, in UTC and milliseconds: what is compared with what was stored."""
+    """Return the wall-clock time in UTC, truncated to milliseconds like the stored times."""
     at = datetime.now(UTC)
     return at.replace(microsecond=at.microsecond // 1000 * 1000)
 
 
 def model_row(connection: sa.Connection, name: str) -> sa.RowMapping:
-    """The row of a model; NotFound where there is none."""
+    """Return the row of a model.
+
+    Raises:
+        NotFound: if the model does not exist.
+    """
     row = connection.execute(sa.select(MODELS).where(MODELS.c.name == name)).mappings().one_or_none()
     if row is None:
         raise NotFound(f"there is no model {name[:80]!r}; upload a version of it first")
@@ -27,7 +31,11 @@ def model_row(connection: sa.Connection, name: str) -> sa.RowMapping:
 
 
 def version_row(connection: sa.Connection, name: str, version: int) -> sa.RowMapping:
-    """The row of a version; NotFound where there is none, or no such model."""
+    """Return the row of a version.
+
+    Raises:
+        NotFound: if the model or the version does not exist.
+    """
     query = sa.select(VERSIONS).where(VERSIONS.c.name == name, VERSIONS.c.version == version)
     row = connection.execute(query).mappings().one_or_none()
     if row is None:
@@ -37,7 +45,7 @@ def version_row(connection: sa.Connection, name: str, version: int) -> sa.RowMap
 
 
 def version_rows(connection: sa.Connection, name: str | None = None) -> list[sa.RowMapping]:
-    """The rows of all versions, or those of one model, in order."""
+    """Return the rows of all versions, or of one model, in order."""
     query = sa.select(VERSIONS).order_by(VERSIONS.c.name, VERSIONS.c.version)
     if name is not None:
         query = query.where(VERSIONS.c.name == name)
@@ -47,7 +55,7 @@ def version_rows(connection: sa.Connection, name: str | None = None) -> list[sa.
 def change_state(
     connection: sa.Connection, name: str, version: int, state: State, by: str, at: datetime, **values: Any
 ) -> None:
-    """Write a version's new state, who brought it there and when, and other columns that change with it."""
+    """Update a version's state, the acting caller, the time and further columns."""
     changed = {"state": str(state), "changed_by": by, "changed_at": at.isoformat(), **values}
     connection.execute(
         sa.update(VERSIONS).where(VERSIONS.c.name == name, VERSIONS.c.version == version).values(changed)
@@ -55,18 +63,18 @@ def change_state(
 
 
 def set_active(connection: sa.Connection, name: str, version: int) -> None:
-    """Let a version be the one that is served."""
+    """Set the active version of a model."""
     connection.execute(sa.update(MODELS).where(MODELS.c.name == name).values(active=version))
 
 
 def activation_steps(connection: sa.Connection, name: str) -> list[tuple[int, int]]:
-    """(step, version) of every activation that was not rolled back, oldest first."""
+    """Return (step, version) of every activation that was not rolled back, oldest first."""
     query = sa.select(ACTIVATIONS.c.step, ACTIVATIONS.c.version).where(ACTIVATIONS.c.name == name)
     return [(row.step, row.version) for row in connection.execute(query.order_by(ACTIVATIONS.c.step))]
 
 
 def version_record(row: sa.RowMapping) -> VersionRecord:
-    """What callers get of a version's row."""
+    """Convert a row to a version record."""
     return VersionRecord(
         name=row["name"],
         version=row["version"],
@@ -83,7 +91,7 @@ def version_record(row: sa.RowMapping) -> VersionRecord:
 
 
 def model_record(row: sa.RowMapping) -> ModelRecord:
-    """What callers get of a model's row."""
+    """Convert a row to a model record."""
     return ModelRecord(
         name=row["name"],
         created_at=datetime.fromisoformat(row["created_at"]),

@@ -1,4 +1,5 @@
-"""An upload on its way in: copied beside the store, measured, hashed, and refused when it is not an archive of a model."""
+"""Staging of an upload: copied next to the store, measured, hashed, and rejected if it is not a
+model archive."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from services.registry.limits import RegistryLimits
 
 @dataclass(frozen=True)
 class StagedUpload:
-    """A whole upload on our disk, and what was measured of it."""
+    """Complete upload on the local disk, with its measurements."""
 
     path: Path
     size_bytes: int
@@ -30,10 +31,18 @@ class StagedUpload:
 
 
 def stage(file: Path, incoming: Path, digest: str | None, limits: RegistryLimits) -> StagedUpload:
-    """Copy an upload into the folder `incoming`, durably, so that nobody can change it any more, and look at its container.
+    """Copy an upload durably into `incoming`, so the caller can no longer change it, and parse its
+    container. On errors nothing is left behind.
 
-    digest: SHA-256 that its sender states, in hexadecimal. Raises Rejected (too large, not the stated digest, not the format), StoreUnavailable (it
-    cannot be read, or there is no room); nothing is left behind then.
+    Args:
+        file: the upload.
+        incoming: folder for the copy.
+        digest: SHA-256 stated by the sender, in hex, or None.
+        limits: budgets of an upload.
+
+    Raises:
+        Rejected: if the file is too large, has another digest, or another format.
+        StoreUnavailable: if the file cannot be read or the disk is full.
     """
     target = beside(incoming / "upload", PART_SUFFIX)
     copy = _Copy(limits.upload_bytes)
@@ -56,7 +65,7 @@ def stage(file: Path, incoming: Path, digest: str | None, limits: RegistryLimits
 
 
 class _Copy:
-    """Bytes on their way through: counted against the limit, and hashed."""
+    """Copy loop that counts bytes against the limit and hashes them."""
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes

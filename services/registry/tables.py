@@ -1,4 +1,4 @@
-"""The registry's tables. A change here needs a new file in `migrations/versions`."""
+"""Tables of the registry. Each change here needs a new file in `migrations/versions`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MODELS = sa.Table(
     sa.Column("last_version", sa.Integer, nullable=False),
     sa.Column("active", sa.Integer, nullable=True),
 )
-"""`active` says which version is served: the one row that an activation swaps."""
+"""Models. `active` is the served version number; an activation updates only this row."""
 
 VERSIONS = sa.Table(
     "versions",
@@ -40,7 +40,7 @@ VERSIONS = sa.Table(
     sa.Column("changed_at", sa.String(40), nullable=False),
     sa.Column("description", sa.JSON, nullable=False),
 )
-"""Times are ISO 8601 in UTC. `blob` is the key of the uploaded file in the blob store."""
+"""Versions. Times are ISO 8601 in UTC. `blob` is the key of the uploaded file in the blob store."""
 
 ACTIVATIONS = sa.Table(
     "activations",
@@ -49,4 +49,4 @@ ACTIVATIONS = sa.Table(
     sa.Column("step", sa.Integer, primary_key=True, autoincrement=False),
     sa.Column("version", sa.Integer, nullable=False),
 )
-"""Which versions were active, oldest first: activation adds the last row, rollback takes it away."""
+"""History of active versions, oldest first. An activation appends a row; a rollback deletes it."""

@@ -1,4 +1,5 @@
-"""The two files of a version as a folder, as `load_bundle` reads it: made from the stored file when it is asked for, checked every time."""
+"""Unpacked versions as folders for `load_bundle`, created on demand from the stored file and
+verified on each access."""
 
 from __future__ import annotations
 
@@ -20,18 +21,21 @@ _log = logging.getLogger(__name__)
 
 
 class UnpackedModels:
-    """Folders named by what is in them; versions with the same contents share one. Any thread may use it, and several processes at once."""
+    """Folders named by content; versions with equal content share a folder. Safe for threads and
+    several processes."""
 
     def __init__(self, folder: Path, incoming: Path, blobs: BlobStore, reached: Callable[[str], None]) -> None:
         self._folder, self._incoming, self._blobs, self._reached = folder, incoming, blobs, reached
         self._locks: dict[str, threading.Lock] = {}
-        """For each folder, so that none is made twice at once and nobody waits for another one."""
+        """Lock per folder. Prevents duplicate unpacking without blocking other folders."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def folder_of(self, row: Mapping[Any, Any]) -> Path:
-        """The folder of a version's row; both files have the digests that were taken at the upload.
+        """Return the folder of a version, with verified digests.
 
-        Raises BlobDamaged where the stored file is gone or changed, StoreUnavailable where it cannot be read or unpacked.
+        Raises:
+            BlobDamaged: if the stored file is missing or altered.
+            StoreUnavailable: if it cannot be read or unpacked.
         """
         target = self._folder / folder_name(row)
         with self._locks.setdefault(target.name, threading.Lock()):
@@ -52,11 +56,15 @@ class UnpackedModels:
         return target
 
     def remove(self, row: Mapping[Any, Any]) -> None:
-        """Remove a version's folder, if there is one."""
+        """Delete a version's folder if it exists."""
         shutil.rmtree(self._folder / folder_name(row), ignore_errors=True)
 
     def remove_others(self, wanted: set[str]) -> list[str]:
-        """Remove every folder whose name is not wanted, half-made ones among them; returns their names."""
+        """Delete every folder not in `wanted`, including incomplete ones.
+
+        Returns:
+            The deleted names.
+        """
         names = sorted(path.name for path in self._folder.iterdir() if path.name not in wanted)
         for name in names:
             shutil.rmtree(self._folder / name, ignore_errors=True)
@@ -82,7 +90,7 @@ class UnpackedModels:
 
 
 def folder_name(row: Mapping[Any, Any]) -> str:
-    """The name of the folder with a version's two files: made of what is in them."""
+    """Return the folder name of a version, derived from its digests."""
     return f"{row['tensors_sha256']}-{row['manifest_sha256'][:16]}"
 
 
@@ -96,7 +104,7 @@ def _is_intact(folder: Path, row: Mapping[Any, Any]) -> bool:
 
 
 def _sha256(path: Path) -> str | None:
-    """None where there is no plain file."""
+    """Return the SHA-256 of a regular file in hex, or None for anything else."""
     if path.is_symlink() or not path.is_file():
         return None
     sha256 = hashlib.sha256()

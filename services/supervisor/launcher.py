@@ -8,11 +8,11 @@ launcher's memory.
 
 Each connection to the launcher's socket carries one JSON request and one JSON answer:
 
- request | answer |
----|---|
- `{"command": "start", "module": NAME, "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
- `{"command": "status", "pid": N}` | `{"ok": true, "status": "signal 9"}`; null if it still runs or is unknown |
- `{"command": "ping"}`, `{"command": "stop"}` | `{"ok": true}` |
+| request | answer |
+|---|---|
+| `{"command": "start", "module": NAME, "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
+| `{"command": "status", "pid": N}` | `{"ok": true, "status": "signal 9"}`; null if it still runs or is unknown |
+| `{"command": "ping"}`, `{"command": "stop"}` | `{"ok": true}` |
 """
 
 from __future__ import annotations
