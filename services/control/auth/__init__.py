@@ -1,1 +1,2 @@
-"""Who may do what: API keys with roles, tickets for one use, and the guard that stands before every route."""
+"""Authentication and authorisation: API keys with roles, single-use tickets, and the guard of every
+route."""

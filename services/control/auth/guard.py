@@ -1,4 +1,4 @@
-"""The guard: every route declares the role that it needs, and nothing of a request's body is read before that was looked at."""
+"""Route guard: every route declares its role, which is checked before any byte of the body is read."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from services.control.state import ControlState, control_of
 JSON = "application/json"
 MOST_TOKEN_LENGTH = 256
 BodyLimit = Literal["body_bytes", "model_bytes", "recording_bytes"]
-"""Which limit of the settings bounds a body."""
+"""Setting that limits the body size."""
 Scope = Literal["all", "stream", "any"]
-"""What a key that is limited to streams may ask of a route. `all`: nothing. `stream`: what the path parameter `name` allows, which is a stream.
-`any`: everything, for the route itself looks at `Caller.streams`."""
+"""Access of stream-limited keys to a route. `all`: none. `stream`: if the path parameter `name` is
+one of the key's streams. `any`: always, because the route itself checks `Caller.streams`."""
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What a route asks for."""
+    """Access rule of a route."""
 
     role: Role
     ticket: bool = False
-    """A ticket in the address is taken in place of a key."""
+    """Accept a ticket in the URL in place of a key."""
     takes: str | None = None
-    """Content type of the body; JSON where the route declares a body."""
+    """Content type of the body; JSON if the route declares a body."""
     most: BodyLimit = "body_bytes"
     scope: Scope = "all"
 
@@ -48,7 +48,15 @@ def requires(
     most: BodyLimit = "body_bytes",
     scope: Scope = "all",
 ) -> Callable[[Endpoint], Endpoint]:
-    """Declare what a route asks for. It stands between the route's decorator and its function."""
+    """Declare the access rule of a route. Place it between the route decorator and the function.
+
+    Args:
+        role: lowest role with access.
+        ticket: accept a ticket in the URL.
+        takes: content type of the body.
+        most: setting that limits the body size.
+        scope: access of stream-limited keys.
+    """
     rule = Rule(Role(role), ticket, takes, most, scope)
 
     def declare(endpoint: Endpoint) -> Endpoint:
@@ -59,7 +67,11 @@ def requires(
 
 
 def rule_of(endpoint: Callable[..., Any]) -> Rule:
-    """What a route's function declared; raises TypeError where it did not."""
+    """Return the rule that a route's function declares.
+
+    Raises:
+        TypeError: if it declares none.
+    """
     rule = getattr(endpoint, "__rule__", None)
     if not isinstance(rule, Rule):
         raise TypeError(
@@ -69,7 +81,7 @@ def rule_of(endpoint: Callable[..., Any]) -> Rule:
 
 
 class GuardedRoute(APIRoute):
-    """A route whose rule is enforced before its body is read, which FastAPI does before it looks at dependencies."""
+    """Route that enforces its rule before the body is read. FastAPI's dependencies run after that."""
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         rule = rule_of(endpoint)
@@ -102,12 +114,13 @@ class GuardedRoute(APIRoute):
 
 
 def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
-    """A router whose routes are guarded."""
+    """Create a router of guarded routes."""
     return APIRouter(prefix=prefix, tags=[tag], route_class=GuardedRoute)
 
 
 async def _caller_of(connection: HTTPConnection) -> Caller:
-    """Return the caller of this request. A WebSocket is guarded here: it has no body, and its route has no handler to wrap."""
+    """Return the caller of a request. WebSockets are guarded here, because their routes have no
+    handler to wrap."""
     if connection.scope["type"] == "websocket":
         rule = rule_of(connection.scope["endpoint"])
         admitted = await _admit(connection, rule, control_of(connection))
@@ -121,7 +134,8 @@ CallerOf = Annotated[Caller, Depends(_caller_of)]
 
 
 def still_valid(control: ControlState, caller: Caller) -> bool:
-    """Return False once the caller's key was revoked, has expired or has another role or other streams, or the person's token has expired.
+    """Return False once a caller lost access: key revoked, expired or changed in role or streams,
+    or token expired.
 
     For connections that outlast their admission, such as displays.
     """
@@ -153,7 +167,11 @@ async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) 
 
 
 def _check_scope(connection: HTTPConnection, rule: Rule, caller: Caller) -> None:
-    """Raise Forbidden where a key that is limited to streams asks for anything else. The answer does not tell whether a stream exists."""
+    """Check that a stream-limited key may use the route.
+
+    Raises:
+        Forbidden: if not, regardless of whether the stream exists.
+    """
     if rule.scope == "any" or (rule.scope == "stream" and caller.may_use(str(connection.path_params["name"]))):
         return
     control_of(connection).measures.refused.labels("stream scope").inc()
@@ -177,7 +195,8 @@ async def _authenticated(connection: HTTPConnection, rule: Rule, control: Contro
     scheme, _, token = (given[0] if given else "").partition(" ")
     if scheme.lower() != "bearer" or not token:
         raise Unauthenticated("send an API key as `Authorization: Bearer KEY`")
-    if control.persons is not None and token.count(".") == 2:  # a signed token's three parts; no API key has them
+    # a signed token has three parts; API keys contain no dots
+    if control.persons is not None and token.count(".") == 2:
         return await control.persons.caller_of(token.strip())
     token = token.strip()
     known = len(token) <= MOST_TOKEN_LENGTH
@@ -192,7 +211,7 @@ async def _authenticated(connection: HTTPConnection, rule: Rule, control: Contro
 
 
 def _query_names(dependant: Any) -> set[str]:
-    """Names of the query parameters of a route and of all that it depends on."""
+    """Return the query parameter names of a route and its dependencies."""
     own = {param.alias for param in dependant.query_params}
     return own.union(*(_query_names(each) for each in dependant.dependencies))
 
@@ -202,9 +221,10 @@ def _known_parameters(dependant: Any, rule: Rule) -> set[str]:
 
 
 def _refuse_unknown(connection: HTTPConnection, known: set[str]) -> None:
-    """Raise Unprocessable for a query parameter that the route does not have, and for one that is given twice.
+    """Refuse unknown and repeated query parameters, which would otherwise be ignored silently.
 
-    Either would be ignored, and the answer would be to another question.
+    Raises:
+        Unprocessable: if there is one.
     """
     given = [name for name, _ in connection.query_params.multi_items()]
     for name in given:

@@ -1,4 +1,5 @@
-"""The keys by which an OpenID Connect issuer signs: fetched when they are needed, kept while they are fresh, asked for again when a new one comes."""
+"""Signing keys of an OpenID Connect issuer: fetched on demand, cached, and refetched for an unknown
+key id."""
 
 from __future__ import annotations
 
@@ -20,15 +21,16 @@ from services.settings.oidc import OidcSettings
 log = logging.getLogger(__name__)
 FRESH_S = 600.0
 KEPT_S = 24 * 3600.0
-"""Keys are used so much longer while the issuer does not answer."""
+"""Seconds for which cached keys stay usable while the issuer does not answer."""
 AGAIN_S = 10.0
-"""A token with a key that is not known, or an issuer that failed, makes this server ask again after so long, not with every request."""
+"""Minimum seconds between requests to the issuer, so unknown key ids and failures do not cause a
+request each."""
 FETCH_S = 5.0
 MOST_BYTES = 1 << 20
 
 
 class IssuerKeys:
-    """Public keys of one issuer, by their id."""
+    """Public keys of one issuer by key id."""
 
     def __init__(
         self,
@@ -44,10 +46,15 @@ class IssuerKeys:
         self._lock = asyncio.Lock()
 
     async def key(self, key_id: str | None, algorithm: str) -> jwt.PyJWK:
-        """A key for an algorithm; without an id the only one there is. Raises Unauthenticated for one that the issuer does not have,
-        jwt.PyJWTError for one of another kind, Unavailable where no keys can be had."""
+        """Return the key for an algorithm. Without an id the issuer must have only one key.
+
+        Raises:
+            Unauthenticated: if the issuer does not have the key.
+            jwt.PyJWTError: if the key has another type.
+            Unavailable: if no keys can be fetched.
+        """
         if not self._is_fresh() or self._found(key_id) is None:
-            async with self._lock:  # those who wait meanwhile find what the first one has fetched
+            async with self._lock:  # waiting requests use the keys that the first one fetched
                 if (not self._is_fresh() or self._found(key_id) is None) and self._clock() - self._tried_s >= AGAIN_S:
                     await self._renew()
         if self._clock() - self._had_s > KEPT_S:
@@ -104,7 +111,11 @@ class IssuerKeys:
 
 
 def _signing_keys(document: Any) -> dict[str, dict[str, Any]]:
-    """The keys of a JWK set that sign; those for encryption, and shared secrets, do not. Raises ValueError where there is none."""
+    """Return the asymmetric signing keys of a JWK set, without encryption keys and shared secrets.
+
+    Raises:
+        ValueError: if there is none.
+    """
     found = {
         str(each.get("kid", "")): dict(each)
         for each in document["keys"]
@@ -113,5 +124,5 @@ def _signing_keys(document: Any) -> dict[str, dict[str, Any]]:
     if not found:
         raise ValueError("it has no key that signs")
     for each in found.values():
-        jwt.PyJWK(each)  # raises for one that is none
+        jwt.PyJWK(each)  # raises for an invalid key
     return found

@@ -1,5 +1,8 @@
-"""Keys that are made and revoked by `intrasplat keys` are in the audit log, as those of the API are: written by the command itself where no server
-runs, else by the server, which sees that the file has changed."""
+"""Audit entries for key changes by `intrasplat keys`.
+
+Without a running server the command writes the entry. Otherwise the server writes it when it
+detects the changed file.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,16 @@ from services.control.auth.keys import ApiKey, KeyStore
 
 log = logging.getLogger(__name__)
 SHELL = "shell"
-"""Who has done it: somebody who may write into the server's folder."""
+"""Actor of changes by a user with write access to the server's folder."""
 AGAIN_S = 2.0
 
 
 def append_key_change(audit: AuditLog, event: str, key: ApiKey) -> None:
-    """Write the entry. Raises AuditUnwritable."""
+    """Append the audit entry of a key change.
+
+    Raises:
+        AuditUnwritable: if the entry cannot be written.
+    """
     if event == "key.create":
         subject, detail = key.name, {"key_id": key.id, **limits_of(key)}
     else:
@@ -28,17 +35,18 @@ def append_key_change(audit: AuditLog, event: str, key: ApiKey) -> None:
 
 
 def limits_of(key: ApiKey) -> Detail:
-    """Return the expiry and the streams of a key for the audit log; nothing where it has none."""
+    """Return the expiry and streams of a key for the audit log, if set."""
     found: Detail = {}
     if key.expires_at is not None:
         found["expires_at"] = key.expires_at
-    if key.streams is not None:  # an entry's values are short: the first names, and how many there are
+    if key.streams is not None:  # audit values are short: the number of streams and the first names
         found["streams"] = f"{len(key.streams)}: {' '.join(key.streams)}"[:400]
     return found
 
 
 def changed_outside(audit: AuditLog, event: str, key: ApiKey) -> None:
-    """The key is changed already: what cannot be written to the audit log is in the log."""
+    """Append the audit entry of a change by another process. The change is already made, so a
+    failure is only logged."""
     try:
         append_key_change(audit, event, key)
     except (AuditUnwritable, ValueError) as error:
@@ -47,8 +55,8 @@ def changed_outside(audit: AuditLog, event: str, key: ApiKey) -> None:
 
 @asynccontextmanager
 async def keys_read_again(keys: KeyStore) -> AsyncIterator[None]:
-    """While the block lasts, and once more at its end, look for changes of the keys, for no request may come to see them; and write the times of
-    last use."""
+    """Poll for key changes while the block runs and once at its end, independently of requests.
+    Also saves the times of last use."""
     looking = asyncio.create_task(_look(keys), name="changes of keys")
     try:
         yield
@@ -68,5 +76,6 @@ def _look_once(keys: KeyStore, *, ends: bool = False) -> None:
     try:
         keys.all()
         keys.save_used(now=ends)
-    except (OSError, ValueError, TypeError, KeyError) as error:  # requests get an error until it can be read again
+    # requests are answered with an error until the file is readable again
+    except (OSError, ValueError, TypeError, KeyError) as error:
         log.error("the file of the API keys cannot be read: %s", error)

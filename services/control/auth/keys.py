@@ -1,7 +1,8 @@
-"""API keys. Only their digests are kept: a key is 256 random bits, so that one SHA-256 is as good as a slow hash is for a password.
+"""API keys, stored as digests. A key has 256 random bits, so one SHA-256 is as safe as a slow
+password hash.
 
-`keys.json` changes only when a key is made or revoked. When each key was last used is in `keys.used.json`, which the server
-writes once a minute at most: losing that file loses no key.
+`keys.json` changes only when a key is created or revoked. `keys.used.json` holds the times of last
+use and is written at most once a minute; its loss affects no key.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from services.control.auth.roles import Role
 log = logging.getLogger(__name__)
 PREFIX = "intrasplat"
 MOST_LIVE = 2
-"""Valid keys of one name: the old key and the new one, while callers change over."""
+"""Valid keys per name: old and new key during a change-over."""
 MOST_KEYS = 1000
 MOST_STREAMS = 100
-"""Streams that one key may be limited to."""
+"""Most streams that one key may be limited to."""
 SAVE_USED_S = 60.0
-"""Shortest time between two writes of the file of last uses."""
+"""Minimum seconds between two writes of the last-use file."""
 _NOBODY = 64 * "0"
 _SHA256 = re.compile("[0-9a-f]{64}")
 MOST_BYTES = 1 << 24
@@ -44,11 +45,11 @@ _MEND = "put back a copy of it from a backup, or move it away to begin without k
 
 
 class KeyConflict(UserError):
-    """Keys cannot be changed in this way now; says why."""
+    """The requested change of keys is not permitted."""
 
 
 class KeysUnwritable(UserError, OSError):
-    """The file of the keys cannot be written; the earlier file stays."""
+    """The key file cannot be written; the earlier file is unchanged."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         said = error.strerror or error
@@ -59,12 +60,12 @@ class KeysUnwritable(UserError, OSError):
 
 
 class KeysUnreadable(UserError, ValueError):
-    """The file of the keys is damaged, or cannot be read."""
+    """The key file is damaged or unreadable."""
 
 
 @dataclass(frozen=True)
 class ApiKey:
-    """A key as it is kept: never its secret. Times are UTC in ISO 8601."""
+    """Stored key, without its secret. Times are UTC in ISO 8601."""
 
     id: str
     name: str
@@ -72,9 +73,9 @@ class ApiKey:
     sha256: str
     created_at: str
     expires_at: str | None = None
-    """Refused from this moment on; None: valid until it is revoked."""
+    """Expiry; None if the key is valid until revoked."""
     streams: tuple[str, ...] | None = None
-    """Streams that the key is limited to; None: not limited."""
+    """Streams that the key is limited to; None for all."""
 
     def has_expired(self, now: datetime | None = None) -> bool:
         """Return True from `expires_at` on."""
@@ -82,7 +83,7 @@ class ApiKey:
 
 
 class KeyStore:
-    """The keys in a file, which several processes may change: it is read again whenever it has changed."""
+    """Key file shared by several processes; reread after each change."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -94,43 +95,50 @@ class KeyStore:
         self._saved: tuple[float, dict[str, str]] = float("-inf"), {}
 
     def watch(self, on_change: Callable[[str, ApiKey], None]) -> None:
-        """From now on, call `on_change` with `key.create` or `key.revoke` and the key for each change by another process, when it is seen."""
+        """Report later key changes of other processes.
+
+        Args:
+            on_change: called with `key.create` or `key.revoke` and the key.
+        """
         self._current()
         self._on_change = on_change
 
     def find(self, token: str) -> ApiKey | None:
-        """Return the valid key that a token is; None for an unknown, revoked or expired one. Takes equally long for each of them."""
+        """Return the valid key of a token, or None. The time does not depend on the reason for
+        None."""
         key = self._match(token)
         return None if key is None or key.has_expired() else key
 
     def expired(self, token: str) -> ApiKey | None:
-        """Return the key that a token is if it has expired, so that its owner can be told when."""
+        """Return the key of a token if it has expired, for an error message with the expiry."""
         key = self._match(token)
         return key if key is not None and key.has_expired() else None
 
     def get(self, key_id: str) -> ApiKey | None:
-        """Return a valid key; None if it was revoked or has expired. Cheap: for looking again while a connection lasts."""
+        """Return a valid key by id, or None. Cheap enough for periodic checks of open connections."""
         key = self._current().get(key_id)
         return None if key is None or key.has_expired() else key
 
     def all(self) -> list[ApiKey]:
-        """Return every key, expired ones too, the oldest first."""
+        """Return every key, including expired ones, oldest first."""
         return list(self._current().values())
 
     def note_use(self, key_id: str) -> None:
-        """Remember that a key is used now. `save_used` brings it to the disk."""
+        """Note a use of a key in memory; `save_used` writes it."""
         self._uses()[key_id] = _now()
 
     def last_used(self) -> Mapping[str, str]:
-        """Return when each key was last used, by its id, in UTC. A key that was never used is absent."""
-        if self._used is None:  # a process without a server reads what the server has written, which may be newer now
+        """Return the time of last use by key id, in UTC. Unused keys are absent."""
+        if self._used is None:  # no server in this process: read the file that a server may have updated
             return _parse_used(self._used_path)
         return dict(self._used)
 
     def save_used(self, *, now: bool = False) -> None:
-        """Write the times of last use if they changed, once a minute at most. With `now`, whatever the time.
+        """Write the times of last use if changed, at most once a minute. Errors are logged, because
+        no request depends on this file.
 
-        An error is logged and not raised: no request depends on this file.
+        Args:
+            now: write regardless of the interval.
         """
         saved_s, saved = self._saved
         if self._used is None or not (now or time.monotonic() - saved_s >= SAVE_USED_S):
@@ -148,19 +156,19 @@ class KeyStore:
     def create(
         self, name: str, role: Role, *, expires_at: datetime | None = None, streams: Sequence[str] | None = None
     ) -> tuple[ApiKey, str]:
-        """Make a key.
+        """Create a key.
 
         Args:
-            name: whom it is for; at most two valid keys share a name.
-            role: what it may do.
-            expires_at: from when on it is refused, with a time zone; None: never.
-            streams: names of the streams that it is limited to; None: not limited.
+            name: owner; at most two valid keys share a name.
+            role: permissions.
+            expires_at: expiry with a time zone, or None.
+            streams: streams that the key is limited to, or None for all.
 
         Returns:
-            The key, and its token, which is not kept and cannot be shown again.
+            The key and its token. The token is not stored and cannot be shown again.
 
         Raises:
-            KeyConflict: where such a key cannot be.
+            KeyConflict: if the key is not permitted.
         """
         token = f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
         return self.add(name, role, token, expires_at=expires_at, streams=streams), token
@@ -174,7 +182,7 @@ class KeyStore:
         expires_at: datetime | None = None,
         streams: Sequence[str] | None = None,
     ) -> ApiKey:
-        """Keep the digest of a token as a key; the rest as for `create`."""
+        """Store the digest of a token as a key; see `create` for the other arguments."""
         if role is Role.PUBLIC:
             raise KeyConflict("no key has the role public; give viewer, operator or admin")
         if expires_at is not None:
@@ -212,7 +220,12 @@ class KeyStore:
             return keys[key_id]
 
     def revoke(self, key_id: str) -> ApiKey:
-        """End a key at once. Raises KeyError for an unknown id, KeyConflict for the last administrator's key."""
+        """Revoke a key at once.
+
+        Raises:
+            KeyError: if the id is unknown.
+            KeyConflict: if it is the last administrator's key.
+        """
         with self._changing() as keys:
             key = keys[key_id]
             admins = [each for each in keys.values() if each.role is Role.ADMIN and not each.has_expired()]
@@ -221,7 +234,8 @@ class KeyStore:
             return keys.pop(key_id)
 
     def _match(self, token: str) -> ApiKey | None:
-        """Return the key that a token is, expired or not. An unknown token takes as long as a wrong secret."""
+        """Return the key of a token, expired or not. An unknown key id takes as long as a wrong
+        secret."""
         prefix, _, rest = token.partition("_")
         key_id, _, secret = rest.partition("_")
         key = self._current().get(key_id)
@@ -233,7 +247,7 @@ class KeyStore:
         return self._path.with_suffix(".used.json")
 
     def _uses(self) -> dict[str, str]:
-        """The last uses in memory, read from the file at the first one."""
+        """Return the times of last use, loaded from the file on first access."""
         if self._used is None:
             self._used = _parse_used(self._used_path)
             self._saved = self._saved[0], dict(self._used)
@@ -264,7 +278,8 @@ class KeyStore:
 
     @contextmanager
     def _changing(self) -> Iterator[dict[str, ApiKey]]:
-        """The keys to change; written when the block ends without an error."""
+        """Provide the keys for a change under the file lock; written if the block ends without an
+        error."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             opened = open(self._path.with_suffix(".lock"), "a", opener=_private)  # noqa: SIM115 - closed below
@@ -280,7 +295,11 @@ class KeyStore:
 
 
 def first_admin_key(store: KeyStore, file: Path) -> bool:
-    """At the first start, when there is no key: take the administrator's from `file`, or make one and put it there. Whether one was made."""
+    """Create the administrator's key at the first start, from the token in `file` if that exists.
+
+    Returns:
+        True if a new token was created and written to `file`.
+    """
     if store.all():
         return False
     if os.path.lexists(file):
@@ -316,7 +335,11 @@ def _digest(secret: str) -> str:
 
 
 def _read_keys(path: Path) -> dict[str, ApiKey]:
-    """Return the keys in a file. Raises KeysUnreadable for a file that this program has not written like that."""
+    """Read the key file.
+
+    Raises:
+        KeysUnreadable: if the file does not have the expected format.
+    """
     try:
         keys = _parse(path)
         for key_id, key in keys.items():
@@ -338,7 +361,8 @@ def _parse(path: Path) -> dict[str, ApiKey]:
 
 
 def _key_of(values: Mapping[str, Any]) -> ApiKey:
-    """Return a key from the file. Files of versions without expiry and streams lack these. An unknown field is refused: it may restrict."""
+    """Parse a key. Expiry and streams are optional for files of older versions. Unknown fields are
+    refused, because they may restrict the key."""
     streams = values.get("streams")
     key = ApiKey(
         **{**values, "role": Role(values["role"]), "streams": None if streams is None else tuple(map(str, streams))}
@@ -349,7 +373,8 @@ def _key_of(values: Mapping[str, Any]) -> ApiKey:
 
 
 def _parse_used(path: Path) -> dict[str, str]:
-    """Return the times of last use; none where the file is missing or damaged, for it is written anew."""
+    """Read the times of last use; empty if the file is missing or damaged, because it will be
+    rewritten."""
     if not path.is_file():
         return {}
     try:
@@ -361,13 +386,17 @@ def _parse_used(path: Path) -> dict[str, str]:
 
 
 def _write(path: Path, keys: dict[str, ApiKey]) -> None:
-    """Write the keys. Fields that are not set are left out, so that an older version reads a file without them."""
+    """Write the keys. Unset fields are omitted, so older versions can read the file."""
     values = [{name: value for name, value in asdict(key).items() if value is not None} for key in keys.values()]
     _write_json(path, {"keys": values})
 
 
 def _write_json(path: Path, values: object) -> None:
-    """Replace a file durably. Raises KeysUnwritable; the earlier file stays then, and nothing else is left."""
+    """Replace a file durably.
+
+    Raises:
+        KeysUnwritable: if that fails. The earlier file is then unchanged.
+    """
     unfinished = path.with_suffix(".new")
     try:
         with open(unfinished, "w", opener=_private) as file:

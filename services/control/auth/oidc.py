@@ -1,4 +1,5 @@
-"""OpenID Connect: a person's token of the hospital's issuer in place of an API key. Nothing of it is kept; its role is what the settings say."""
+"""OpenID Connect: tokens of the hospital's issuer accepted in place of API keys. Nothing is stored;
+the settings map claims to roles."""
 
 from __future__ import annotations
 
@@ -19,14 +20,21 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9._@+-]{1,80}")
 
 
 class OpenIdPersons:
-    """Checks tokens of one issuer: signature, algorithm, issuer, audience, times; then who it is and what that may do."""
+    """Verifier of one issuer's tokens: signature, algorithm, issuer, audience and times, then user
+    and role."""
 
     def __init__(self, settings: OidcSettings, keys: IssuerKeys | None = None) -> None:
         self._settings = settings
         self._keys = keys or IssuerKeys(settings)
 
     async def caller_of(self, token: str) -> Caller:
-        """Whose token it is. Raises Unauthenticated, Forbidden where it gives no role, Unavailable where the issuer's keys cannot be had."""
+        """Return the caller of a token.
+
+        Raises:
+            Unauthenticated: if the token is not valid.
+            Forbidden: if the token's claims give no role.
+            Unavailable: if the issuer's keys cannot be fetched.
+        """
         if len(token) > MOST_TOKEN_LENGTH:
             raise Unauthenticated(f"the token has {len(token)} characters; at most {MOST_TOKEN_LENGTH} are taken")
         settings = self._settings
@@ -60,7 +68,7 @@ class OpenIdPersons:
 
 
 def _claim(claims: Mapping[str, Any], path: str) -> Any:
-    """A claim by its name, or by the names on the way to it with dots between them."""
+    """Return a claim by its name or dotted path."""
     if path in claims:
         return claims[path]
     found: Any = claims
@@ -70,7 +78,7 @@ def _claim(claims: Mapping[str, Any], path: str) -> Any:
 
 
 def _name(claims: Mapping[str, Any], settings: OidcSettings) -> tuple[str, str]:
-    """What the audit log calls a person, and a number that stands for issuer and subject."""
+    """Return the user's name for the audit log, and an id derived from issuer and subject."""
     digest = hashlib.sha256(f"{settings.issuer}\n{claims['sub']}".encode()).hexdigest()[:16]
     name = str(_claim(claims, settings.name_claim) or claims["sub"])
     return name if _PLAIN_NAME.fullmatch(name) else f"subject-{digest[:8]}", f"oidc-{digest}"

@@ -1,4 +1,4 @@
-"""Roles, each of which may do what those before it may."""
+"""Roles in ascending order; each includes the permissions of the previous ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Role(StrEnum):
-    """`public` is anybody, without a key; no key has it."""
+    """Caller role. `public` needs no key and no key has it."""
 
     PUBLIC = "public"
     VIEWER = "viewer"
@@ -15,27 +15,27 @@ class Role(StrEnum):
     ADMIN = "admin"
 
     def may(self, needed: Role) -> bool:
-        """Whether this role suffices where `needed` is asked for."""
+        """Return True if this role includes `needed`."""
         order = list(Role)
         return order.index(self) >= order.index(needed)
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Who makes a request: the name and number of a key, or of a person, and the role."""
+    """Authenticated caller: name and id of a key or an OpenID Connect user, and the role."""
 
     name: str
     key_id: str
     role: Role
     federated: bool = False
-    """A person of an OpenID Connect issuer: `key_id` is no key's number."""
+    """True for an OpenID Connect user, where `key_id` is not the id of an API key."""
     streams: frozenset[str] | None = None
-    """Streams that the key is limited to; None: not limited."""
+    """Streams that the key is limited to; None for all."""
     expires_at: float | None = None
-    """Seconds of the wall clock (Unix time) after which the person's token is not valid any more."""
+    """Unix time in seconds at which the user's token expires."""
 
     def may_use(self, stream: str) -> bool:
-        """Return True for a stream within the key's limits, whether there is such a stream or not."""
+        """Return True if the key's limits include the stream, regardless of whether it exists."""
         return self.streams is None or stream in self.streams
 
     def __str__(self) -> str:

@@ -1,4 +1,5 @@
-"""Tickets: what a browser shows in an address where it cannot send a key. Each is good for one path, once, for a short time."""
+"""Tickets for URLs, where a browser cannot send a key. Each is valid for one path, once, and for a
+short time."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ class _Ticket:
 
 
 class Tickets:
-    """The tickets that were given and not used. They live in memory: a restart voids them."""
+    """Unused tickets, held in memory; a restart invalidates them."""
 
     def __init__(self, lifetime_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self.lifetime_s = lifetime_s
@@ -29,15 +30,19 @@ class Tickets:
         self._waiting: dict[str, _Ticket] = {}
 
     def give(self, caller: Caller, path: str) -> str:
-        """A ticket with the caller's role for one path."""
+        """Create a ticket with the caller's role for one path."""
         self._forget_old()
         ticket = secrets.token_urlsafe(32)
         self._waiting[_digest(ticket)] = _Ticket(caller, path, self._clock() + self.lifetime_s)
         return ticket
 
     def use(self, ticket: str, path: str) -> Caller | None:
-        """Whose ticket it is, which it is no longer; None for one that is unknown, used, late, or for another path."""
-        # Found by its digest: how long that takes tells nothing about the tickets that there are.
+        """Consume a ticket.
+
+        Returns:
+            The caller, or None if the ticket is unknown, used, expired or for another path.
+        """
+        # Lookup by digest, so the lookup time reveals nothing about existing tickets.
         found = self._waiting.pop(_digest(ticket), None)
         if found is None or found.path != path or self._clock() > found.until_s:
             return None

@@ -1,4 +1,4 @@
-"""The routes, one module for each resource."""
+"""API routes, one module per resource."""
 
 from fastapi import APIRouter
 

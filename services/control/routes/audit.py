@@ -1,4 +1,4 @@
-"""The audit log, read: its newest entries, a search, and a download."""
+"""Audit log routes: newest entries, search and download."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from services.control.state import control_of
 router = new_router("audit")
 MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/jsonl"}
 Text = Annotated[str, Query(pattern=r"^[A-Za-z0-9_ .:@/+()-]{1,100}$")]
-"""As entries have it: what was looked for is an entry, too."""
+"""Filter text. Restricted to characters of audit values, because the filter itself is recorded in
+the log."""
 
 
 class EntryView(BaseModel):
-    """An entry."""
+    """Audit log entry."""
 
     model_config = ConfigDict(from_attributes=True)
     seq: int
@@ -41,7 +42,8 @@ class EntryView(BaseModel):
 
 
 class AuditPage(BaseModel):
-    """Entries, the newest first, and the digest of the newest of all: note it elsewhere, and nobody can shorten the log unseen."""
+    """Audit entries, newest first, with the digest of the newest entry of the log. A copy of the
+    digest elsewhere reveals truncation of the log."""
 
     entries: list[EntryView]
     head_seq: int
@@ -60,7 +62,7 @@ def wanted_of(
     since: Annotated[Moment | None, Query(description="From this moment on, with a time zone.")] = None,
     until: Annotated[Moment | None, Query(description="Before this moment, with a time zone.")] = None,
 ) -> Wanted:
-    """Return the entries to look for."""
+    """Build the filter from the query parameters."""
     return Wanted(event, actor, subject, outcome, since, until)
 
 
@@ -76,8 +78,8 @@ async def audit_entries(
     count: int = Query(100, ge=1, le=500),
     before: int | None = Query(None, ge=0, le=2**63 - 1),
 ) -> AuditPage:
-    """What was done, the newest first. That it was read is an entry, too: one a minute for the same key and the same filter, so that a page that
-    follows the log does not fill it."""
+    """List audit entries, newest first. Reading is recorded too, at most once a minute per key and
+    filter, so that a page that polls the log does not fill it."""
     control = control_of(request)
     log = control.audit
     async with AsyncExitStack() as entry:
@@ -107,7 +109,7 @@ async def export_audit(
         ExportFormat, Query(description="`jsonl`: the lines as they were written, with their digests. `csv`: a table.")
     ] = "jsonl",
 ) -> Response:
-    """Download the log, or what a filter leaves of it, the oldest entry first. The download is an entry of it."""
+    """Download the log or the filtered entries, oldest first. The download is recorded in the log."""
     log = control_of(request).audit
     async with recorded(request, caller, "audit.export", "audit", {"format": format, **_said(wanted)}):
         made = log.exported(wanted, format)
@@ -117,7 +119,7 @@ async def export_audit(
 
 
 def _said(wanted: Wanted) -> dict[str, Any]:
-    """Return a filter as the detail of an entry."""
+    """Return a filter as the detail of an audit entry."""
     times = {name: time.isoformat() for name in ("since", "until") if (time := getattr(wanted, name)) is not None}
     names = ("event", "actor", "subject", "outcome")
     return {name: value for name in names if (value := getattr(wanted, name)) is not None} | times

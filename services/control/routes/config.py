@@ -1,4 +1,4 @@
-"""The settings in force."""
+"""Settings in force."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ router = new_router("service")
 @router.get("/config")
 @requires("admin")
 async def config(request: Request) -> dict[str, Any]:
-    """The settings that this server runs with; secrets are masked."""
+    """Return the settings of this server, with secrets masked."""
     return control_of(request).settings.shown()
 
 
 @router.get("/config/schema")
 @requires("viewer")
 async def config_schema() -> dict[str, Any]:
-    """JSON schema of the settings file."""
+    """Return the JSON schema of the settings file."""
     return ServiceSettings.model_json_schema()

@@ -1,4 +1,4 @@
-"""What a stream shows, as it comes: by WebSocket, with what is known of each picture, or as MJPEG for anything that shows pictures."""
+"""Live pictures of a stream: by WebSocket with metadata, or as MJPEG for browsers and players."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Kind = Annotated[
 Quality = Annotated[int, Query(ge=10, le=95, description="Of the JPEG.")]
 GOING_AWAY = 1001
 CLOSE_S = 1.0
-"""How long a viewer may take to hear that it is over."""
+"""Seconds that a viewer may take to receive the close message."""
 
 
 @router.websocket("/streams/{name}/display")
@@ -43,11 +43,11 @@ async def display(
     kind: Kind = "shown",
     quality: Quality = 75,
 ) -> None:
-    """Binary messages, one for each picture that this viewer is in time for."""
+    """Send pictures as binary WebSocket messages. A slow viewer skips pictures."""
     async with viewing(socket, "websocket", name, kind, quality) as pictures:
         await socket.accept()
         send = in_time(socket.send_bytes, socket)
-        with suppress(ViewerStalled):  # the server closes the connection, and the system cuts it off
+        with suppress(ViewerStalled):  # the server closes the connection, and the kernel cuts it off
             async with until_ended(socket, _left(socket), caller) as ending:
                 async for picture in pictures:
                     await send(picture.message)
@@ -60,7 +60,7 @@ async def display(
 
 
 async def _left(socket: WebSocket) -> None:
-    """Viewers have nothing to say; what they send is read and forgotten, so that their leaving is heard."""
+    """Discard messages from the viewer until it disconnects."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass
 
@@ -77,14 +77,15 @@ async def _left(socket: WebSocket) -> None:
 async def mjpeg(
     request: Request, caller: CallerOf, name: ResourceName, kind: Kind = "shown", quality: Quality = 75
 ) -> Response:
-    """Pictures as `multipart/x-mixed-replace`, which an `<img>` shows."""
+    """Send pictures as `multipart/x-mixed-replace`, for an `<img>` element."""
     opened = AsyncExitStack()
     pictures = await opened.enter_async_context(viewing(request, "mjpeg", name, kind, quality))
     return MjpegResponse(request, caller, pictures, opened)
 
 
 class MjpegResponse(Response):
-    """An answer that ends when the viewer leaves, when it takes nothing for too long, or when the server does; then its pictures are closed."""
+    """MJPEG response that ends when the viewer leaves or stalls, or the server drains. The
+    subscription is then closed."""
 
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
 

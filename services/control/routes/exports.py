@@ -1,4 +1,4 @@
-"""Models and snapshots as files for other programs."""
+"""Export of models and snapshots to file formats of other programs."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ async def export_model(
     time_s: TimeS = None,
     times: Times = None,
 ) -> Response:
-    """A version of a model as a file; it was checked before. It is made by a process of its own, and found again the next time."""
+    """Export a checked version of a model. A separate process creates the file, and later requests
+    use the cached file."""
     exports, wish = exports_of(request), _wish(format, time_s, times)
     subject = f"{name}/{number}"
     return await _answer(request, caller, "model.export", subject, wish, lambda: exports.of_version(name, number, wish))
@@ -85,7 +86,7 @@ async def export_snapshot(
     time_s: TimeS = None,
     times: Times = None,
 ) -> Response:
-    """A snapshot as a file."""
+    """Export a snapshot."""
     exports, wish = exports_of(request), _wish(format, time_s, times)
     subject = f"{name}/{number}"
     return await _answer(
@@ -94,7 +95,7 @@ async def export_snapshot(
 
 
 def exports_of(request: Request) -> Exports:
-    """The exports of this server."""
+    """Return the exporter of this server."""
     return part(request, lambda parts: parts.exports, "exports")
 
 

@@ -1,4 +1,4 @@
-"""Liveness and readiness for orchestrators, without a key."""
+"""Liveness and readiness for orchestrators; no key required."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ router = new_router("health", prefix="")
 
 
 class Alive(BaseModel):
-    """The process answers."""
+    """Liveness of the process."""
 
     status: Literal["alive"] = "alive"
 
@@ -24,7 +24,8 @@ class Alive(BaseModel):
 @router.get("/livez")
 @requires("public")
 async def live() -> Alive:
-    """Whether the process answers. Nothing else is looked at: a lost camera is no reason to restart."""
+    """Confirm that the process answers. Nothing else is checked: a lost camera does not justify a
+    restart."""
     return Alive()
 
 
@@ -35,7 +36,7 @@ async def ready(
     response: Response,
     verbose: str | None = Query(None, max_length=8, description="Given, with or without a value: each check."),
 ) -> Readiness:
-    """Whether requests should come here: 503 while the server drains, or while a part that is needed is not well."""
+    """Report readiness: 503 while the server drains or a required part is unhealthy."""
     found = await readiness(control_of(request), verbose=verbose is not None)
     if found.status == "not ready":
         response.status_code = 503

@@ -1,4 +1,4 @@
-"""Replays as jobs: started, watched, cancelled, deleted."""
+"""Replay jobs: start, status, cancel, delete."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
 class ReplayWanted(BaseModel):
-    """One recording, or a list of them as one batch; and how they are replayed."""
+    """One recording or a batch of recordings, with replay options."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -44,12 +44,12 @@ class ReplayWanted(BaseModel):
 
     @property
     def names(self) -> list[str]:
-        """The recordings."""
+        """Return the recordings."""
         return self.recordings if self.recording is None else [self.recording]
 
 
 class Submitted(BaseModel):
-    """What is queued now: one replay for each recording, in order."""
+    """Queued replays, one per recording, in order."""
 
     id: str | None = Field(description="Of the replay, where one recording was named.", examples=["1f0c9a3b5d7e8f20"])
     batch: str = Field(examples=["8f20c9a35d7e1f0b"])
@@ -57,7 +57,7 @@ class Submitted(BaseModel):
 
 
 class ReplayView(BaseModel):
-    """A replay. `state`: queued, running, done, failed or cancelled; `reason` says why."""
+    """Replay job. `state`: queued, running, done, failed or cancelled; `reason` explains it."""
 
     model_config = ConfigDict(from_attributes=True)
     id: str = Field(examples=["1f0c9a3b5d7e8f20"])
@@ -89,19 +89,19 @@ class ReplayView(BaseModel):
 
 
 class BatchView(BaseModel):
-    """How many replays of a batch are in which state."""
+    """Number of replays of a batch in each state."""
 
     batch: str = Field(examples=["8f20c9a35d7e1f0b"])
     states: dict[str, int] = Field(examples=[{"queued": 3, "running": 1, "done": 196, "failed": 0, "cancelled": 0}])
 
 
 def jobs_of(connection: HTTPConnection) -> Jobs:
-    """The replays of this server."""
+    """Return the job store of this server."""
     return part(connection, lambda parts: parts.jobs, "replays")
 
 
 def view_of(jobs: Jobs, job_id: str) -> ReplayView:
-    """A replay with the results that are there."""
+    """Return a replay with its available results."""
     job = jobs.get(job_id)
     return ReplayView.model_validate(job).model_copy(update={"results": list(jobs.files(job))})
 
@@ -124,7 +124,7 @@ async def start_replays(
         description="A second request with the same key starts nothing, and gets the same answer.",
     ),
 ) -> Submitted:
-    """Queue a replay of a recording, or of each of a list."""
+    """Queue a replay of one recording, or of each recording of a list."""
     jobs = jobs_of(request)
     detail: Mapping[str, Any] = {"recordings": len(wanted.names), "recording": wanted.recording}
     async with recorded(request, caller, "replay.start", wanted.recording or "batch", {**detail}) as said:
@@ -144,7 +144,7 @@ async def replays(
     batch: str | None = Query(None, pattern=r"^[0-9a-f]{16}$", description="Of this batch alone."),
     state: State | None = Query(None, description="In this state alone."),
 ) -> list[ReplayView]:
-    """Replays, the newest first."""
+    """List replays, newest first."""
     jobs = jobs_of(request)
 
     def found() -> list[ReplayView]:
@@ -157,14 +157,14 @@ async def replays(
 @router.get("/replays/{job_id}")
 @requires("viewer")
 async def replay(request: Request, job_id: JobId) -> ReplayView:
-    """One replay."""
+    """Return one replay."""
     return await asyncio.to_thread(view_of, jobs_of(request), job_id)
 
 
 @router.get("/batches/{batch}")
 @requires("viewer")
 async def batch(request: Request, batch: BatchId) -> BatchView:
-    """How far a batch has come."""
+    """Return the progress of a batch."""
     states = await asyncio.to_thread(jobs_of(request).counts, batch)
     if not any(states.values()):
         raise Missing("there is no batch with this id; POST /v1/replays answers with the id of one")
@@ -174,7 +174,7 @@ async def batch(request: Request, batch: BatchId) -> BatchView:
 @router.post("/replays/{job_id}/cancel")
 @requires("operator")
 async def cancel_replay(request: Request, caller: CallerOf, job_id: JobId) -> ReplayView:
-    """Cancel a replay: at once where it is queued, within a second where it runs. 409 for one that has ended."""
+    """Cancel a replay: a queued one at once, a running one within a second. 409 if it has ended."""
     jobs = jobs_of(request)
     async with recorded(request, caller, "replay.cancel", job_id):
         await asyncio.to_thread(jobs.cancel, job_id, str(caller))
@@ -184,7 +184,7 @@ async def cancel_replay(request: Request, caller: CallerOf, job_id: JobId) -> Re
 @router.delete("/replays/{job_id}", status_code=204)
 @requires("admin")
 async def delete_replay(request: Request, caller: CallerOf, job_id: JobId) -> None:
-    """Delete a replay that has ended, with its results. 409 for one that has not: cancel it first."""
+    """Delete an ended replay with its results. 409 if it has not ended; cancel it first."""
     jobs = jobs_of(request)
     async with recorded(request, caller, "replay.delete", job_id):
         await asyncio.to_thread(jobs.delete, job_id)

@@ -1,4 +1,5 @@
-"""API keys: listed, made and revoked by administrators. A key is shown once, when it is made. Every caller may ask whose key it uses."""
+"""API keys: listed, created and revoked by administrators. A token is returned only at creation.
+Every caller may query its own key."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ router = new_router("keys")
 
 
 class NewKey(BaseModel):
-    """A new key. A name may have two valid keys with one role, the old and the new one, while callers change over."""
+    """New key. A name may have two valid keys with the same role, for a change-over."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
@@ -48,7 +49,7 @@ class NewKey(BaseModel):
 
 
 class KeyView(BaseModel):
-    """A key, without what makes it one."""
+    """API key without its secret."""
 
     model_config = ConfigDict(from_attributes=True)
     id: str = Field(examples=["1f0c9a3b"])
@@ -67,13 +68,13 @@ class KeyView(BaseModel):
 
 
 class MadeKey(KeyView):
-    """A key with its secret, which is not kept and not shown again."""
+    """New key with its token, which is not stored and not returned again."""
 
     key: str = Field(examples=["intrasplat_1f0c9a3b_…"])
 
 
 class Myself(BaseModel):
-    """Whose key a request was made with."""
+    """Identity of the caller."""
 
     name: str = Field(examples=["console"])
     key_id: str
@@ -86,7 +87,7 @@ class Myself(BaseModel):
 @router.get("/me")
 @requires("viewer", scope="any")
 async def who_am_i(request: Request, caller: CallerOf) -> Myself:
-    """Name, role and limits of the key that asks."""
+    """Return name, role and limits of the calling key."""
     key = next((key for key in control_of(request).keys.all() if key.id == caller.key_id), None)
     return Myself(
         name=caller.name, key_id=caller.key_id, role=caller.role, federated=caller.federated,
@@ -98,7 +99,7 @@ async def who_am_i(request: Request, caller: CallerOf) -> Myself:
 @router.get("/keys")
 @requires("admin")
 async def keys(request: Request) -> list[KeyView]:
-    """Every key, expired ones too, with the time of its last use."""
+    """List every key, including expired ones, with the time of its last use."""
     control = control_of(request)
     used = control.keys.last_used()
     return [_view(key, used.get(key.id)) for key in control.keys.all()]
@@ -107,7 +108,7 @@ async def keys(request: Request) -> list[KeyView]:
 @router.post("/keys", status_code=201)
 @requires("admin")
 async def make_key(request: Request, caller: CallerOf, new: NewKey) -> MadeKey:
-    """Make a key. 409 where the name has two valid keys, or one with another role."""
+    """Create a key. 409 if the name already has two valid keys, or one with another role."""
     async with recorded(request, caller, "key.create", new.name, {"role": new.role}) as said:
         key, token = await asyncio.to_thread(_made, control_of(request), new)
         said.update({"key_id": key.id, **limits_of(key)})
@@ -117,7 +118,7 @@ async def make_key(request: Request, caller: CallerOf, new: NewKey) -> MadeKey:
 @router.delete("/keys/{key_id}", status_code=204)
 @requires("admin")
 async def revoke_key(request: Request, caller: CallerOf, key_id: str) -> None:
-    """Revoke a key: it is refused from now on."""
+    """Revoke a key; later requests with it are refused."""
     store = control_of(request).keys
     if all(key.id != key_id for key in store.all()):
         raise Missing("there is no key with this number; GET /v1/keys lists them")

@@ -1,4 +1,4 @@
-"""Metrics in Prometheus' format."""
+"""Metrics in the Prometheus format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ router = new_router("health", prefix="")
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 @requires("viewer")
 async def metrics(request: Request) -> Response:
-    """What is measured; give Prometheus a key with the role viewer (`authorization: credentials_file`)."""
+    """Return the metrics. Give Prometheus a key with the role viewer (`authorization:
+    credentials_file`)."""
     encode, content_type = choose_encoder(request.headers.get("accept", ""))
     body = await asyncio.to_thread(encode, control_of(request).measures.registry)
     return Response(body, headers={"Content-Type": content_type})

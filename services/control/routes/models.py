@@ -1,4 +1,4 @@
-"""Models and their versions: listed, activated, rolled back, deleted. Uploads are in `uploads.py`."""
+"""Models and their versions: list, activate, roll back, delete. Uploads are in `uploads.py`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ Number = Annotated[int, Path(ge=1, le=2**31 - 1)]
 
 
 class VersionView(BaseModel):
-    """A version. `state`: uploaded, validated, ready, active, retired, or rejected with a reason."""
+    """Model version. `state`: uploaded, validated, ready, active, retired, or rejected with a
+    reason."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["liver"])
@@ -35,7 +36,7 @@ class VersionView(BaseModel):
 
 
 class ModelView(BaseModel):
-    """A model and its active version."""
+    """Model and its active version."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["liver"])
@@ -43,7 +44,8 @@ class ModelView(BaseModel):
 
 
 class Activation(BaseModel):
-    """Which version is to be shown, and which one the caller believes is now: another one refuses it."""
+    """Version to activate, and the version that the caller expects to be active. A different active
+    version refuses the request."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     version: int = Field(ge=1, le=2**31 - 1, examples=[3])
@@ -51,14 +53,14 @@ class Activation(BaseModel):
 
 
 def registry_of(request: Request) -> Models:
-    """The registry of this server."""
+    """Return the model registry of this server."""
     return part(request, lambda parts: parts.models, "a registry of models")
 
 
 @router.get("/models")
 @requires("viewer")
 async def models(request: Request) -> list[ModelView]:
-    """Every model."""
+    """List every model."""
     found = await asyncio.to_thread(registry_of(request).models)
     return [ModelView.model_validate(model) for model in found]
 
@@ -66,7 +68,7 @@ async def models(request: Request) -> list[ModelView]:
 @router.get("/models/{name}/versions")
 @requires("viewer")
 async def model_versions(request: Request, name: ResourceName) -> list[VersionView]:
-    """Every version of a model."""
+    """List every version of a model."""
     found = await asyncio.to_thread(registry_of(request).versions, name)
     return [VersionView.model_validate(version) for version in found]
 
@@ -74,14 +76,15 @@ async def model_versions(request: Request, name: ResourceName) -> list[VersionVi
 @router.get("/models/{name}/versions/{number}")
 @requires("viewer")
 async def model_version(request: Request, name: ResourceName, number: Number) -> VersionView:
-    """One version."""
+    """Return one version."""
     return VersionView.model_validate(await asyncio.to_thread(registry_of(request).version, name, number))
 
 
 @router.post("/models/{name}/activate")
 @requires("operator")
 async def activate_model(request: Request, caller: CallerOf, name: ResourceName, wanted: Activation) -> VersionView:
-    """Show a version from the next frame on. 409 when another version than `expected_current` is active."""
+    """Activate a version from the next frame on. 409 if another version than `expected_current` is
+    active."""
     registry = registry_of(request)
     detail = {"expected_current": wanted.expected_current}
     async with recorded(request, caller, "model.activate", f"{name}/{wanted.version}", {**detail}):
@@ -92,7 +95,7 @@ async def activate_model(request: Request, caller: CallerOf, name: ResourceName,
 @router.post("/models/{name}/rollback")
 @requires("operator")
 async def roll_back_model(request: Request, caller: CallerOf, name: ResourceName) -> VersionView:
-    """Show the version before again."""
+    """Activate the previous version again."""
     registry = registry_of(request)
     async with recorded(request, caller, "model.rollback", name) as said:
         record = await asyncio.to_thread(registry.rollback, name, str(caller))
@@ -103,7 +106,7 @@ async def roll_back_model(request: Request, caller: CallerOf, name: ResourceName
 @router.delete("/models/{name}/versions/{number}", status_code=204)
 @requires("admin")
 async def delete_model_version(request: Request, caller: CallerOf, name: ResourceName, number: Number) -> None:
-    """Delete a version; never the active one."""
+    """Delete a version. The active version cannot be deleted."""
     registry = registry_of(request)
     async with recorded(request, caller, "model.delete", f"{name}/{number}"):
         await asyncio.to_thread(registry.delete, name, number, str(caller))

@@ -1,4 +1,5 @@
-"""Recordings: uploaded as the body itself, checked in a process of their own after the answer, listed, deleted."""
+"""Recordings: upload as request body, list, delete. A separate process checks an upload after the
+answer."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ BODY = {
 
 
 class RecordingDescription(BaseModel):
-    """What was found in a recording."""
+    """Properties found in a recording."""
 
     model_config = ConfigDict(extra="ignore")
     layout: str | None = Field(None, examples=["video"])
@@ -47,7 +48,8 @@ class RecordingDescription(BaseModel):
 
 
 class RecordingView(BaseModel):
-    """A recording. `state`: uploaded, ready, rejected with a reason, or missing where its files are not on the disk."""
+    """Recording. `state`: uploaded, ready, rejected with a reason, or missing if its files are gone
+    from the disk."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["case-7"])
@@ -63,14 +65,14 @@ class RecordingView(BaseModel):
 
 
 def recordings_of(request: Request) -> Recordings:
-    """The recordings of this server."""
+    """Return the recording store of this server."""
     return part(request, lambda parts: parts.recordings, "recordings")
 
 
 @router.get("/recordings")
 @requires("viewer")
 async def recordings(request: Request) -> list[RecordingView]:
-    """Every recording."""
+    """List every recording."""
     found = await asyncio.to_thread(recordings_of(request).all)
     return [RecordingView.model_validate(each) for each in found]
 
@@ -78,7 +80,7 @@ async def recordings(request: Request) -> list[RecordingView]:
 @router.get("/recordings/{name}")
 @requires("viewer")
 async def recording(request: Request, name: ResourceName) -> RecordingView:
-    """One recording."""
+    """Return one recording."""
     return RecordingView.model_validate(await asyncio.to_thread(recordings_of(request).get, name))
 
 
@@ -99,7 +101,8 @@ async def upload_recording(
         examples=["sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"],
     ),
 ) -> RecordingView:  # fmt: skip
-    """Upload a recording. It is `uploaded` at first; a check makes it `ready`, or `rejected` with a reason. 409 where another one has this name."""
+    """Upload a recording. It is `uploaded` at first; a check makes it `ready`, or `rejected` with a
+    reason. 409 if a different recording has this name."""
     control = control_of(request)
     kept = recordings_of(request)
     expected = stated_sha256(content_digest)
@@ -120,17 +123,18 @@ async def upload_recording(
 @router.delete("/recordings/{name}", status_code=204)
 @requires("operator")
 async def delete_recording(request: Request, caller: CallerOf, name: ResourceName) -> None:
-    """Delete a recording; never one that a replay reads or waits to read."""
+    """Delete a recording. 409 if a queued or running replay reads it."""
     kept = recordings_of(request)
     async with recorded(request, caller, "recording.delete", name):
         await asyncio.to_thread(kept.delete, name)
 
 
 async def _check(control: ControlState, kept: Recordings, name: str) -> None:
-    """Set the recording's state to what the check finds. A check that cannot be run leaves it as it was, for the next start."""
+    """Check a recording and store the result. If the check cannot run, the state is unchanged until
+    the next start."""
     try:
         record = await asyncio.to_thread(kept.check, name)
-    except Exception as error:  # nothing waits for this task
+    except Exception as error:  # background task: no caller receives the error
         kind = known_problem(control, error)
         if kind is not None and await is_missing(control, lambda: kept.get(name)):
             log.info("a recording was deleted during its check")

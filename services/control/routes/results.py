@@ -1,4 +1,4 @@
-"""What a replay has made: its files, its progress as it runs, and its model for the registry."""
+"""Results of a replay: files, live progress, and its model for the registry."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ REPORT_POLICY = "; ".join(
         "sandbox",
     ]
 )
-"""A report has its style and its pictures within itself, and no script; it is shown as if it came from nowhere, so that it may ask for nothing."""
+"""Content security policy for reports. A report embeds its style and pictures and has no script. It
+is sandboxed and may load nothing."""
 ResultFile = Literal["report.html", "report.json", "frames.jsonl", "reconstruction.mp4", "model.isplat"]
 
 
@@ -53,7 +54,7 @@ ResultFile = Literal["report.html", "report.json", "frames.jsonl", "reconstructi
 )
 @requires("viewer", ticket=True)
 async def replay_result(request: Request, caller: CallerOf, job_id: JobId, file: ResultFile) -> Response:
-    """A file that a replay has made: its report, its video, its model."""
+    """Return a result file of a replay: report, video or model."""
     path = await asyncio.to_thread(jobs_of(request).file, job_id, file)
     headers = {"Content-Security-Policy": REPORT_POLICY} if file == "report.html" else {}
     shown = file != "model.isplat"
@@ -64,7 +65,7 @@ async def replay_result(request: Request, caller: CallerOf, job_id: JobId, file:
 
 
 class Kept(BaseModel):
-    """Under which name."""
+    """Target model for a replay's model."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"model": "liver"}]})
     model: ResourceName
@@ -75,7 +76,8 @@ class Kept(BaseModel):
 async def keep_model(
     request: Request, response: Response, caller: CallerOf, job_id: JobId, wanted: Kept
 ) -> VersionView:
-    """Keep a replay's model in the registry, as the next version of a model. It is checked like one that was uploaded."""
+    """Store a replay's model in the registry as the next version of a model. It is checked like an
+    upload."""
     jobs, registry = jobs_of(request), registry_of(request)
     async with recorded(request, caller, "replay.keep", f"{wanted.model}/{job_id}") as said:
         job = await asyncio.to_thread(jobs.get, job_id)
@@ -94,7 +96,7 @@ async def keep_model(
 async def replay_progress(
     socket: WebSocket, caller: CallerOf, job_id: Annotated[str, Path(pattern=r"^[0-9a-f]{16}$")]
 ) -> None:
-    """The replay as JSON whenever something of it has changed, until it has ended."""
+    """Send the replay as JSON on each change, until it has ended."""
     control, jobs = control_of(socket), jobs_of(socket)
     view = await asyncio.to_thread(view_of, jobs, job_id)
     if control.viewers.full:
@@ -121,6 +123,6 @@ async def replay_progress(
 
 
 async def _left(socket: WebSocket) -> None:
-    """Who watches has nothing to say; what comes is read and forgotten, so that its leaving is heard."""
+    """Discard messages from the client until it disconnects."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass

@@ -1,4 +1,4 @@
-"""Snapshots of live streams: taken, listed, deleted. They are fetched through `exports.py`."""
+"""Snapshots of live streams: take, list, delete. `exports.py` serves the files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SnapshotId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5
 
 
 class SnapshotWanted(BaseModel):
-    """What becomes of a snapshot."""
+    """Use of a snapshot."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     model: ResourceName | None = Field(
@@ -37,7 +37,7 @@ class SnapshotWanted(BaseModel):
 
 
 class SnapshotView(BaseModel):
-    """A stream's model as it stood after a frame."""
+    """Model of a stream at one frame."""
 
     model_config = ConfigDict(from_attributes=True)
     id: str | None = Field(None, examples=["1f0c9a3b5d7e8f20"], description="null: it became a version.")
@@ -55,7 +55,7 @@ class SnapshotView(BaseModel):
 
 
 def snapshots_of(request: Request) -> Snapshots:
-    """The snapshots of this server."""
+    """Return the snapshot store of this server."""
     return part(request, lambda parts: parts.snapshots, "snapshots")
 
 
@@ -69,8 +69,9 @@ async def take_snapshot(
     wanted: SnapshotWanted,
     idempotency_key: IdempotencyKey = None,
 ) -> SnapshotView:
-    """Write the live model as it stands after the next frame. The picture does not wait. 409 where the stream is stopped, just starting, or shows
-    a finished model. The newest 20 of a stream are kept."""
+    """Write the live model after the next frame, without delaying pictures. 409 if the stream is
+    stopped, just starting, or shows a finished model. The newest 20 snapshots per stream are kept.
+    """
 
     async def take() -> SnapshotView:
         async with recorded(request, caller, "snapshot.take", name, {"model": wanted.model}) as said:
@@ -97,7 +98,7 @@ async def take_snapshot(
 @router.get("/streams/{name}/snapshots")
 @requires("viewer", scope="stream")
 async def snapshots(request: Request, name: ResourceName) -> list[SnapshotView]:
-    """The snapshots of a stream that are kept, the newest first; they outlast the stream."""
+    """List the stored snapshots of a stream, newest first. They remain after the stream is deleted."""
     found = await asyncio.to_thread(snapshots_of(request).all, name)
     return [SnapshotView.model_validate(each) for each in found]
 
@@ -105,7 +106,7 @@ async def snapshots(request: Request, name: ResourceName) -> list[SnapshotView]:
 @router.get("/streams/{name}/snapshots/{number}")
 @requires("viewer", scope="stream")
 async def snapshot(request: Request, name: ResourceName, number: SnapshotId) -> SnapshotView:
-    """One snapshot."""
+    """Return one snapshot."""
     return SnapshotView.model_validate(await asyncio.to_thread(snapshots_of(request).get, name, number))
 
 

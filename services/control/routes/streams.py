@@ -1,4 +1,4 @@
-"""Streams: made, started, stopped, looked at."""
+"""Streams: create, start, stop, configure, delete."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Option = str | int | FiniteFloat | bool | None
 
 
 class StreamOptions(BaseModel):
-    """Options of the source and of the reconstruction, by name; null takes one back to its default."""
+    """Source and reconstruction options by name; null restores the default."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     options: dict[str, Option] = Field(max_length=MOST_OPTIONS, examples=[{"tool_mask": "builtin"}])
 
 
 class StreamWanted(StreamSettings):
-    """A new stream."""
+    """New stream."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
@@ -46,7 +46,8 @@ class StreamWanted(StreamSettings):
 
 
 class StreamView(BaseModel):
-    """A stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason` says why."""
+    """Stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason`
+    explains it."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["endoscope"])
@@ -76,21 +77,21 @@ class StreamView(BaseModel):
 
 
 def streams_of(request: Request) -> Streams:
-    """The streams of this server."""
+    """Return the stream manager of this server."""
     return part(request, lambda parts: parts.streams, "streams")
 
 
 @router.get("/streams")
 @requires("viewer", scope="any")
 async def streams(request: Request, caller: CallerOf) -> list[StreamView]:
-    """Every stream that the key is not kept from."""
+    """List the streams that the key may access."""
     return [_view(stream) for stream in await streams_of(request).all() if caller.may_use(stream.name)]
 
 
 @router.post("/streams", status_code=201)
 @requires("operator", scope="any")
 async def create_stream(request: Request, caller: CallerOf, wanted: StreamWanted) -> StreamView:
-    """Make a stream. Its source must be one that the settings allow (`sources`)."""
+    """Create a stream. The settings must allow its source (`sources`)."""
     found = streams_of(request)
     if not caller.may_use(wanted.name):
         raise Forbidden(f"the key {caller.name} is limited to other streams; make {wanted.name} with another key")
@@ -107,14 +108,14 @@ async def create_stream(request: Request, caller: CallerOf, wanted: StreamWanted
 @router.get("/streams/{name}")
 @requires("viewer", scope="stream")
 async def stream(request: Request, name: ResourceName) -> StreamView:
-    """One stream, with its state and its processes."""
+    """Return a stream with its state and processes."""
     return _view(await streams_of(request).get(name))
 
 
 @router.post("/streams/{name}/start")
 @requires("operator", scope="stream")
 async def start_stream(request: Request, caller: CallerOf, name: ResourceName) -> StreamView:
-    """Start a stream; one that runs goes on."""
+    """Start a stream. No effect on a running stream."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.start", name):
         return _view(await found.start(name))
@@ -123,7 +124,7 @@ async def start_stream(request: Request, caller: CallerOf, name: ResourceName) -
 @router.post("/streams/{name}/stop")
 @requires("operator", scope="stream")
 async def stop_stream(request: Request, caller: CallerOf, name: ResourceName) -> StreamView:
-    """Stop a stream, its raw picture too."""
+    """Stop a stream, including its raw picture."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.stop", name):
         return _view(await found.stop(name))
@@ -134,7 +135,7 @@ async def stop_stream(request: Request, caller: CallerOf, name: ResourceName) ->
 async def set_stream_options(
     request: Request, caller: CallerOf, name: ResourceName, wanted: StreamOptions
 ) -> StreamView:
-    """Change options; those that are not named stay."""
+    """Change options; unnamed options keep their values."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.options", name, {"options": len(wanted.options)}):
         return _view(await found.set_options(name, wanted.options))
@@ -143,7 +144,7 @@ async def set_stream_options(
 @router.delete("/streams/{name}", status_code=204)
 @requires("admin", scope="stream")
 async def delete_stream(request: Request, caller: CallerOf, name: ResourceName) -> None:
-    """Stop a stream and forget it."""
+    """Stop and delete a stream."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.delete", name):
         await found.delete(name)

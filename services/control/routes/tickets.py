@@ -1,4 +1,4 @@
-"""Tickets: a browser shows one in the address of a WebSocket or a picture, where it cannot send a key."""
+"""Single-use tickets for the URL of a WebSocket or a picture, where a browser cannot send a key."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ router = new_router("keys")
 
 
 class TicketFor(BaseModel):
-    """What it is for."""
+    """Target of a ticket."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     path: str = Field(
@@ -23,7 +23,7 @@ class TicketFor(BaseModel):
 
 
 class Ticket(BaseModel):
-    """Good once, for that path, for so long."""
+    """Single-use ticket for one path, with its lifetime."""
 
     ticket: str
     expires_s: float
@@ -32,6 +32,6 @@ class Ticket(BaseModel):
 @router.post("/tickets", status_code=201)
 @requires("viewer", scope="any")
 async def give_ticket(request: Request, caller: CallerOf, wanted: TicketFor) -> Ticket:
-    """Get a ticket with the role of this key; give it as `?ticket=…`."""
+    """Create a ticket with the role of this key; send it as `?ticket=…`."""
     tickets = control_of(request).tickets
     return Ticket(ticket=tickets.give(caller, wanted.path), expires_s=tickets.lifetime_s)

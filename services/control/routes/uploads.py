@@ -1,4 +1,5 @@
-"""Uploading a model: the file is the body, its digest a header. It is checked in a process of its own after the answer."""
+"""Model upload: the file is the request body, its digest a header. A separate process checks it
+after the answer."""
 
 from __future__ import annotations
 
@@ -37,7 +38,7 @@ DESCRIBED = {
         "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
     },
 }
-"""Of what is read from the request itself."""
+"""OpenAPI entry for the request body, which the route reads from the request itself."""
 
 
 @router.put("/models/{name}/versions", status_code=201, openapi_extra=DESCRIBED)
@@ -48,7 +49,8 @@ async def upload_model(
     caller: CallerOf,
     name: ResourceName,
 ) -> VersionView:
-    """Upload a model's next version. It is `uploaded` at first; a check makes it `ready`, or `rejected` with a reason."""
+    """Upload a model's next version. It is `uploaded` at first; a check makes it `ready`, or
+    `rejected` with a reason."""
     control = control_of(request)
     registry = registry_of(request)
     expected = stated_sha256(", ".join(request.headers.getlist("content-digest")) or None)
@@ -63,18 +65,19 @@ async def upload_model(
 
 
 def check_soon(control: ControlState, registry: Models, record: VersionRecord) -> None:
-    """Have a new version checked, after the answer."""
+    """Start the check of a new version in the background."""
     checking = asyncio.create_task(_check(control, registry, record.name, record.version))
     control.tasks.add(checking)
     checking.add_done_callback(control.tasks.discard)
 
 
 async def _check(control: ControlState, registry: Models, name: str, version: int) -> None:
-    """Set the version's state to what the check finds. A check that cannot be run leaves the version as it was, for the next start."""
+    """Check a version and store the result. If the check cannot run, the state is unchanged until
+    the next start."""
     events = control.parts.events
     try:
         record = await asyncio.to_thread(registry.check, name, version)
-    except Exception as error:  # nothing waits for this task
+    except Exception as error:  # background task: no caller receives the error
         kind = known_problem(control, error)
         if kind is not None and await is_missing(control, lambda: registry.version(name, version)):
             log.info("%s/%d was deleted during its check", name, version)

@@ -1,4 +1,4 @@
-"""Which version this is."""
+"""Version of the server."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FASTAPI = fastapi.__version__
 
 
 class Version(BaseModel):
-    """Versions, and which parts this server has."""
+    """Versions, and the available parts of this server."""
 
     version: str = Field(examples=["0.1.0"])
     api: str = "v1"
@@ -28,7 +28,7 @@ class Version(BaseModel):
 @router.get("/version")
 @requires("viewer", scope="any")
 async def version(request: Request) -> Version:
-    """Version of the server and of what it stands on."""
+    """Return the versions of the server, Python and FastAPI, and the available parts."""
     parts = control_of(request).parts
     here = [name for name in ("streams", "models", "display", "jobs", "recordings") if getattr(parts, name) is not None]
     return Version(version=request.app.version, python=platform.python_version(), fastapi=FASTAPI, parts=here)

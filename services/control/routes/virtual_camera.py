@@ -1,4 +1,4 @@
-"""The virtual camera of a stream, whose view is the picture `orbit`."""
+"""Virtual camera of a stream, the viewpoint of the picture `orbit`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ router = new_router("streams")
 
 
 class VirtualCamera(BaseModel):
-    """Where the virtual camera is, beside the endoscope's: round the point in the middle of its picture."""
+    """Position of the virtual camera relative to the endoscope, orbiting the point at the centre of
+    its picture."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}
@@ -26,6 +27,6 @@ class VirtualCamera(BaseModel):
 @router.put("/streams/{name}/camera")
 @requires("viewer", scope="stream")
 async def turn_virtual_camera(request: Request, name: ResourceName, wanted: VirtualCamera) -> VirtualCamera:
-    """Turn the stream's virtual camera. There is one for all who watch, and the last one to turn it wins. It changes nothing else, and is not
-    in the audit log. 409 where the stream is stopped or just starting."""
+    """Move the stream's virtual camera, which all viewers share; the last request wins. Nothing
+    else changes, and the audit log has no entry. 409 if the stream is stopped or just starting."""
     return VirtualCamera.model_validate(await streams_of(request).set_camera(name, wanted.model_dump()))
