@@ -1,12 +1,15 @@
-"""The `intrasplat` command. Importing this package is quick: a command imports what it needs when it runs."""
+"""Command line interface `intrasplat`. Imports are fast because each command imports its
+dependencies when it runs."""
 
 import os
 import sys
 
 
 def main() -> None:
-    """Entry point of the console script; exits with 0, 1 (a bug), 2 (bad input), 130 (interrupted) or 141 (nobody reads the output)."""
-    # Until the handler below is set, an import that Ctrl-C cuts short would show a traceback. This module is built in: it is there at once.
+    """Run the console script. Exits with 0, 1 (bug), 2 (bad input), 3 (no frame shown), 130
+    (interrupted) or 141 (output closed)."""
+    # Until the handler below is set, Ctrl-C during an import would print a traceback. The built-in
+    # module loads at once.
     import _signal  # type: ignore[import-not-found]
 
     _signal.signal(_signal.SIGINT, lambda number, frame: os._exit(130))

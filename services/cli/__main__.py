@@ -1,4 +1,4 @@
-"""`python -m services.cli` is the `intrasplat` command."""
+"""Entry point of `python -m services.cli`, the `intrasplat` command."""
 
 from services.cli import main
 

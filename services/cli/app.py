@@ -1,4 +1,4 @@
-"""The commands of `intrasplat` and their options. What a command needs is imported when it runs."""
+"""Commands of `intrasplat` and their options. Each command imports its dependencies when it runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from services.cli.options import (
 )
 from services.cli.streams import sentence
 
-# Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
+# Base class of usage errors. Its module differs between typer releases; its subclasses do not.
 _USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 app = typer.Typer(
@@ -42,7 +42,14 @@ app = typer.Typer(
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line; returns the exit code. Every error ends here."""
+    """Run a command line. Every error is converted to an exit code here.
+
+    Args:
+        arguments: arguments without the program's name.
+
+    Returns:
+        The exit code.
+    """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     empty = [word or f"argument {at}" for at, word in enumerate(arguments, 1) if _is_empty(word)]
     if empty:
@@ -54,7 +61,7 @@ def run(arguments: list[str]) -> int:
         return INTERRUPTED
     except _USAGE_ERRORS as error:
         return _say_usage(error)
-    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the one place where errors become exit codes
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the single place where errors become exit codes
         return exit_code_of(error, arguments)
     return code if isinstance(code, int) else OK
 
@@ -65,7 +72,7 @@ def _is_empty(word: str) -> bool:
 
 
 def _say_usage(error: Any) -> int:
-    """One sentence for a command line that cannot be understood; the help for one without a command."""
+    """Print a usage error in one sentence, or the help if the command is missing."""
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return BAD_INPUT
@@ -117,7 +124,8 @@ def replay(
     ] = False,
     json: JsonOption = False,
 ) -> int:
-    """Reconstruct a recording as if it were live: train on each frame as it comes, show it, measure it."""
+    """Reconstruct a recording as if it were live: train on each frame as it arrives, display it,
+    score it."""
     from operators.applications.replay import ReplaySettings
     from services.cli.replay import replay_command
 
@@ -152,7 +160,7 @@ def batch(
     poses: PosesFromOption = "given",
     json: JsonOption = False,
 ) -> int:
-    """Replay every recording of a folder; called again, it goes on where it was ended, however that was."""
+    """Replay every recording of a folder. A repeated call continues an interrupted batch."""
     from services.cli.batch import batch_command
 
     chosen = {**options.settings(), "steps_per_frame": steps_per_frame, "heldout": heldout, "poses": poses}
@@ -177,7 +185,8 @@ def live(
     record_keep: RecordKeepOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Reconstruct a stream live: show each frame's reconstruction within its time, and say how old it is."""
+    """Reconstruct a stream live: display each frame's reconstruction within its time budget, with
+    its age."""
     from services.cli.live import live_command, live_settings
 
     with live_settings(source, out, budget_ms, record, record_keep or (), **options.settings()) as settings:
@@ -210,7 +219,7 @@ def evaluate(
     out: EvaluationOutOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Measure a model or a run on a recording, beside what doing nothing scores."""
+    """Evaluate a model or a run on a recording, next to trivial baselines."""
     from services.cli.evaluate import evaluate_command, evaluation_settings
 
     return evaluate_command(model, evaluation_settings(recording, options), out, as_json=json)
@@ -219,7 +228,8 @@ def evaluate(
 @app.command()
 @takes_run_options
 def synthesize(out: OutOption, options: SynthesizeOptions, json: JsonOption = False) -> int:
-    """Make a recording with exact ground truth: tissue, tool, stereo, depth, masks, poses; and more of it where it is asked for."""
+    """Create a recording with exact ground truth: tissue, tool, stereo, depth, masks and poses,
+    with optional extras."""
     from services.cli.synthesize import synthesize_command
 
     return synthesize_command(out, options, as_json=json)
@@ -227,7 +237,7 @@ def synthesize(out: OutOption, options: SynthesizeOptions, json: JsonOption = Fa
 
 @app.command()
 def doctor(json: JsonOption = False) -> int:
-    """Say what this machine has, what is missing, and what to do about it."""
+    """Report the capabilities of this machine, missing components and remedies."""
     from services.cli.doctor import doctor_command
 
     return doctor_command(as_json=json)

@@ -1,4 +1,4 @@
-"""`intrasplat audit verify`."""
+"""Implementation of `intrasplat audit verify`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ from services.settings import SettingsInvalid, load_settings
 
 
 def audit_verify_command(file: Path | None, config: Path | None, head: str | None, *, as_json: bool) -> int:
-    """Say whether an audit log is as it was written; 2 when it is not."""
+    """Verify the hash chain of an audit log.
+
+    Returns:
+        The exit code; 2 if the log was altered.
+    """
     if head is not None and not re.fullmatch("[0-9a-f]{64}", head):
         raise SettingsInvalid(f"--head is {head!r:.80}, no digest; give the 64 hexadecimal digits of an entry")
     path = file or load_settings(config).data_dir / AUDIT_FILE

@@ -1,4 +1,4 @@
-"""`intrasplat backup` and `intrasplat restore`."""
+"""Implementation of `intrasplat backup` and `intrasplat restore`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from services.settings import ServiceSettings, load_settings
 
 
 def backup_command(target: Path, config: Path | None, data: Path | None, *, as_json: bool) -> int:
-    """Back up a service, whether it runs or not; 2 where rows had no files or the audit log does not fit."""
+    """Back up a service, running or not.
+
+    Returns:
+        The exit code; 2 if files of rows were missing or the audit log is inconsistent.
+    """
     keep_files_private()
     made = make_backup(_settings(config, data), target)
     _say(f"{target}: ", made, as_json)
@@ -34,7 +38,7 @@ def backup_command(target: Path, config: Path | None, data: Path | None, *, as_j
 
 
 def restore_command(source: Path, config: Path | None, data: Path | None, *, check: bool, as_json: bool) -> int:
-    """Check a backup and, unless `check`, put it into the service's empty folders."""
+    """Check a backup and, unless `check` is set, restore it into the service's empty folders."""
     keep_files_private()
     if check:
         found = check_backup(source)

@@ -1,4 +1,4 @@
-"""`intrasplat batch`."""
+"""Implementation of `intrasplat batch`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ SAY_S = 5.0
 def batch_command(
     folder: Path, out: Path | None, workers: int | None, options: Mapping[str, Any], *, as_json: bool
 ) -> int:
-    """Replay the recordings of a folder and print a summary; returns the exit code, NOTHING_SHOWN where no recording showed a frame."""
+    """Replay the recordings of a folder and print a summary.
+
+    Returns:
+        The exit code; NOTHING_SHOWN if no recording showed a frame.
+    """
     out = out or folder.absolute().with_name(f"{folder.absolute().name}-replays")
     batch = Batch(folder, out, _checked(options))
     cores = os.cpu_count() or 1
@@ -57,7 +61,7 @@ def batch_command(
 def _checked(options: Mapping[str, Any]) -> ReplayOptions:
     try:
         chosen = ReplayOptions(**options)
-        check_depth(chosen.depth)  # the network of onnx:FILE is read once before the recordings are
+        check_depth(chosen.depth)  # reads the network of onnx:FILE once, before the recordings
         return chosen
     except ValidationError as error:
         first = error.errors()[0]
@@ -65,7 +69,7 @@ def _checked(options: Mapping[str, Any]) -> ReplayOptions:
 
 
 class _Asked:
-    """Whether a signal has asked for the end. It is looked at between two steps of the pool, which starts no thread."""
+    """Stop flag set by signals. The pool polls it, so no thread is started."""
 
     def __init__(self) -> None:
         self._number = 0
@@ -80,7 +84,7 @@ class _Asked:
 
 
 class _Teller:
-    """Says how far a batch has come, every few seconds, on standard error."""
+    """Progress output of a batch on standard error, every few seconds."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet, self._said_s, self._said = quiet, 0.0, ""

@@ -1,4 +1,4 @@
-"""`intrasplat compare`."""
+"""Implementation of `intrasplat compare`."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from gsplat_core.io.surface_files import read_surface
 from services.cli.exit_codes import BAD_INPUT, OK
 
 INLIER_SHARE = 0.02
-"""Of the surface's extent: an inlier's distance unless it is given."""
+"""Default inlier distance as a share of the surface's extent."""
 MOST_SIZE_RATIO = 20.0
-"""Largest ratio of the sizes of two surfaces that are laid onto each other without pairs of points."""
+"""Largest size ratio of two surfaces aligned without point pairs."""
 MOST_SCALE = 1.25
-"""Largest ratio of the distances between pairs of points, in the mesh and in a model with a known unit."""
+"""Largest ratio of point pair distances between the mesh and a metric model."""
 LEAST_INLIERS = 0.05
-"""Share of inliers below which two surfaces are not one."""
+"""Share of inliers below which two surfaces do not match."""
 
 
 def compare_command(
     model: Path, mesh: Path, time_s: float | None, pairs: str | None, inlier: float | None, *, as_json: bool
 ) -> int:
-    """Lay a model's surface onto a mesh and print how far apart they are.
+    """Align a model's surface to a mesh and print the distances.
 
-    Raises BundleError where the model cannot be used, InvalidSetting for a mesh or pairs that cannot, and where the surfaces decide nothing.
+    Raises:
+        BundleError: if the model cannot be used.
+        InvalidSetting: if the mesh or the pairs cannot be used, or the alignment is ambiguous.
     """
     if inlier is not None and not 0 < inlier < float("inf"):
         raise InvalidSetting(f"the distance of inliers is {inlier:g}; it must be positive")
@@ -84,7 +86,11 @@ def compare_command(
 
 
 def _check_sizes(points: np.ndarray, surface: ClosestPoints) -> None:
-    """Raise InvalidSetting where two surfaces are of such different sizes that one of them has another unit."""
+    """Check that two surfaces have similar sizes.
+
+    Raises:
+        InvalidSetting: if the sizes suggest different units.
+    """
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     if not surface.extent / MOST_SIZE_RATIO < extent < surface.extent * MOST_SIZE_RATIO:
         raise InvalidSetting(
@@ -94,7 +100,11 @@ def _check_sizes(points: np.ndarray, surface: ClosestPoints) -> None:
 
 
 def _check_scale(with_scale: np.ndarray) -> None:
-    """Raise InvalidSetting where pairs of points are not as far from each other in the mesh as in a model with a known unit."""
+    """Check that the point pairs have similar distances in the mesh and in a metric model.
+
+    Raises:
+        InvalidSetting: if the scales differ.
+    """
     scale = float(np.cbrt(np.linalg.det(with_scale[:3, :3])))
     if not 1 / MOST_SCALE < scale < MOST_SCALE:
         raise InvalidSetting(
@@ -104,7 +114,14 @@ def _check_scale(with_scale: np.ndarray) -> None:
 
 
 def _read_pairs(text: str) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the model and of the mesh from "x,y,z=x,y,z; ...". Raises InvalidSetting."""
+    """Parse point pairs "x,y,z=x,y,z; ...".
+
+    Returns:
+        Points of the model and of the mesh, float64 [N, 3] each.
+
+    Raises:
+        InvalidSetting: if the text is malformed.
+    """
     try:
         values = np.array([[side.split(",") for side in pair.split("=")] for pair in text.split(";")], np.float64)
     except ValueError as error:

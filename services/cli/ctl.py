@@ -1,4 +1,4 @@
-"""`intrasplat ctl`: the service's API from a shell."""
+"""Commands of `intrasplat ctl`: client for the service's API."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def create(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Make a stream and start it."""
+    """Create a stream and start it."""
     made = with_client(url, key_file, ca, lambda client: client.create_stream(name, source, show=show, device=device))
     return print_found([made], STREAM, False, stream_row)
 
@@ -80,7 +80,7 @@ def models(
     ca: CaOption = None,
     json: JsonOption = False,
 ) -> int:
-    """List the models, or the versions of one."""
+    """List the models, or the versions of one model."""
     if name is None:
         return print_found(with_client(url, key_file, ca, lambda client: client.models()), MODEL, json)
     return print_found(with_client(url, key_file, ca, lambda client: client.versions(name)), VERSION, json)
@@ -94,7 +94,7 @@ def upload(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Upload a model's next version, and wait until it was checked."""
+    """Upload a model's next version and wait for its check."""
 
     def act(client: Any) -> Any:
         made = client.upload(name, file)
@@ -115,7 +115,7 @@ def activate(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Let a version be shown in place of the one that is active now."""
+    """Activate a version in place of the active one."""
 
     def act(client: Any) -> Any:
         active = {model.name: model.active for model in client.models()}
@@ -126,5 +126,5 @@ def activate(
 
 @ctl.command("rollback")
 def rollback(name: ModelName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
-    """Show the version before again."""
+    """Activate the previous version again."""
     return print_found([with_client(url, key_file, ca, lambda client: client.rollback(name))], VERSION, False)

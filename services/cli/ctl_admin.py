@@ -1,4 +1,4 @@
-"""`intrasplat ctl`: delete, keys, the audit log, health, and a status that renews itself."""
+"""Commands of `intrasplat ctl`: delete, keys, audit log, health, and a refreshing status."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ keys = typer.Typer(help="API keys of the service.", no_args_is_help=True)
 
 
 def add_to(ctl: typer.Typer) -> None:
-    """Give `intrasplat ctl` these commands."""
+    """Add these commands to `intrasplat ctl`."""
     ctl.add_typer(delete, name="delete")
     ctl.add_typer(keys, name="keys")
     for name, command in (("audit", audit), ("watch", watch), ("health", health), ("whoami", whoami)):
@@ -50,7 +50,11 @@ def add_to(ctl: typer.Typer) -> None:
 
 
 def check_sure(what: str, yes: bool) -> None:
-    """Ask for confirmation of a deletion. Raises InvalidSetting if it is refused, or without a terminal and `--yes`."""
+    """Ask for confirmation of a deletion.
+
+    Raises:
+        InvalidSetting: if it is declined, or there is neither a terminal nor `--yes`.
+    """
     if yes:
         return
     if not sys.stdin.isatty():
@@ -68,7 +72,8 @@ def _deleted(
     find: Callable[[Client], object],
     act: Callable[[Client], None],
 ) -> int:
-    """Delete what is there: looked for first, so that nobody is asked about a name that was mistyped."""
+    """Delete an existing resource. The lookup comes first, so a mistyped name fails before the
+    confirmation."""
 
     def look_and_act(client: Client) -> None:
         find(client)
@@ -88,7 +93,7 @@ def delete_stream(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Stop a stream and forget it. Its live reconstruction is lost unless a snapshot was taken."""
+    """Stop and delete a stream. Its live reconstruction is lost unless a snapshot was taken."""
     return _deleted(
         url, key_file, ca, yes, f"the stream {name}", lambda client: client.stream(name), lambda client: client.delete_stream(name)
     )  # fmt: skip
@@ -103,7 +108,7 @@ def delete_version(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Delete a version of a model; never the active one."""
+    """Delete a version of a model. The active version cannot be deleted."""
     return _deleted(
         url, key_file, ca, yes, f"version {version} of the model {model}",
         lambda client: client.version(model, version), lambda client: client.delete_version(model, version),
@@ -133,7 +138,7 @@ def delete_replay(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Delete a replay that has ended, with its results."""
+    """Delete an ended replay with its results."""
     return _deleted(
         url, key_file, ca, yes, f"the replay {job_id} and its results",
         lambda client: client.replay(job_id), lambda client: client.delete_replay(job_id),
@@ -165,7 +170,7 @@ def delete_snapshot(
 def keys_list(
     url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
 ) -> int:
-    """List the keys, without what makes them keys."""
+    """List the keys, without their secrets."""
     return print_found(with_client(url, key_file, ca, lambda client: client.keys()), KEY_COLUMNS, json)
 
 
@@ -184,7 +189,7 @@ def keys_add(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Make a key and print it; it is not kept and not shown again."""
+    """Create a key and print its token, which is not stored and cannot be shown again."""
     from services.cli.keys import expiry_in
 
     expires_at = expiry_in(expires_days)
@@ -203,7 +208,7 @@ def keys_revoke(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """End a key: it is refused from the next request on."""
+    """Revoke a key. It is refused from the next request on."""
 
     def find(client: Client) -> None:
         if all(each.id != key_id for each in client.keys()):  # noqa: SIM118
@@ -228,7 +233,7 @@ def audit(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Show the audit log, the oldest of the entries first."""
+    """Show audit log entries, oldest first."""
     wanted: dict[str, Any] = {
         "event": event, "actor": actor, "subject": subject, "outcome": outcome, "since": moment(since), "until": moment(until),
     }  # fmt: skip
@@ -272,7 +277,8 @@ def _show_audit(client: Client, wanted: Mapping[str, Any], count: int, follow: b
 
 
 def _filled(client: Client, wanted: Mapping[str, Any], count: int) -> AuditPage:
-    """Return a page with so many entries, if there are so many: a search goes through the log in pieces."""
+    """Collect up to `count` entries. Several requests may be needed, because the server searches
+    the log in parts."""
     page = first = client.audit(count, **wanted)
     entries = list(page.entries)
     while page.next_before is not None and len(entries) < count:
@@ -282,10 +288,10 @@ def _filled(client: Client, wanted: Mapping[str, Any], count: int) -> AuditPage:
 
 
 def moment(text: str | None) -> datetime | None:
-    """Return the time that a text names: ISO 8601, in this machine's zone where it names none, or a span such as 2h before now.
+    """Parse a time: ISO 8601, in this machine's zone by default, or a span such as 2h before now.
 
     Raises:
-        InvalidSetting: for anything else.
+        InvalidSetting: if the text is neither.
     """
     if text is None:
         return None
@@ -302,7 +308,7 @@ def moment(text: str | None) -> datetime | None:
 def health(
     url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
 ) -> int:
-    """Show each check of the service's readiness. Exit code 2 while it is not ready."""
+    """Show each readiness check of the service. Exit code 2 if it is not ready."""
     ready = with_client(url, key_file, ca, lambda client: client.ready())
     if json:
         typer.echo(ready.model_dump_json(indent=2))
@@ -317,7 +323,7 @@ def health(
 def whoami(
     url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
 ) -> int:
-    """Show name, role and limits of the key that is used."""
+    """Show name, role and limits of the key in use."""
     return print_found([with_client(url, key_file, ca, lambda client: client.myself())], MYSELF, json)
 
 
@@ -329,7 +335,7 @@ def watch(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Show the streams again and again: state, rates, age, restarts and displays. Ends with Ctrl-C."""
+    """Show the streams periodically: state, rates, age, restarts and displays. Ends with Ctrl-C."""
     from services.client import ClientError
 
     def look(client: Client) -> None:
@@ -360,7 +366,8 @@ def _status(client: Client, stream: str | None) -> list[str]:
 
 
 def stream_row(stream: StreamView) -> dict[str, Any]:
-    """Return a stream as a row: rates in frames a second, the newest picture's age and training PSNR, restarts and displays."""
+    """Convert a stream to a table row: frame rates, the newest picture's age and training PSNR,
+    restarts and displays."""
     capture, engine = (stream.processes.get(role) or {} for role in ("capture", "engine"))
     figures = engine.get("figures")
     picture = figures.get("picture") if isinstance(figures, Mapping) else None

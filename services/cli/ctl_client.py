@@ -1,4 +1,4 @@
-"""What the commands of `intrasplat ctl` share: where the service is, its key, and how what it answers is printed."""
+"""Common parts of `intrasplat ctl` commands: address of the service, key, and output."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def print_found(
     as_json: bool,
     row_of: Callable[[Any], Mapping[str, Any]] = lambda one: one.model_dump(mode="json"),
 ) -> int:
-    """Print records as a table with headings, or as JSON with all that they have."""
+    """Print records as a table with selected columns, or as JSON with all fields."""
     if as_json:
         typer.echo(json_format.dumps([one.model_dump(mode="json") for one in found], indent=2))
         return OK
@@ -75,7 +75,11 @@ def print_found(
 
 
 def check_download(file: Path, overwrite: bool) -> None:
-    """Raise OutputError where a download must not be written: see `operators.output_paths.check_file_path`."""
+    """Check the target of a download; see `operators.output_paths.check_file_path`.
+
+    Raises:
+        OutputError: if the file must not be written.
+    """
     from operators.output_paths import check_file_path
 
     check_file_path(file, overwrite=overwrite)

@@ -55,7 +55,7 @@ def snapshot(
     ca: CaOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Write the live model of a stream as it stands."""
+    """Take a snapshot of a stream's live model."""
 
     def act(client: Any) -> Any:
         taken = client.take_snapshot(stream, model)
@@ -72,7 +72,7 @@ def snapshots(
     ca: CaOption = None,
     json: JsonOption = False,
 ) -> int:
-    """List the snapshots of a stream that are kept."""
+    """List the stored snapshots of a stream."""
     return print_found(with_client(url, key_file, ca, lambda client: client.snapshots(stream)), SNAPSHOT, json)
 
 
@@ -89,7 +89,7 @@ def export(
     ca: CaOption = None,
     overwrite: OverwriteOption = False,
 ) -> int:
-    """Fetch a version of a model as a file for other programs."""
+    """Export a version of a model to a file for other programs."""
     wanted = _format(file, format)
     check_download(file, overwrite)
 
@@ -114,7 +114,7 @@ def fetch(
     ca: CaOption = None,
     overwrite: OverwriteOption = False,
 ) -> int:
-    """Fetch a snapshot as a file: .isplat, or one for other programs."""
+    """Export a snapshot to a file: .isplat, or a format of other programs."""
     wanted = _format(file, format)
     check_download(file, overwrite)
 
@@ -136,6 +136,6 @@ def camera(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Turn the virtual camera of a stream, whose view is the picture `orbit`."""
+    """Move the virtual camera of a stream, the viewpoint of the picture `orbit`."""
     with_client(url, key_file, ca, lambda client: client.turn_camera(stream, azimuth, elevation, zoom))
     return OK

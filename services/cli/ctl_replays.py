@@ -1,4 +1,4 @@
-"""Recordings and replays of a running service from a shell: commands of `intrasplat ctl`."""
+"""Commands of `intrasplat ctl` for recordings and replays."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays
 
 
 def add_to(ctl: typer.Typer) -> None:
-    """Give `intrasplat ctl` these commands."""
+    """Add these commands to `intrasplat ctl`."""
     for name, command in (
         ("recordings", recordings), ("add-recording", add_recording), 
         ("replays", replays), ("replay", replay), ("cancel", cancel), ("result", result), ("keep", keep),
@@ -65,7 +65,7 @@ def add_recording(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Upload a recording, and wait until it was checked. A folder is packed first."""
+    """Upload a recording and wait for its check. A folder is packed first."""
 
     def act(client: Any) -> Any:
         with _packed(path) as file:
@@ -105,7 +105,7 @@ def replay(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Start a replay of a recording, or one of each of several."""
+    """Start a replay of each given recording."""
     options = dict(_assigned(each) for each in option or ())
 
     def act(client: Any) -> Any:
@@ -134,7 +134,8 @@ def result(
     ca: CaOption = None,
     overwrite: OverwriteOption = False,
 ) -> int:
-    """Download what a replay has made: report.html, report.json, frames.jsonl, reconstruction.mp4, model.isplat."""
+    """Download a result file of a replay: report.html, report.json, frames.jsonl,
+    reconstruction.mp4, model.isplat."""
     target = out or Path(Path(name).name)
     check_download(target, overwrite)
     with_client(url, key_file, ca, lambda client: client.result(job_id, name, target, overwrite=overwrite))
@@ -149,14 +150,15 @@ def keep(
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
-    """Keep a replay's model in the registry, as the next version of a model."""
+    """Store a replay's model in the registry, as the next version of a model."""
     found = with_client(url, key_file, ca, lambda client: client.keep_model(job_id, model))
     return print_found([found], KEPT, False)
 
 
 @contextmanager
 def _packed(path: Path) -> Iterator[Path]:
-    """The file itself, or a folder's as an archive that is gone afterwards. Pictures are packed already: nothing is deflated."""
+    """Provide a file, packing a folder into a temporary archive. Nothing is deflated, because
+    images are already compressed."""
     if not path.is_dir():
         yield path
         return
@@ -178,7 +180,7 @@ def _packed(path: Path) -> Iterator[Path]:
 
 
 def _assigned(text: str) -> tuple[str, Any]:
-    """A name and its value, as YAML reads it: a number, true, a word."""
+    """Parse `name=value`, with the value as YAML: a number, a boolean or a word."""
     from services.settings.yaml_file import yaml_value
 
     name, equals, value = text.partition("=")

@@ -1,4 +1,5 @@
-"""`intrasplat doctor`: what this machine has, what is missing, what to do about it."""
+"""Implementation of `intrasplat doctor`: capabilities of this machine, missing components and
+remedies."""
 
 from __future__ import annotations
 
@@ -30,19 +31,23 @@ PACKAGES = (
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at."""
+    """Result of one check."""
 
     name: str
     value: str
     ok: bool = True
     advice: str = ""
-    """What to do when it is not ok, or what would be better."""
+    """Remedy if the check failed, or a possible improvement."""
     needed: bool = True
-    """Whether the program works without it."""
+    """True if the program does not work without the component."""
 
 
 def doctor_command(*, as_json: bool) -> int:
-    """Print all checks; 2 when something that is needed is missing."""
+    """Print all checks.
+
+    Returns:
+        The exit code; 2 if a needed component is missing.
+    """
     checks = [*_versions(), *_processor(), *_core(), *_video(), *_holoscan()]
     broken = [check for check in checks if check.needed and not check.ok]
     if as_json:
@@ -120,7 +125,7 @@ def _core() -> list[Check]:
 
 
 def _cuda(ops: list[str]) -> list[Check]:
-    """The GPU, the kernels that were built for one, and whether the two fit together."""
+    """Check the GPU, the built kernels, and their compatibility."""
     from gsplat_core.ops.native import CUDA_MISSING, cuda_build, cuda_refusal
     from services.cli.gpu_check import look
 

@@ -1,4 +1,4 @@
-"""`intrasplat evaluate`."""
+"""Implementation of `intrasplat evaluate`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ from services.reports.evaluation_schema import EvaluationReport
 
 
 def evaluation_settings(recording: Path, options: EvaluateOptions) -> EvaluationSettings:
-    """What the options ask for. Raises InvalidSetting."""
+    """Convert command line options to settings.
+
+    Raises:
+        InvalidSetting: if an option is not valid.
+    """
     return EvaluationSettings(
         recording,
         tuple(options.protocol or ()),
@@ -42,7 +46,11 @@ def evaluation_settings(recording: Path, options: EvaluateOptions) -> Evaluation
 
 
 def _place(text: str) -> Visits:
-    """Two stays at a place from `0:2,60:62`, in seconds. Raises InvalidSetting."""
+    """Parse two visits of one place, `0:2,60:62` in seconds.
+
+    Raises:
+        InvalidSetting: if the text is malformed.
+    """
     try:
         first, again = ([float(end) for end in stay.split(":")] for stay in text.split(","))
         if len(first) != 2 or len(again) != 2 or not all(math.isfinite(end) for end in (*first, *again)):
@@ -55,7 +63,11 @@ def _place(text: str) -> Visits:
 
 
 def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None, *, as_json: bool) -> int:
-    """Evaluate, write the reports where they are wanted, print the result; returns the exit code."""
+    """Evaluate, write the requested reports and print the result.
+
+    Returns:
+        The exit code.
+    """
     model, run = load_evaluated(path)
 
     def measure(folder: Path) -> EvaluationReport:
@@ -77,7 +89,7 @@ def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None,
 
 
 def print_evaluation(report: EvaluationReport, out: Path | None, *, as_json: bool) -> None:
-    """The report as JSON, or its table in plain text and where the page is."""
+    """Print the report as JSON, or its table and the path of the page."""
     if as_json:
         typer.echo(report.model_dump_json(indent=2))
         return
@@ -89,7 +101,7 @@ def print_evaluation(report: EvaluationReport, out: Path | None, *, as_json: boo
 
 
 def table(report: EvaluationReport) -> list[str]:
-    """Lines of equal columns: each protocol, its baselines indented below it."""
+    """Format the scores as aligned lines: each protocol, with its baselines indented below."""
     rows = [("", "frames", "tissue dB", "frame dB", "SSIM", "worst dB")]
     found = measured(report)
     for each in found:

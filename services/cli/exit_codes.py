@@ -1,4 +1,4 @@
-"""The one place where errors become exit codes and sentences."""
+"""Conversion of errors to exit codes and messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OK = 0
 BUG = 1
 BAD_INPUT = 2
 NOTHING_SHOWN = 3
-"""The run ended as it should, and no frame was shown."""
+"""Exit code of a regular run that showed no frame."""
 
 _MACHINE = {
     errno.ENOSPC: "free space on that disk",
@@ -28,15 +28,23 @@ _MACHINE = {
     errno.EIO: "check the disk",
     errno.ESTALE: "check the network drive",
 }
-"""What the system says about itself, whatever the file, and what to do."""
+"""System errors that are independent of the file, with their remedies."""
 _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc", "insufficient memory")
 
 
 def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
-    """Print what went wrong to stderr and return the exit code.
+    """Print an error to stderr.
 
-    What the user can change (UserError: a file, an option, a disk) is one sentence and 2, or 3 for a run that showed nothing. Everything else
-    is a bug in this program: traceback and 1. arguments: the command line; the system's errors about files that it names are the user's too.
+    A UserError (file, option, disk) prints one sentence. Everything else is a bug and prints a
+    traceback.
+
+    Args:
+        error: the exception.
+        arguments: the command line; OS errors about files named in it count as user errors.
+
+    Returns:
+        The exit code: 2 for user errors, 3 for a run that showed nothing, 130 for an interrupt, 1
+        for a bug.
     """
     if isinstance(error, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)  # noqa: T201
@@ -51,17 +59,17 @@ def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
 
 
 def user_sentence(error: BaseException, arguments: Iterable[str] = ()) -> str | None:
-    """What happened, the value, what to do; None for a bug."""
+    """Return the message for a user error, or None for a bug."""
     from gsplat_core.errors import UserError
     from operators.errors import OperatorFailed, RunFailed
 
     where = ""
     for link in _causes(error):
         if isinstance(link, OperatorFailed):
-            # The operator is where it happened; its cause is what happened.
+            # the operator is the place of the error; its cause is the reason
             frame = "" if link.seq is None else f" on frame {link.seq}"
             where = f"\n  in operator {link.operator}{frame}"
-        elif not isinstance(link, RunFailed):  # that one says that a run ended early; what it is raised from says why
+        elif not isinstance(link, RunFailed):  # RunFailed only reports the early end; its cause holds the reason
             said = str(link) if isinstance(link, UserError) else _of_the_machine(link, arguments)
             return None if said is None else sentence(said) + where
     return None
@@ -74,7 +82,8 @@ def _showed_nothing(error: BaseException) -> bool:
 
 
 def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | None:
-    """A sentence where memory, a disk or a file that the user named is at fault."""
+    """Return a message if memory, a disk or a file of the command line caused the error, otherwise
+    None."""
     if _is_out_of_memory(error):
         said = str(error).strip().splitlines() or ["an allocation failed"]
         return f"there is not enough memory ({said[0][:200]}); free some, or give a smaller --scale or fewer frames"
@@ -91,14 +100,15 @@ def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | Non
 def _is_out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError):
         return True
-    # torch's allocators raise RuntimeError, OpenCV's an error of its own; neither has a class for it on the CPU.
+    # torch raises RuntimeError and OpenCV its own error; neither has an out-of-memory class on the
+    # CPU.
     kinds = {kind.__name__ for kind in type(error).__mro__}
     text = str(error).lower()
     return bool(kinds & {"RuntimeError", "error"}) and any(words in text for words in _MEMORY_WORDS)
 
 
 def _related(named: str, argument: str) -> bool:
-    """Whether a file is what an argument names, lies in it, or is a folder on the way there."""
+    """Return True if a file is, is inside, or is an ancestor of the path in an argument."""
     _, equals, value = argument.partition("=")
     given = os.path.abspath(value if equals and argument.startswith("-") else argument)
     named = os.path.abspath(named)

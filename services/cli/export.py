@@ -1,4 +1,4 @@
-"""`intrasplat export`."""
+"""Implementation of `intrasplat export`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,13 @@ def export_command(
     model: Path, file: Path, format_name: str | None, time_s: float | None, times: int | None, *, overwrite: bool,
     as_json: bool,
 ) -> int:  # fmt: skip
-    """Export a model and print where the file is.
+    """Export a model and print the path of the file.
 
-    Raises BundleError where the model cannot be used, InvalidSetting and ExportError where it cannot be exported so, OutputError where the file cannot be written.
+    Raises:
+        BundleError: if the model cannot be used.
+        InvalidSetting: if an option does not fit.
+        ExportError: if the model cannot be exported to the format.
+        OutputError: if the file cannot be written.
     """
     wish = ExportWish(format_of(file) if format_name is None else format_named(format_name), time_s, times)
     if file.suffix.lower() != wish.format.suffix:

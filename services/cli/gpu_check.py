@@ -1,6 +1,6 @@
-"""Is there an NVIDIA GPU that this program can use, and if not, what is in the way? For `intrasplat doctor` and `make demo`.
+"""Detection of a usable NVIDIA GPU and of obstacles, for `intrasplat doctor` and `make demo`.
 
-python -m services.cli.gpu_check     # prints the answer; exit code 0 when there is one, 1 when there is none
+python -m services.cli.gpu_check     # prints the answer; exit code 0 with a GPU, 1 without
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 OLDEST = (8, 0)
-"""Compute capability that the CUDA kernels need: they use instructions of Ampere."""
+"""Minimum compute capability: the CUDA kernels use Ampere instructions."""
 DRIVER, DEVICE, WSL = Path("/proc/driver/nvidia/version"), Path("/dev/nvidiactl"), Path("/dev/dxg")
 
 
 @dataclass(frozen=True)
 class Graphics:
-    """What was found."""
+    """Result of the detection."""
 
     usable: bool
     found: str
     advice: str = ""
-    """What would make it usable; empty when it is, or nothing would."""
+    """Remedy; empty if the GPU is usable or there is no remedy."""
 
 
 def look() -> Graphics:
-    """Ask torch, whose word counts, and where it sees no GPU look at the driver's files for the reason."""
+    """Query torch, and inspect the driver's files for the reason if torch sees no GPU."""
     import torch
 
     if torch.version.cuda is None:
@@ -43,7 +43,8 @@ def look() -> Graphics:
 
 
 def _unseen(cuda: str) -> Graphics:
-    """torch sees no GPU. The driver's version file is there in every container of its machine; the device's is not."""
+    """Explain why torch sees no GPU. A container always has the host driver's version file, but not
+    the device file."""
     if DEVICE.exists() or WSL.exists():
         return Graphics(
             False,
@@ -70,7 +71,11 @@ def _why_cuda_does_not_start() -> str:
 
 
 def main() -> int:
-    """Print what was found; 0 when it is usable."""
+    """Print the result.
+
+    Returns:
+        The exit code; 0 if a GPU is usable.
+    """
     graphics = look()
     print("NVIDIA GPU:", graphics.found + (f"; {graphics.advice}" if graphics.advice else ""))  # noqa: T201 - its purpose
     return 0 if graphics.usable else 1

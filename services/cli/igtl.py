@@ -1,4 +1,4 @@
-"""`intrasplat igtl`."""
+"""Implementation of `intrasplat igtl`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def igtl_command(
     stream: str, config: Path | None, runtime: Path | None, *, kind: str, host: str, port: int, name: str | None,
     spacing_mm: float, plaintext: bool,
 ) -> int:  # fmt: skip
-    """Send a stream's pictures until asked to end."""
+    """Send a stream's pictures until interrupted."""
     if kind not in KINDS:
         raise InvalidSetting(f"there is no picture {kind!r:.60}; choose {', '.join(KINDS)}")
     check_host(host, plaintext, "OpenIGTLink has no keys, and sends pictures in the clear to whoever connects")

@@ -1,4 +1,4 @@
-"""Ctrl-C: the first one asks the run to end, the second one ends it."""
+"""Signal handling: the first Ctrl-C asks the run to stop, the second ends it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from types import FrameType, TracebackType
 INTERRUPTED = 130
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INSISTING = (signal.SIGINT, signal.SIGTERM)
-"""A terminal that is closed sends SIGHUP more than once: that never counts as insisting."""
+"""Signals whose repetition ends the run at once. Not SIGHUP, which a closing terminal may send
+repeatedly."""
 GRACE_S = 2.0
-"""How long a run that must end at once has to leave what it is in, before the process ends without it."""
+"""Seconds that a run has to unwind after the second signal before the process is terminated."""
 
 
 def end_on_interrupt() -> None:
-    """From here on Ctrl-C ends the process at once: while the program starts there is nothing to save, and an import that is cut short would
-    show a traceback."""
+    """Make Ctrl-C end the process at once. During startup nothing needs saving, and an interrupted
+    import would print a traceback."""
     signal.signal(signal.SIGINT, _end)
 
 
@@ -36,10 +37,11 @@ def _end_now() -> None:
 
 
 class InterruptRequest:
-    """While entered, SIGINT, SIGTERM and SIGHUP set `requested`, and that is acknowledged on stderr at once, whatever the program computes.
+    """Context manager that turns SIGINT, SIGTERM and SIGHUP into a flag, acknowledged on stderr at
+    once. Calling the object returns the flag.
 
-    A second SIGINT or SIGTERM raises KeyboardInterrupt; where that is not heard within GRACE_S, in a long computation, the process ends
-    without it. Called, it answers whether a signal came.
+    A second SIGINT or SIGTERM raises KeyboardInterrupt. If a long computation blocks that for
+    GRACE_S, the process is terminated.
     """
 
     def __init__(self) -> None:
@@ -51,7 +53,8 @@ class InterruptRequest:
         return self.requested
 
     def __enter__(self) -> InterruptRequest:
-        # The interpreter writes each signal's number into the pipe as it arrives; the handlers run only when the main thread gets to them.
+        # The interpreter writes signal numbers into the pipe at arrival; handlers run only when the
+        # main thread returns to Python code.
         receiver, self._sender = os.pipe()
         os.set_blocking(self._sender, False)
         self._wakeup_before = signal.set_wakeup_fd(self._sender, warn_on_full_buffer=False)
@@ -78,7 +81,7 @@ class InterruptRequest:
 
 
 def _acknowledge(receiver: int) -> None:
-    """Answer each signal when it arrives; ends when the other end of the pipe is closed."""
+    """Acknowledge each signal at its arrival, until the write end of the pipe is closed."""
     seen = 0
     ended = threading.Event()
     with os.fdopen(receiver, "rb", buffering=0) as signals:
@@ -103,6 +106,6 @@ def _end_after(ended: threading.Event) -> None:
 
 
 def _say(text: str) -> None:
-    """A line on stderr from any thread, past all buffers."""
+    """Write a line to stderr from any thread, bypassing buffers."""
     with contextlib.suppress(OSError):  # the terminal is gone
         os.write(2, f"{text}\n".encode())

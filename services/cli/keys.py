@@ -1,4 +1,5 @@
-"""`intrasplat keys`: API keys of a server's folder, whether the server runs or not."""
+"""Implementation of `intrasplat keys`: API keys in a server's folder, with or without a running
+server."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ from services.settings.sections import NAME_PATTERN
 
 
 class KeyRefused(UserError):
-    """A key cannot be made or revoked; says why."""
+    """A key cannot be created or revoked."""
 
 
 def keys_list_command(config: Path | None, data: Path | None, *, as_json: bool) -> int:
@@ -51,7 +52,7 @@ def keys_list_command(config: Path | None, data: Path | None, *, as_json: bool) 
 def keys_add_command(
     config: Path | None, data: Path | None, name: str, role: str, expires_days: float | None, streams: Sequence[str]
 ) -> int:
-    """Make a key and print it, once, to standard output."""
+    """Create a key and print its token once to standard output."""
     _check_name(name, "a key")
     for stream in streams:
         _check_name(stream, "a stream")
@@ -69,7 +70,11 @@ def keys_add_command(
 
 
 def expiry_in(days: float | None) -> datetime | None:
-    """Return the moment in so many days; None for None. Raises KeyRefused for a number of days that no calendar has."""
+    """Return the time in `days` days, or None for None.
+
+    Raises:
+        KeyRefused: if the number is not positive or too large.
+    """
     if days is None:
         return None
     try:
@@ -86,7 +91,7 @@ def _check_name(name: str, of: str) -> None:
 
 
 def keys_revoke_command(config: Path | None, data: Path | None, key_id: str) -> int:
-    """End a key."""
+    """Revoke a key."""
     try:
         key = _store(config, data).revoke(key_id)
     except KeyError as error:
@@ -99,7 +104,8 @@ def keys_revoke_command(config: Path | None, data: Path | None, key_id: str) -> 
 
 
 def _audited(config: Path | None, data: Path | None, event: str, key: ApiKey) -> None:
-    """Write the change into the audit log; a server that runs holds that log, and writes it itself within seconds."""
+    """Write the change to the audit log. A running server holds the log and writes the entry itself
+    within seconds."""
     settings = _settings(config, data)
     keep = settings.audit
     with suppress(AuditInUse):

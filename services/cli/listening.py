@@ -1,4 +1,4 @@
-"""Addresses that a command listens on without keys or encryption."""
+"""Check of listen addresses for servers without keys or encryption."""
 
 from __future__ import annotations
 
@@ -8,7 +8,16 @@ from gsplat_core.errors import InvalidSetting
 
 
 def check_host(host: str, plaintext: bool, why: str) -> None:
-    """Raises InvalidSetting for an address beyond this machine, unless that was asked for; `why` says what is wrong with it."""
+    """Check that an address is a loopback address, unless `plaintext` is set.
+
+    Args:
+        host: address to listen on.
+        plaintext: allow other addresses.
+        why: explanation for the error message.
+
+    Raises:
+        InvalidSetting: if the address is reachable from other machines.
+    """
     try:
         here = host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -1,4 +1,4 @@
-"""`intrasplat live`."""
+"""Implementation of `intrasplat live`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ PLAIN_PERIOD_S = 5.0
 
 
 class LiveStatus:
-    """One line about what is on the screen: renewed on a terminal, printed now and then anywhere else; always on stderr."""
+    """Status line of the display on stderr: refreshed on a terminal, printed periodically
+    otherwise."""
 
     def __init__(self, quiet: bool = False) -> None:
         self._quiet = quiet
@@ -62,7 +63,7 @@ class LiveStatus:
             print(file=sys.stderr)  # noqa: T201 - leaves the renewed line
 
     def __call__(self, graph: LiveApplication, scored: ScoredFrame) -> None:
-        """Take one scored frame."""
+        """Process one scored frame."""
         now_s = time.monotonic()
         if self._quiet or now_s - self._printed_s < self._period_s:
             return
@@ -88,9 +89,11 @@ def live_settings(
     record_keep: Sequence[str] = (),
     **settings: Any,
 ) -> Iterator[LiveSettings]:
-    """The settings of a run; without `out` its results are written into a folder that goes with the context, and nothing can be recorded.
+    """Provide the settings of a run. Without `out`, results go to a temporary folder and recording
+    is not possible.
 
-    Raises InvalidSetting.
+    Raises:
+        InvalidSetting: if a setting is not valid.
     """
     if budget_ms == "auto":
         clock = ClockSettings()
@@ -113,7 +116,12 @@ def live_settings(
 
 
 def recording_kept(texts: Sequence[str]) -> WriterOptions:
-    """How sessions are recorded of which so much, or what is so young, is kept: `20GiB`, `90min`, or one of each. Raises InvalidSetting."""
+    """Parse retention limits of session recordings: a size such as `20GiB`, an age such as `90min`,
+    or both.
+
+    Raises:
+        InvalidSetting: if a text is malformed.
+    """
     bounds: dict[str, float] = {}
     for text in texts:
         match = _KEPT.fullmatch(text.strip())
@@ -138,9 +146,13 @@ def recording_kept(texts: Sequence[str]) -> WriterOptions:
 
 
 def live_command(settings: LiveSettings, *, keep: bool, as_json: bool) -> int:
-    """Run live, write the reports whatever the end, print the result; returns the exit code. Without `keep` nothing stays on the disk.
+    """Run live, write the reports and print the result. Without `keep` the results are deleted.
 
-    Raises NothingShown for a run that showed no frame.
+    Returns:
+        The exit code.
+
+    Raises:
+        NothingShown: if the run showed no frame.
     """
     written: list[RunReport] = []
 
@@ -155,12 +167,12 @@ def live_command(settings: LiveSettings, *, keep: bool, as_json: bool) -> int:
     if not written:
         typer.echo("ended before there was anything to show", err=True)
         return INTERRUPTED if interrupt.requested else OK
-    # A stream has no end of its own: to interrupt it is how it is ended.
+    # A stream has no end, so an interrupt is its regular end.
     return OK
 
 
 def print_live(report: RunReport, out: Path | None, *, as_json: bool) -> None:
-    """The report as JSON, or its main figures in a few lines and where the page is."""
+    """Print the report as JSON, or its main figures and the path of the page."""
     if as_json:
         typer.echo(report.model_dump_json(indent=2))
         return
@@ -178,7 +190,7 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
         f" {sum(facts.dropped.values())} passed over; ended: {printable(report.run.stop_reason)}",
         f"age of what was shown: p50 {facts.age_p50_ms:.1f} ms, p99 {facts.age_p99_ms:.1f} ms, most {facts.age_max_ms:.1f} ms",
     ]
-    # The first second, in which the model begins, is in none of these figures.
+    # The first second, in which the model is initialised, is excluded from these figures.
     name = "displayed frame (training error)"
     lines += quality_line(name, facts.settled_psnr_tissue_db, facts.previous_frame_db)
     lines += quality_line(f"worst {name}", facts.worst_psnr_tissue_db, None)

@@ -1,4 +1,4 @@
-"""`intrasplat measure`."""
+"""Implementation of `intrasplat measure`."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ PIXEL = re.compile(r"\s*(\d+(?:\.\d+)?)\s*,\s*(\d+(?:\.\d+)?)\s*")
 
 
 def measure_command(model: Path, time_s: float | None, start: str, end: str | None, *, as_json: bool) -> int:
-    """Measure on a model and print what was found.
+    """Measure on a model's surface and print the result.
 
-    Raises BundleError where the model cannot be used, InvalidSetting for what cannot be measured: outside of the picture, never observed.
+    Raises:
+        BundleError: if the model cannot be used.
+        InvalidSetting: if a pixel is outside the picture or was never observed.
     """
     loaded = load_model(model)
     time_s = loaded.time_window_s[1] if time_s is None else time_s
@@ -38,7 +40,11 @@ def measure_command(model: Path, time_s: float | None, start: str, end: str | No
 
 
 def pixel_of(text: str) -> tuple[float, float]:
-    """Column and row of "X,Y". Raises InvalidSetting."""
+    """Parse a pixel "X,Y" (column, row).
+
+    Raises:
+        InvalidSetting: if the text is malformed.
+    """
     found = PIXEL.fullmatch(text)
     if found is None:
         raise InvalidSetting(f"{text!r:.60} is no pixel; give its column and row, as 120,85")

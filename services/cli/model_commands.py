@@ -1,4 +1,4 @@
-"""The commands of `intrasplat` that take a finished model, and their options. What a command needs is imported when it runs."""
+"""Commands of `intrasplat` for finished models. Each command imports its dependencies when it runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from services.cli.options import (
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the commands to the program."""
+    """Add these commands to the program."""
     for command in (render, pack, export, measure, compare):
         app.command()(command)
 
@@ -58,7 +58,7 @@ def pack(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Pack a model into one file, for an upload to the service."""
+    """Pack a model into one file for upload to the service."""
     from services.cli.pack import pack_command
 
     return pack_command(model, file, overwrite=overwrite, as_json=json)
@@ -83,7 +83,8 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Write a model as a file for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its surface."""
+    """Export a model for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its
+    surface."""
     from services.cli.export import export_command
 
     return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)
@@ -100,7 +101,7 @@ def measure(
     ] = None,
     json: JsonOption = False,
 ) -> int:
-    """Measure on a model's surface: points, distances and lengths, each with its standard error."""
+    """Measure points, distances and lengths on a model's surface, each with its standard error."""
     from services.cli.measure import measure_command
 
     return measure_command(model, time, start, end, as_json=json)
@@ -124,7 +125,8 @@ def compare(
     ] = None,
     json: JsonOption = False,
 ) -> int:
-    """Lay a model's surface onto a mesh (.ply, .stl or .obj, of a CT for one) without bending it, and say how far apart they are."""
+    """Align a model's surface rigidly to a mesh (.ply, .stl or .obj, for example from CT) and
+    report the distances."""
     from services.cli.compare import compare_command
 
     return compare_command(model, mesh, time, pairs, inlier, as_json=json)

@@ -1,4 +1,4 @@
-"""The options of `intrasplat`'s commands, and those that commands share."""
+"""Options of `intrasplat` commands and their shared groups."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JS
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What `replay` and `reconstruct` have in common; the names are those of `ReplaySettings`."""
+    """Options common to `replay` and `reconstruct`, named as in `ReplaySettings`."""
 
     device: DeviceOption = "cpu"
     field: FieldOption = "auto"
@@ -123,13 +123,13 @@ class RunOptions:
     eyes: EyesOption = None
 
     def settings(self) -> dict[str, Any]:
-        """By name."""
+        """Return the options by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """Those of `evaluate`."""
+    """Options of `evaluate`."""
 
     protocol: Annotated[
         list[str] | None,
@@ -156,7 +156,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True)
 class SynthesizeOptions:
-    """Those of `synthesize`."""
+    """Options of `synthesize`."""
 
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60
     width: Annotated[int, typer.Option(help="Width in pixels.")] = 320
@@ -193,7 +193,7 @@ class SynthesizeOptions:
 
 @dataclass(frozen=True)
 class LiveOptions(RunOptions):
-    """What `live` takes besides; the names are those of `LiveSettings`."""
+    """Additional options of `live`, named as in `LiveSettings`."""
 
     scale: Annotated[
         float | None,
@@ -217,7 +217,8 @@ class LiveOptions(RunOptions):
 
 
 def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
-    """A command whose parameter `options`, a dataclass, is filled from an option for each of its fields."""
+    """Wrap a command whose parameter `options` is a dataclass: each field becomes a command line
+    option."""
     kind: Any = get_type_hints(command, include_extras=True)["options"]
     shared = [
         inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default) for field in fields(kind)
@@ -237,5 +238,5 @@ def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
     ]
     call.__signature__ = inspect.Signature(both)  # type: ignore[attr-defined]
     call.__annotations__ = {each.name: each.annotation for each in both}
-    del call.__dict__["__wrapped__"]  # typer would look at the command's own signature
+    del call.__dict__["__wrapped__"]  # otherwise typer inspects the wrapped command's signature
     return call

@@ -1,4 +1,4 @@
-"""`intrasplat pack`."""
+"""Implementation of `intrasplat pack`."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS
 
 
 def pack_command(model: Path, file: Path, *, overwrite: bool, as_json: bool) -> int:
-    """Check a model, pack it into one file, and print where that is.
+    """Check a model, pack it into one file and print the path.
 
-    Raises BundleError where the model cannot be used, OutputError where the file cannot be written.
+    Raises:
+        BundleError: if the model cannot be used.
+        OutputError: if the file cannot be written.
     """
     _check_target(model, file, overwrite)
     load_bundle(model)
@@ -45,7 +47,8 @@ def _check_target(model: Path, file: Path, overwrite: bool) -> None:
 
 
 def _check_saved_whole(model: Path) -> None:
-    """A save that was interrupted between its two renames can be loaded, but its two files do not belong together."""
+    """Refuse a save that was interrupted between its two renames. Such a bundle loads, but its two
+    files do not match."""
     manifest = parse_manifest((model / MANIFEST).read_bytes(), MANIFEST) if (model / MANIFEST).exists() else None
     if manifest is None or manifest.tensors_sha256 != _sha256(model / TENSORS):
         raise BundleError(f"{model} was not saved to its end; load it and save it again before it is packed")

@@ -1,4 +1,4 @@
-"""`intrasplat poses`."""
+"""Implementation of `intrasplat poses`."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ from services.cli.progress import ProgressPrinter
 from services.cli.streams import printable
 
 MOSTLY = 0.75
-"""Share of the motion that the scope has to explain, or it is said that it may well stand still."""
+"""Share of the motion that the endoscope must explain; below it a static endoscope is reported as
+likely."""
 OFF = 0.002
-"""Of the focal length: where points are off by more, as a median, than errors of following them, tissue moves by itself."""
+"""Share of the focal length. A larger median reprojection error is attributed to tissue motion, not
+to tracking noise."""
 
 
 def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwrite: bool, as_json: bool) -> int:
-    """Estimate the poses of a recording, write them, and say how far they are to be believed."""
+    """Estimate the poses of a recording, write them and print their reliability."""
     if out.suffix != ".npy":
         raise OutputError(f"{out} does not end in .npy; give a name that does, such as {POSES_FILE}")
     check_file_path(out, [recording], overwrite=overwrite, into_recording=out.name == POSES_FILE)
@@ -52,7 +54,7 @@ def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwri
                 found, focal = trajectory_without_calibration(read, opened.camera)
             else:
                 found = trajectory_of(read(), opened.camera)
-        except InvalidInput as error:  # all that it refuses are pictures and cameras, which are the recording's here
+        except InvalidInput as error:  # it refuses only pictures and cameras, which come from the recording
             raise RecordingInvalid(f"{recording}: {error}") from error
     with storage_errors(out.parent):
         write_poses(out, found.poses, overwrite=overwrite)
@@ -61,7 +63,7 @@ def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwri
 
 
 def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
-    """What the pictures tell of a focal length that no calibration gives."""
+    """Describe how well the pictures determine an uncalibrated focal length."""
     assumed_px = float(camera.K[0, 0])
     if focal is None:
         return f"too few points could be followed far enough to tell the focal length: the poses are those of the assumed {assumed_px:.4g} px"
@@ -87,7 +89,7 @@ def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
 
 
 def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
-    """What is known of tissue that moves by itself."""
+    """Describe the detected tissue motion."""
     if found.breathing is not None:
         told = " and ".join(f"{hz:.2f}" for hz in found.breathing.frequencies_hz)
         share = found.breathing.uncertain / max(found.path, 1e-9)

@@ -1,4 +1,5 @@
-"""Progress of a run: a live bar on a terminal, plain lines anywhere else; always on stderr, so that stdout is the result's alone."""
+"""Progress output on stderr, so stdout holds only the result: a live bar on a terminal, plain lines
+otherwise."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ PLAIN_PERIOD_S = 5.0
 
 
 class ProgressPrinter:
-    """Shows `Progress` events; use as a context manager."""
+    """Context manager that prints `Progress` events."""
 
     def __init__(self, quiet: bool = False) -> None:
         self._quiet = quiet
@@ -61,7 +62,7 @@ class ProgressPrinter:
             self._bar.stop()
 
     def __call__(self, progress: Progress) -> None:
-        """Take one event."""
+        """Process one event."""
         if self._quiet:
             return
         now_s = time.monotonic()
@@ -70,7 +71,7 @@ class ProgressPrinter:
             self._stage, self._printed_s, self._measured_from = progress.stage, now_s, None
         begun = self._measured_from is None and progress.done > 0
         if begun:
-            # The first frame starts the model and takes far longer than those after it: the rate leaves it out.
+            # The first frame initialises the model and is far slower, so the rate excludes it.
             self._measured_from = now_s, progress.done
         rate = 0.0
         if self._measured_from and now_s > self._measured_from[0]:
@@ -98,7 +99,7 @@ class ProgressPrinter:
 
 
 def _quality(progress: Progress) -> str:
-    """Return the PSNR of the newest frame, what kind of error it is, and the trivial baseline."""
+    """Return the PSNR of the newest frame with its kind of error and the trivial baseline."""
     if progress.psnr_tissue_db is None:
         return ""
     kind = "training error" if progress.trained else "held out"

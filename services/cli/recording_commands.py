@@ -1,4 +1,4 @@
-"""The commands about a recording by itself: what is wrong with it, and where the scope was."""
+"""Commands for recordings: validation and pose estimation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a fi
 
 
 def add_to(app: typer.Typer) -> None:
-    """Give the program these commands."""
+    """Add these commands to the program."""
     app.command()(validate)
     app.command()(poses)
 
 
 def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
-    """Read a recording from the first frame to the last and say what is wrong with it."""
+    """Read a recording completely and report its defects."""
     from services.cli.validate import validate_command
 
     return validate_command(recording, as_json=json)
@@ -33,7 +33,7 @@ def poses(
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> int:
-    """Estimate where a moving scope was at each frame, from the pictures alone."""
+    """Estimate the pose of a moving endoscope at each frame, from the pictures alone."""
     from services.cli.poses import poses_command
 
     return poses_command(recording, out, max_frames, overwrite=overwrite, as_json=json)

@@ -1,4 +1,4 @@
-"""`intrasplat render`."""
+"""Implementation of `intrasplat render`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.cli.progress import ProgressPrinter
 
 
 def render_command(model: Path, out: Path, fps: float, *, as_json: bool, **options: Any) -> int:
-    """Render a model and print where the result is. options: those of `render_model`."""
+    """Render a model and print the path of the result. `options` are passed to `render_model`."""
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
         frames = render_model(model, out, fps=fps, progress=progress, stop_requested=interrupt, **options)
     if as_json:

@@ -1,4 +1,4 @@
-"""What `replay` and `reconstruct` have in common: progress, interruption, reports, a summary."""
+"""Common parts of `replay` and `reconstruct`: progress, interruption, reports, summary."""
 
 from __future__ import annotations
 
@@ -22,7 +22,14 @@ Run = Callable[[ProgressCallback, Callable[[], bool], Report], RunOutcome]
 
 
 def report_run(run: Run, out: Path, *, as_json: bool) -> int:
-    """Run, write the reports whatever the end, print the result; returns the exit code. Raises NothingShown for a run that showed no frame."""
+    """Run, write the reports even after an error, and print the result.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        NothingShown: if the run showed no frame.
+    """
     written: list[RunReport] = []
 
     def report(outcome: RunOutcome, folder: Path) -> None:
@@ -40,7 +47,7 @@ def report_run(run: Run, out: Path, *, as_json: bool) -> int:
 
 
 def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
-    """The report as JSON, or its main figures in a few lines and where the page is."""
+    """Print the report as JSON, or its main figures and the path of the page."""
     if as_json:
         typer.echo(report.model_dump_json(indent=2))
         return
@@ -65,7 +72,8 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
 
 
 def quality_line(name: str, psnr_db: float | None, previous_db: float | None) -> list[str]:
-    """Return one line with a mean tissue PSNR and the trivial baseline over the same frames; none without the PSNR."""
+    """Return a line with a mean tissue PSNR and the trivial baseline on the same frames; empty
+    without the PSNR."""
     if psnr_db is None:
         return []
     beside = "" if previous_db is None else f" (previous frame shown instead: {previous_db:.2f} dB)"
@@ -73,7 +81,8 @@ def quality_line(name: str, psnr_db: float | None, previous_db: float | None) ->
 
 
 def next_frame_line(report: RunReport) -> list[str]:
-    """Return the line of the figure that is no training error; none where it was not measured."""
+    """Return the line of the next-frame prediction score, which is no training error; empty if it
+    was not measured."""
     measured = report.quality.next_frame
     if measured is None:
         return []

@@ -1,4 +1,4 @@
-"""`intrasplat serve` and `intrasplat schema`."""
+"""Implementation of `intrasplat serve` and `intrasplat schema`."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from services.settings import ServiceSettings, SettingsInvalid, load_settings
 def serve_command(
     config: Path | None, host: str | None, port: int | None, data: Path | None, setting: Sequence[str]
 ) -> int:
-    """Serve until the process is asked to end."""
+    """Serve until asked to stop."""
     keep_files_private()
     named = {"server.host": host, "server.port": port, "paths.data": data}
     flags = {name: json.dumps(str(value)) for name, value in named.items() if value is not None}
     settings = load_settings(config, {**_assigned(setting), **flags})
     log_to_stderr(settings.log)
-    listener = bind(settings)  # before anything is made or started
+    listener = bind(settings)  # before anything is created or started
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     parts = assembled(settings)
     certificate = certificate_of(settings, parts.events)

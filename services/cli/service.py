@@ -1,4 +1,4 @@
-"""The commands of the service and their options."""
+"""Service commands of `intrasplat` and their options."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ audit = typer.Typer(help="The service's audit log.", no_args_is_help=True)
 
 
 def add_to(app: typer.Typer) -> None:
-    """Give the program the service's commands."""
+    """Add these commands to the program."""
     app.command()(serve)
     app.command()(schema)
     app.command()(backup)
@@ -42,7 +42,7 @@ def serve(
         typer.Option("--set", metavar="<section.key=value>", help="Any setting; more than once for several."),
     ] = None,
 ) -> int:
-    """Serve streams, models and their API to browsers and programs, until it is asked to end."""
+    """Serve streams, models and their API to browsers and programs, until stopped."""
     from services.cli.serve import serve_command
 
     return serve_command(config, host, port, data, setting or ())
@@ -61,7 +61,7 @@ def backup(
     data: DataOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Copy all that the service keeps into a new folder, whether it runs or not."""
+    """Copy all data of the service into a new folder, whether it runs or not."""
     from services.cli.backup import backup_command
 
     return backup_command(target, config, data, as_json=json)
@@ -74,7 +74,7 @@ def restore(
     check: Annotated[bool, typer.Option("--check", help="Only check the backup; change nothing.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Check a backup and put it into the service's folders, which must be empty."""
+    """Check a backup and restore it into the service's folders, which must be empty."""
     from services.cli.backup import restore_command
 
     return restore_command(backup, config, data, check=check, as_json=json)
@@ -93,7 +93,8 @@ def igtl(
         bool, typer.Option("--plaintext", help="Listen beyond this machine, though nothing is encrypted.")
     ] = False,
 ) -> int:
-    """Send a stream's pictures and the pose of its camera to 3D Slicer and others over OpenIGTLink."""
+    """Send a stream's pictures and the pose of its camera over OpenIGTLink, for example to 3D
+    Slicer."""
     from services.cli.igtl import igtl_command
 
     return igtl_command(
@@ -114,7 +115,7 @@ def view(
         bool, typer.Option("--plaintext", help="Listen beyond this machine, though nothing is encrypted.")
     ] = False,
 ) -> int:
-    """Show a model in browsers, to be turned and played (extra `viser`)."""
+    """Show a model in browsers, with free viewpoint and playback (extra `viser`)."""
     from services.cli.view import view_command
 
     return view_command(model, host, port, plaintext=plaintext)
@@ -122,7 +123,7 @@ def view(
 
 @keys.command("list")
 def keys_list(config: ConfigOption = None, data: DataOption = None, json: JsonOption = False) -> int:
-    """List the keys, without what makes them keys."""
+    """List the keys, without their secrets."""
     from services.cli.keys import keys_list_command
 
     return keys_list_command(config, data, as_json=json)
@@ -142,7 +143,8 @@ def keys_add(
     config: ConfigOption = None,
     data: DataOption = None,
 ) -> int:
-    """Make a key and print it; it is not kept and not shown again. A running server takes it at once."""
+    """Create a key and print its token, which is not stored and cannot be shown again. A running
+    server accepts it at once."""
     from services.cli.keys import keys_add_command
 
     return keys_add_command(config, data, name, role, expires_days, stream or ())
@@ -154,7 +156,7 @@ def keys_revoke(
     config: ConfigOption = None,
     data: DataOption = None,
 ) -> int:
-    """End a key. A running server refuses it at once."""
+    """Revoke a key. A running server refuses it at once."""
     from services.cli.keys import keys_revoke_command
 
     return keys_revoke_command(config, data, key_id)
@@ -171,7 +173,7 @@ def audit_verify(
     ] = None,
     json: JsonOption = False,
 ) -> int:
-    """Find entries that were changed, removed, inserted or cut off."""
+    """Detect entries that were changed, removed, inserted or truncated."""
     from services.cli.audit import audit_verify_command
 
     return audit_verify_command(file, config, head, as_json=json)

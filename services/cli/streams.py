@@ -1,7 +1,8 @@
-"""Standard output and standard error that may be closed, full or broken while the program runs.
+"""Standard output and standard error that may be closed, full or broken during a run.
 
-A run takes long and its results are files: what happens to the streams neither ends it nor changes what it writes. A stream that refuses to
-be written is remembered, and the exit code says so at the end (`StandardStreams.code`).
+A run takes long and its results are files, so a failing stream neither ends it nor changes its
+results. The first write error is remembered and reflected in the exit code
+(`StandardStreams.code`).
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ import sys
 from typing import Any, TextIO
 
 OUTPUT_CLOSED = 141
-"""What a shell reports of a program that a broken pipe ended: 128 and the number of SIGPIPE."""
+"""Exit code that a shell reports after a broken pipe: 128 plus the number of SIGPIPE."""
 _READER_GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ECONNRESET)
-"""A closed pipe; a terminal that was closed; a descriptor that was closed."""
+"""Errors of a closed pipe, terminal or descriptor."""
 _NAMES = "intrasplat-names"
 
 
 class _Descriptor(io.RawIOBase):
-    """Writes to a descriptor until that fails; the first error is kept, and everything after it is dropped."""
+    """Raw stream that writes to a descriptor. After the first error, which is kept, all output is
+    dropped."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -43,7 +45,7 @@ class _Descriptor(io.RawIOBase):
             try:
                 return os.write(self._descriptor, data)
             except BlockingIOError:
-                # A pipe that another program has set to non-blocking is full.
+                # another program set the pipe to non-blocking, and it is full
                 select.select([], [self._descriptor], [])
             except OSError as error:
                 self.error = error
@@ -51,7 +53,7 @@ class _Descriptor(io.RawIOBase):
 
 
 class StandardStreams:
-    """Takes the place of `sys.stdout` and `sys.stderr` for the rest of the process."""
+    """Replacement of `sys.stdout` and `sys.stderr` for the rest of the process."""
 
     def __init__(self) -> None:
         _occupy_closed_descriptors()
@@ -60,10 +62,13 @@ class StandardStreams:
         self._err, sys.stderr = _guarded(sys.stderr, 2)
 
     def code(self, code: int) -> int:
-        """The exit code of a program that would end with `code`, after all that it has printed was written out.
+        """Flush all output and return the final exit code.
 
-        A reader that has closed our output has had enough: nothing is said, and 0 becomes OUTPUT_CLOSED. An output that cannot be
-        written, such as a file on a full disk, is the user's to know: one sentence, and 0 becomes 2.
+        If the reader closed the output, 0 becomes OUTPUT_CLOSED without a message. Another write
+        error, such as a full disk, prints one sentence, and 0 becomes 2.
+
+        Args:
+            code: exit code of the command.
         """
         sys.stdout.flush()
         error = self._out.error if self._out is not None else None
@@ -78,7 +83,8 @@ class StandardStreams:
 
 
 def _occupy_closed_descriptors() -> None:
-    """Open /dev/null where a standard stream is closed. Otherwise the next file would get its number, and be written to by what prints there."""
+    """Open /dev/null for closed standard streams. Otherwise the next opened file would get the
+    descriptor and receive printed text."""
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -88,7 +94,7 @@ def _occupy_closed_descriptors() -> None:
 
 def _guarded(stream: TextIO | None, descriptor: int) -> tuple[_Descriptor | None, TextIO]:
     if stream is None:
-        # It was closed when the program started: nobody wants to read it.
+        # closed at program start, so no program reads the output
         return None, open(os.devnull, "w", encoding="utf-8", errors="replace")
     raw = _Descriptor(descriptor)
     errors = _NAMES if descriptor == 1 else "backslashreplace"
@@ -99,7 +105,8 @@ def _guarded(stream: TextIO | None, descriptor: int) -> tuple[_Descriptor | None
 
 
 def _as_the_system_spells_it(error: UnicodeError) -> tuple[bytes | str, int]:
-    """Bytes of a file's name that are not text come out as they are; other characters that the terminal's encoding lacks, as escapes."""
+    """Encoding error handler: undecodable bytes of file names are written unchanged, other missing
+    characters as escapes."""
     assert isinstance(error, UnicodeEncodeError)
     character = ord(error.object[error.start])
     if 0xDC80 <= character <= 0xDCFF:
@@ -108,14 +115,15 @@ def _as_the_system_spells_it(error: UnicodeError) -> tuple[bytes | str, int]:
 
 
 MOST_WORD = 240
-"""Characters of a word in a sentence; a longer one is a value that somebody gave, and is cut in its middle."""
+"""Longest word in a message; a longer value is shortened in the middle."""
 
 
 def sentence(text: str) -> str:
-    """Return an error's text on one line, in which no value makes what to do about it impossible to find."""
+    """Return an error text on one line, with long values shortened so the remedy stays visible."""
     return re.sub(rf"\S{{{MOST_WORD + 1},}}", lambda word: f"{word[0][:160]}...{word[0][-60:]}", printable(text))
 
 
 def printable(text: str) -> str:
-    """The text on one line, with control characters as escapes: a file's name may hold anything, what steers a terminal too."""
+    """Return a text on one line, with control characters escaped, because file names may contain
+    terminal sequences."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)

@@ -1,4 +1,4 @@
-"""`intrasplat synthesize`."""
+"""Implementation of `intrasplat synthesize`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from services.cli.progress import ProgressPrinter
 
 
 def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) -> int:
-    """Write a synthetic recording and print where it is. An interrupt leaves what was there before."""
+    """Write a synthetic recording and print its path. An interrupt leaves an existing recording
+    unchanged."""
     extras = Extras(
         scene=options.scene,
         third=options.third,

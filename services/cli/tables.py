@@ -1,4 +1,4 @@
-"""Tables of the service's commands: headings, aligned columns, sizes and times for people."""
+"""Table output of the service commands: headings, aligned columns, readable sizes and times."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 from services.cli.streams import printable
 
 WIDEST = 60
-"""Characters of a cell, but for the last column, which nothing follows."""
+"""Widest cell in characters, except in the last column."""
 Columns = Mapping[str, str]
-"""Headings by the name of the field; a dot leads into a field (`figures.age_ms`)."""
+"""Headings by field name; a dot selects a nested field (`figures.age_ms`)."""
 KEY_COLUMNS: Columns = {
     "id": "ID", "role": "ROLE", "created_at": "CREATED", "expires_at": "EXPIRES", "expired": "EXPIRED",
     "last_used_at": "LAST USED", "streams": "STREAMS", "name": "NAME",
@@ -21,11 +21,14 @@ _EMPTY = {"expires_at": "never", "last_used_at": "never", "streams": "all"}
 
 
 def table(columns: Columns, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the lines of a table: the headings, then a line for each row. Columns without any value are left out, the first one never.
+    """Format a table as lines. Columns without values are omitted, except the first.
 
     Args:
         columns: headings by field.
-        rows: a mapping for each line; a missing field is an empty cell.
+        rows: one mapping per line; missing fields give empty cells.
+
+    Returns:
+        The headings, then one line per row.
     """
     cells = [[_text(field, _value(row, field)) for field in columns] for row in rows]
     first = next(iter(columns))
@@ -50,7 +53,7 @@ def _value(row: Mapping[str, Any], field: str) -> Any:
 
 
 def _text(field: str, value: Any) -> str:
-    """Return a cell's text on one line: times to the second with their zone, sizes in binary units."""
+    """Format a cell on one line: times to the second with their zone, sizes in binary units."""
     if value is None or value == "":
         return _EMPTY.get(field, "")
     if field.endswith("_at") or field == "at":
@@ -71,12 +74,12 @@ def _text(field: str, value: Any) -> str:
 def _time(text: str) -> str:
     try:
         return datetime.fromisoformat(text).astimezone().strftime("%Y-%m-%d %H:%M:%S %z")
-    except (ValueError, OverflowError, OSError):  # a server may say anything
+    except (ValueError, OverflowError, OSError):  # the server's text may be no time
         return printable(text)
 
 
 def size(count: float) -> str:
-    """Return a number of bytes for people, in binary units."""
+    """Format a number of bytes in binary units."""
     for unit in ("B", "KiB", "MiB"):
         if count < 1024:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"

@@ -1,4 +1,4 @@
-"""`intrasplat validate`."""
+"""Implementation of `intrasplat validate`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from services.cli.streams import printable
 
 
 def validate_command(recording: Path, *, as_json: bool) -> int:
-    """Print what the recording holds and what is wrong with it; 2 when it cannot be used."""
+    """Print the properties and defects of a recording.
+
+    Returns:
+        The exit code; 2 if the recording cannot be used.
+    """
     report = validate_recording(recording)
     if as_json:
         typer.echo(json.dumps({"ok": report.ok, **asdict(report)}, indent=2))

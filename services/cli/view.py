@@ -1,4 +1,4 @@
-"""`intrasplat view`."""
+"""Implementation of `intrasplat view`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from services.registry.bundle_file import SUFFIX, unpack
 
 
 def view_command(model: Path, host: str, port: int, *, plaintext: bool) -> int:
-    """Serve a model to browsers until asked to end."""
+    """Serve a model to browsers until interrupted."""
     check_host(host, plaintext, "the viewer has no keys, and shows the model to whoever connects")
     with bundle_in(model) as folder:
         loaded = load_model(folder)
@@ -32,7 +32,12 @@ def view_command(model: Path, host: str, port: int, *, plaintext: bool) -> int:
 
 @contextmanager
 def bundle_in(model: Path) -> Iterator[Path]:
-    """The folder of a model, also of a packed one. Raises BundleError, Rejected."""
+    """Provide the folder of a model, unpacking a packed model temporarily.
+
+    Raises:
+        BundleError: if the model cannot be read.
+        Rejected: if the packed model is not valid.
+    """
     if model.suffix != SUFFIX or model.is_dir():
         yield model
         return
