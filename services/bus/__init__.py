@@ -1,1 +1,1 @@
-"""How the service's processes meet: the runtime folder, and what goes over its sockets."""
+"""Inter-process communication of the service: runtime folder and socket messages."""

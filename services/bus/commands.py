@@ -1,4 +1,4 @@
-"""Commands to a process, and its answers: one JSON object each way, of limited size, within a limited time."""
+"""Commands to a process and its answers: one JSON object each way, with limits on size and time."""
 
 from __future__ import annotations
 
@@ -20,11 +20,22 @@ LOOK_MS = 100
 ANSWER_S = 2.0
 
 Handler = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
-"""Takes a command's arguments, returns what is answered."""
+"""Command handler: takes the arguments, returns the answer."""
 
 
 def ask(endpoint: str, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any) -> dict[str, Any]:
-    """Send a command and wait for its answer. Raises NoAnswer, and CommandRefused with what the process says."""
+    """Send a command and wait for the answer.
+
+    Args:
+        endpoint: ZeroMQ address of the process.
+        command: name of the command.
+        timeout_s: seconds to wait.
+        arguments: arguments of the command.
+
+    Raises:
+        NoAnswer: if the process does not answer in time.
+        CommandRefused: with the reason, if the process refuses.
+    """
     socket = _to(endpoint, zmq.Context.instance())
     try:
         socket.send(packed_json({"command": command, **arguments}))
@@ -36,7 +47,7 @@ def ask(endpoint: str, command: str, *, timeout_s: float = ANSWER_S, **arguments
 
 
 async def ask_async(endpoint: str, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any) -> dict[str, Any]:
-    """`ask`, for an event loop."""
+    """Send a command like `ask`, in an event loop."""
     socket = _to(endpoint, zmq.asyncio.Context.instance())
     try:
         await socket.send(packed_json({"command": command, **arguments}))
@@ -48,7 +59,7 @@ async def ask_async(endpoint: str, command: str, *, timeout_s: float = ANSWER_S,
 
 
 def _to(endpoint: str, context: Any) -> Any:
-    """A socket for one command."""
+    """Create a socket for one command."""
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
@@ -69,22 +80,22 @@ def _accepted(data: bytes) -> dict[str, Any]:
 
 
 class CommandServer:
-    """Answers commands in a thread of its own, one at a time."""
+    """Answers commands one at a time in its own thread."""
 
     def __init__(self, endpoint: str, handlers: Mapping[str, Handler]) -> None:
         self._handlers = handlers
         self.heard_s = time.monotonic()
-        """When somebody has asked for something last."""
+        """Time of the last command."""
         self._stop = threading.Event()
         self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
-        self._socket.setsockopt(zmq.LINGER, 200)  # the answer to the command that ends the process
+        self._socket.setsockopt(zmq.LINGER, 200)  # lets the answer to the stop command leave before the process ends
         self._socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
         self._socket.bind(endpoint)
         self._thread = threading.Thread(target=self._serve, name="commands", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Take no more commands, and remove the socket."""
+        """Stop answering and remove the socket."""
         self._stop.set()
         self._thread.join()
 
@@ -108,7 +119,7 @@ class CommandServer:
             return packed_json({"ok": True, **(self._handlers[name](told) or {})})
         except (UserError, BusError) as error:
             return _refusal(str(error))
-        except Exception as error:  # whoever asked has to learn of it, and the process goes on
+        except Exception as error:  # the client gets the error, and the process continues
             log.exception("command failed")
             return _refusal(f"{type(error).__name__}: {error}")
 

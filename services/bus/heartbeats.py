@@ -1,4 +1,4 @@
-"""Heartbeats: a process says four times a second that it is well, what it is doing, and why."""
+"""Heartbeats: a process publishes its state and the reason four times a second."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ PERIOD_S = 0.25
 
 
 class Heartbeats:
-    """Publishes what `report` returns, in a thread of its own, until it is closed."""
+    """Publishes the result of `report` from its own thread until closed."""
 
     def __init__(self, endpoint: str, report: Callable[[], Mapping[str, Any]]) -> None:
         self._report = report
         self._stop = threading.Event()
         self._now = threading.Event()
         self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.PUB)
-        self._socket.setsockopt(zmq.LINGER, 200)  # the last one says why the process ends
+        self._socket.setsockopt(zmq.LINGER, 200)  # lets the last heartbeat leave, which states why the process ends
         self._socket.setsockopt(zmq.SNDHWM, 8)
         self._socket.bind(endpoint)
         self._thread = threading.Thread(target=self._beat, name="heartbeats", daemon=True)
         self._thread.start()
 
     def say_now(self) -> None:
-        """Do not wait for the next beat: something has changed."""
+        """Publish at once, because the state has changed."""
         self._now.set()
 
     def close(self) -> None:
-        """Say the last state, and remove the socket."""
+        """Publish the last state and remove the socket."""
         self._stop.set()
         self._now.set()
         self._thread.join()

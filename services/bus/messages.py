@@ -1,4 +1,4 @@
-"""JSON over the bus: one object, of limited size. Nothing is ever unpickled."""
+"""JSON messages of the bus: one object of limited size. Nothing is ever unpickled."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from typing import Any
 from services.bus.errors import BadMessage
 
 MOST_BYTES = 1 << 16
-"""Of one message."""
+"""Largest message in bytes."""
 
 
 def packed_json(content: Mapping[str, Any]) -> bytes:
-    """An object as bytes. Raises BadMessage for one that is too large or holds what JSON does not."""
+    """Encode an object.
+
+    Raises:
+        BadMessage: if it is too large or not representable in JSON.
+    """
     try:
         data = json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
     except (TypeError, ValueError) as error:
@@ -24,7 +28,11 @@ def packed_json(content: Mapping[str, Any]) -> bytes:
 
 
 def parsed_json(data: bytes | memoryview) -> dict[str, Any]:
-    """An object from bytes. Raises BadMessage."""
+    """Decode an object.
+
+    Raises:
+        BadMessage: if the data is too large or is no JSON object.
+    """
     if len(data) > MOST_BYTES:
         raise BadMessage(f"a message of {len(data)} bytes is not read; at most {MOST_BYTES} are")
     text = bytes(data)

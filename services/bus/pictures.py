@@ -1,8 +1,10 @@
-"""Pictures over ZeroMQ: published to any number of readers, none of whom slows the sender. The newest one wins.
+"""Pictures over ZeroMQ, published to any number of readers. Slow readers never delay the sender;
+they lose old pictures.
 
-A message is a JSON object and the pixels. Where the object says `"pixels": "frame"` a whole frame follows, in the pieces of
-`operators/sources/zeromq_message.py` (what capture publishes); where it says `"rgb"` one part, uint8 [H, W, 3] of its `width_px` and `height_px` (what an
-engine shows). Pixels are sent from where they lie: a copy of a 1920x1080 picture costs more than the socket (ADR 14).
+A message is a JSON header and the pixels. With `"pixels": "frame"` in the header a complete frame
+follows, in the pieces of `operators/sources/zeromq_message.py` (capture process). With `"rgb"` one
+part follows, uint8 [H, W, 3] of `width_px` and `height_px` (engine process). Pixels are sent
+without a copy, because copying a 1920x1080 picture costs more than the socket (ADR 14).
 """
 
 from __future__ import annotations
@@ -20,16 +22,17 @@ from services.bus.errors import BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 
 HIGH_WATER = 4
-"""Pictures that wait for a reader that does not keep up, on either side; what comes then is dropped for it. Readers take all that waits and use the
-newest. Fewer would be lost to readers that do keep up: ZeroMQ takes note of what was read only now and then."""
+"""Pictures queued per reader on either side; further ones are dropped for that reader. Readers
+drain the queue and use the newest picture. A smaller value would lose pictures of fast readers,
+because ZeroMQ updates the queue length only now and then."""
 
 MOST_PARTS = 2 + len(zeromq_message.ARRAYS)
-"""Of a message."""
+"""Largest number of parts of a message."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture and what is said about it."""
+    """Picture with its header."""
 
     header: Mapping[str, Any]
     image: NDArray[np.uint8]
@@ -37,7 +40,7 @@ class Picture:
 
 
 class PicturePublisher:
-    """Publishes pictures at an endpoint. One thread at a time uses it."""
+    """Publisher of pictures at an endpoint. For use by one thread at a time."""
 
     kind = zmq.PUB
 
@@ -48,26 +51,38 @@ class PicturePublisher:
         self._socket.bind(endpoint)
 
     def publish_frame(self, header: Mapping[str, Any], pieces: Sequence[bytes | memoryview]) -> None:
-        """Send a frame in the pieces of `zeromq_message`, which nobody may change any more; it never waits."""
+        """Send a frame in the pieces of `zeromq_message`, without blocking. The pieces must not be
+        modified afterwards."""
         self._send({**header, "pixels": "frame"}, *pieces)
 
     def publish(self, header: Mapping[str, Any], image: NDArray[np.uint8]) -> None:
-        """Send a picture, RGB uint8 [H, W, 3], which nobody may change any more; it never waits."""
+        """Send a picture, RGB uint8 [H, W, 3], without blocking. The array must not be modified
+        afterwards."""
         height_px, width_px = image.shape[:2]
         said = {**header, "pixels": "rgb", "width_px": width_px, "height_px": height_px}
         self._send(said, np.ascontiguousarray(image).data)
 
     def _send(self, header: Mapping[str, Any], *pixels: bytes | memoryview) -> None:
-        # What has no reader, or whose reader does not keep up, is dropped by ZeroMQ here.
+        # ZeroMQ drops the message here for missing or slow readers.
         self._socket.send_multipart([packed_json(header), *pixels], copy=False)
 
     def close(self) -> None:
-        """Stop sending, and remove the socket."""
+        """Stop sending and remove the socket."""
         self._socket.close()
 
 
 def subscribe(socket: Any, *endpoints: str, waiting: int = HIGH_WATER) -> Any:
-    """Make a SUB socket, plain or of asyncio, read pictures (or heartbeats) from endpoints, whether or not somebody is there yet."""
+    """Connect a SUB socket (plain or asyncio) to endpoints of pictures or heartbeats. The
+    publishers may start later.
+
+    Args:
+        socket: the socket.
+        endpoints: ZeroMQ addresses.
+        waiting: queue length.
+
+    Returns:
+        The socket.
+    """
     options = {
         zmq.LINGER: 0,
         zmq.RCVHWM: waiting,
@@ -84,7 +99,11 @@ def subscribe(socket: Any, *endpoints: str, waiting: int = HIGH_WATER) -> Any:
 
 
 def split(parts: Sequence[zmq.Frame]) -> tuple[dict[str, Any], list[memoryview]]:
-    """The header and the pixels of a message. Raises BadMessage."""
+    """Split a message into header and pixels.
+
+    Raises:
+        BadMessage: if the message is malformed.
+    """
     if not 2 <= len(parts) <= MOST_PARTS:
         raise BadMessage(f"a picture has 2 to {MOST_PARTS} parts, this message {len(parts)}")
     header, *pixels = (part.buffer for part in parts)
@@ -94,7 +113,11 @@ def split(parts: Sequence[zmq.Frame]) -> tuple[dict[str, Any], list[memoryview]]
 
 
 def picture_from(parts: Sequence[zmq.Frame]) -> Picture:
-    """The picture of a message; its pixels look into the message's memory. Raises BadMessage."""
+    """Return the picture of a message; its pixels reference the message's memory.
+
+    Raises:
+        BadMessage: if the message is malformed.
+    """
     header, pixels = split(parts)
     if header.get("pixels") == "frame":
         try:
@@ -112,5 +135,5 @@ def picture_from(parts: Sequence[zmq.Frame]) -> Picture:
 
 
 def _side(value: Any) -> int:
-    """A side in pixels; 0 where it is none."""
+    """Return a side length in pixels, or 0 if the value is not valid."""
     return value if type(value) is int and value > 0 else 0

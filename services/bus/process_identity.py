@@ -1,4 +1,4 @@
-"""Which process: its number alone may belong to another one by now."""
+"""Identity of a process that is safe against reuse of process ids."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from pathlib import Path
 from signal import pidfd_send_signal
 
 _STATE, _STARTED = 0, 19
-"""Where they stand in /proc/PID/stat after the name, which may hold anything but ends with the last bracket."""
+"""Field positions in /proc/PID/stat after the name. The name may contain anything, so fields are
+counted from its last bracket."""
 
 
 @dataclass(frozen=True)
 class ProcessIdentity:
-    """A process by its number and when it started: no other one, now or later, has both."""
+    """Process id and start time, which together are unique."""
 
     pid: int
     started: str
-    """The machine's boot, and the clock ticks from it to the start of the process."""
+    """Boot id of the machine, and the start time of the process in clock ticks since boot."""
 
     @staticmethod
     def of(pid: int) -> ProcessIdentity | None:
-        """That of the process with this number; None where there is none, or only what is left of one that has ended."""
+        """Return the identity of a process, or None if it does not exist or is a zombie."""
         try:
             fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         except (FileNotFoundError, ProcessLookupError):
@@ -34,17 +35,22 @@ class ProcessIdentity:
 
     @property
     def is_alive(self) -> bool:
-        """Whether this very process still runs."""
+        """Return True if this process still runs."""
         return ProcessIdentity.of(self.pid) == self
 
     def signal(self, number: int) -> bool:
-        """Send a signal to this process and to no other; False when it has ended."""
+        """Send a signal to this process only.
+
+        Returns:
+            False if the process has ended.
+        """
         try:
             handle = os.pidfd_open(self.pid)
         except ProcessLookupError:
             return False
         try:
-            # The handle stays with the process, so what is asked now holds when the signal is sent.
+            # The handle refers to this process, so the identity check stays valid when the signal
+            # is sent.
             if not self.is_alive:
                 return False
             pidfd_send_signal(handle, number)
@@ -55,7 +61,11 @@ class ProcessIdentity:
         return True
 
     async def ended(self, timeout_s: float | None = None) -> bool:
-        """Wait until the process has ended, whoever started it; False when it has not within `timeout_s`."""
+        """Wait for the end of the process, which need not be a child.
+
+        Returns:
+            False after `timeout_s`.
+        """
         try:
             handle = os.pidfd_open(self.pid)
         except ProcessLookupError:

@@ -29,48 +29,60 @@ from services.bus.process_identity import ProcessIdentity
 Role = Literal["capture", "engine"]
 ROLES: tuple[Role, ...] = get_args(Role)
 PICTURES: Mapping[Role, str] = {"capture": "raw", "engine": "shown"}
-"""The socket at which each process publishes pictures."""
+"""Picture socket of each process."""
 Layer = Literal["depth", "confidence", "orbit"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-"""Further pictures of the engine, at a socket each, made only while somebody reads them."""
+"""Additional pictures of the engine, one socket each, produced only while a reader is connected."""
 MOST_PATH_BYTES = 100
-"""A socket's path may not be longer (`man 7 unix`: 108, and libzmq needs some)."""
+"""Longest path of a socket in bytes (`man 7 unix`: 108, minus the suffix of libzmq)."""
 _LONGEST_NAME = "capture.status"
 
 
 @dataclass(frozen=True)
 class ProcessRecord:
-    """What a process has written about itself."""
+    """Record that a process writes about itself."""
 
     identity: ProcessIdentity
     spec_digest: str
-    """Of the specification that it runs with."""
+    """Digest of the specification in use."""
 
 
 def default_runtime_folder() -> Path:
-    """Where the system keeps such folders for this user."""
+    """Return the system's default runtime folder for this user."""
     own = os.environ.get("XDG_RUNTIME_DIR")
     return Path(own) / "intrasplat" if own else Path(f"/tmp/intrasplat-{os.geteuid()}")
 
 
 class RuntimeFolder:
-    """The runtime folder of one service. Raises RuntimeFolderUnusable."""
+    """Runtime folder of one service.
+
+    Raises:
+        RuntimeFolderUnusable: if the folder cannot be used.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(os.path.abspath(path))
         own_folder(self.path)
 
     def stream(self, name: str) -> StreamFolder:
-        """The folder of a stream, made where it is missing. Raises RuntimeFolderUnusable."""
+        """Return the folder of a stream, created if missing.
+
+        Raises:
+            RuntimeFolderUnusable: if the folder cannot be used.
+        """
         return StreamFolder(self.path / name)
 
     def streams(self) -> list[str]:
-        """Names of the streams whose folders are there."""
+        """Return the names of the streams with a folder."""
         return sorted(entry.name for entry in self.path.iterdir() if entry.is_dir() and not entry.is_symlink())
 
 
 class StreamFolder:
-    """What belongs to one stream. Raises RuntimeFolderUnusable."""
+    """Runtime folder of one stream.
+
+    Raises:
+        RuntimeFolderUnusable: if the folder cannot be used.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -78,36 +90,37 @@ class StreamFolder:
         own_folder(path)
 
     def endpoint(self, name: str) -> str:
-        """ZeroMQ's address of a socket."""
+        """Return the ZeroMQ address of a socket."""
         return f"ipc://{self.path / name}"
 
     def pictures(self, role: Role) -> str:
-        """Where a process publishes pictures."""
+        """Return the address at which a process publishes pictures."""
         return self.endpoint(PICTURES[role])
 
     def status(self, role: Role) -> str:
-        """Where it publishes heartbeats."""
+        """Return the address at which a process publishes heartbeats."""
         return self.endpoint(f"{role}.status")
 
     def commands(self, role: Role) -> str:
-        """Where it takes commands."""
+        """Return the address at which a process accepts commands."""
         return self.endpoint(f"{role}.ctl")
 
     def spec(self, role: Role) -> Path:
-        """The file with its specification."""
+        """Return the specification file of a process."""
         return self.path / f"{role}.spec"
 
     @property
     def engine_size(self) -> Path:
-        """The file with the size that the engine works at."""
+        """Return the file with the measured working size of the engine."""
         return self.path / "engine.size"
 
     def log(self, role: Role) -> Path:
-        """The file that it prints to."""
+        """Return the log file of a process."""
         return self.path / f"{role}.log"
 
     def record(self, role: Role) -> ProcessRecord | None:
-        """The process that serves this part now; None when none does. What one that has ended left behind is removed."""
+        """Return the record of the running process for a role, or None. Files of an ended process
+        are removed."""
         try:
             content = parsed_json((self.path / f"{role}.json").read_bytes())
             identity = ProcessIdentity(int(content["pid"]), str(content["started"]))
@@ -119,7 +132,7 @@ class StreamFolder:
         return None
 
     def write_record(self, role: Role, spec_digest: str) -> None:
-        """Say that this process serves that part."""
+        """Record this process as the one that serves a role."""
         identity = ProcessIdentity.of(os.getpid())
         assert identity is not None
         write_json(
@@ -128,7 +141,14 @@ class StreamFolder:
         )
 
     def lock(self, role: Role) -> int:
-        """Take the part for this process, until it ends. Raises AlreadyRunning."""
+        """Lock a role for this process until it ends.
+
+        Returns:
+            The descriptor that holds the lock.
+
+        Raises:
+            AlreadyRunning: if another process holds the lock.
+        """
         held = os.open(self.path / f"{role}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -140,13 +160,13 @@ class StreamFolder:
         return held
 
     def clean(self, role: Role) -> None:
-        """Remove the sockets and the record of a process that has ended."""
+        """Delete the sockets and the record of an ended process."""
         layers = LAYERS if role == "engine" else ()
         for name in (PICTURES[role], *layers, f"{role}.status", f"{role}.ctl", f"{role}.json"):
             (self.path / name).unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Remove the folder with all that the processes of this stream left behind; they have ended."""
+        """Delete the stream's folder after its processes have ended."""
         for role in ROLES:
             self.clean(role)
             for path in (self.spec(role), self.log(role), self.path / f"{role}.lock", self.path / f"{role}.show"):
@@ -156,7 +176,11 @@ class StreamFolder:
 
 
 def own_folder(path: Path) -> None:
-    """Make a folder for this user alone, or check that one is it. Raises RuntimeFolderUnusable."""
+    """Create a folder for this user alone, or verify an existing one.
+
+    Raises:
+        RuntimeFolderUnusable: if the folder has another owner or is accessible to other users.
+    """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = path.lstat()
@@ -176,7 +200,11 @@ def own_folder(path: Path) -> None:
 
 
 def check_path(path: Path) -> None:
-    """Raises RuntimeFolderUnusable for a socket whose path is too long."""
+    """Check the length of a socket's path.
+
+    Raises:
+        RuntimeFolderUnusable: if it is too long.
+    """
     length = len(os.fsencode(path))
     if length > MOST_PATH_BYTES:
         raise RuntimeFolderUnusable(
@@ -185,7 +213,7 @@ def check_path(path: Path) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Replace a file of this folder as a whole; nobody else may read it."""
+    """Replace a file atomically, readable by its owner only."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     descriptor = os.open(part, os.O_CREAT | os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, 0o600)
     with open(descriptor, "wb") as file:
@@ -194,5 +222,10 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What `write_json` wrote. Raises BadMessage and OSError."""
+    """Read a file of `write_json`.
+
+    Raises:
+        BadMessage: if the content is malformed.
+        OSError: if the file cannot be read.
+    """
     return parsed_json(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Pictures that are made only while somebody reads them: the publisher hears when its first reader comes and when the last one has left."""
+"""Pictures produced only while they are read: the publisher detects its first and last reader."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from services.bus.pictures import PicturePublisher
 
 
 class WatchedPublisher(PicturePublisher):
-    """Publishes pictures at an endpoint, and knows whether anybody reads them. One thread uses it."""
+    """Publisher that knows whether readers are connected. For use by one thread."""
 
     kind = zmq.XPUB
 
@@ -20,15 +20,16 @@ class WatchedPublisher(PicturePublisher):
 
     @property
     def watched(self) -> bool:
-        """Whether anybody reads: a reader that dies has left."""
+        """Return True if a reader is connected; a dead reader does not count."""
         while self._socket.poll(0):
-            # One byte and the topic: 1 for the first reader, 0 when the last one has left.
+            # Each message is one byte and the topic: 1 for the first reader, 0 after the last one
+            # left.
             self._watched = self._socket.recv()[:1] == b"\x01"
         return self._watched
 
 
 def wait_for_readers(publishers: Iterable[WatchedPublisher], timeout_s: float) -> None:
-    """Wait until a reader comes to one of them or leaves it."""
+    """Wait until a reader connects to or leaves one of the publishers."""
     poller = zmq.Poller()
     for publisher in publishers:
         poller.register(publisher._socket, zmq.POLLIN)

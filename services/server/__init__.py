@@ -1,1 +1,2 @@
-"""What `intrasplat serve` puts together: the control plane's protocols, met by the supervisor, the display, the registry and the console."""
+"""Composition of `intrasplat serve`: implements the control plane's protocols with supervisor,
+display, registry and console."""

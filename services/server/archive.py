@@ -1,4 +1,5 @@
-"""Recordings and replays of a server, put together: they share the registry's database, so that a recording in use cannot go."""
+"""Recording store and replay jobs of a server. Both use the registry's database, so a recording in
+use cannot be deleted."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Archive:
-    """The parts."""
+    """Recording and replay parts of a server."""
 
     recordings: RecordingStore
     recording_retention: RecordingRetention
@@ -48,9 +49,16 @@ class Archive:
 def new_archive(
     settings: ServiceSettings, events: SystemEvents, trusts_ages: Callable[[], bool] = lambda: True
 ) -> Archive:
-    """As the settings want it; the registry has made the folder of the database. Raises StoreUnavailable.
+    """Create the parts from the settings. The registry must already have created the database
+    folder.
 
-    trusts_ages: whether something may be removed now because it is old.
+    Args:
+        settings: settings of the service.
+        events: receives events for the audit log.
+        trusts_ages: returns True if data may be deleted by age now.
+
+    Raises:
+        StoreUnavailable: if the database or the folders cannot be used.
     """
     data, wanted, jobs = settings.data_dir, settings.uploaded_recordings, settings.jobs
     database = settings.registry.database
@@ -93,7 +101,7 @@ def _open(counts: dict[str, int]) -> int:
 
 
 class ArchiveMeasures(Collector):
-    """What Prometheus is told of recordings and replays, at the moment when it asks: numbers by state, no names."""
+    """Prometheus collector for recordings and replays: counts by state, without names."""
 
     def __init__(self, recordings: RecordingStore, store: JobStore) -> None:
         self._recordings, self._store = recordings, store

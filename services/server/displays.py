@@ -1,4 +1,4 @@
-"""The pictures of all streams of a server."""
+"""Display hubs of all streams of a server."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from services.server.streams import SupervisedStreams
 
 
 class StreamDisplays:
-    """See `services.control.parts.Display`."""
+    """Implementation of `services.control.parts.Display`."""
 
     def __init__(self, streams: SupervisedStreams) -> None:
         self._streams = streams
@@ -21,7 +21,11 @@ class StreamDisplays:
     async def subscribe(
         self, stream: str, kind: PictureKind, quality: int
     ) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
-        """See `Display`. Raises Conflicting for a stream that does not run."""
+        """See `Display`.
+
+        Raises:
+            Conflicting: if the stream does not run.
+        """
         hub = self._streams.hub(stream)
         if hub is None:
             raise Conflicting(f"the stream {stream} is stopped; start it first")

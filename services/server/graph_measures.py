@@ -1,4 +1,4 @@
-"""What the processes of streams tell with their heartbeats, as Prometheus' families."""
+"""Prometheus metric families built from the heartbeats of stream processes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from services.bus.durations import cumulative
 
 SOURCE_STATES = ("starting", "opening", "live", "stalled", "reconnecting", "lost", "ended", "failed", "down", "stopped")
 LOST_BY_SOURCES = ("too_late", "bad_messages")
-"""What sources count that is a frame lost; the rest is something that they repaired or went through."""
+"""Source counters that mean lost frames. The other counters are repaired or bridged defects."""
 
 
 class GraphFamilies:
-    """The families of one collection; `add` puts a stream's figures in."""
+    """Metric families of one collection; `add` adds a stream's values."""
 
     def __init__(self) -> None:
         of_stream = ["stream"]
@@ -51,7 +51,7 @@ class GraphFamilies:
         )
 
     def add(self, stream: str, processes: Mapping[str, Mapping[str, Any]], measures: Mapping[str, Any]) -> None:
-        """A stream that runs: the state of its processes, and what its engine has measured."""
+        """Add a running stream: process states and engine measurements."""
         capture, engine = (processes.get(role, {}) for role in ("capture", "engine"))
         for each in SOURCE_STATES:
             self._source.add_metric([stream, each], float(capture.get("state") == each))
@@ -70,7 +70,7 @@ class GraphFamilies:
                 self._dropped.add_metric([stream, f"{queue}: {reason}"], count)
 
     def families(self) -> Iterable[Metric]:
-        """All of them."""
+        """Return all families."""
         return [value for value in vars(self).values() if isinstance(value, Metric)]
 
     def _add_counts(self, stream: str, capture: Mapping[str, Any], engine: Mapping[str, Any]) -> None:
@@ -99,11 +99,12 @@ class GraphFamilies:
         if shown.get("show") == "model":
             self._model.add_metric([stream, "model", str(model.get("name", "")), str(model.get("version", ""))], 1)
         elif shown.get("show") == "live":
-            # Its version counts up with every frame, and each would be a series of its own.
+            # The live model's version changes with every frame, and each value would create a new
+            # time series.
             self._model.add_metric([stream, "live", "", ""], 1)
 
 
 def _items(told: Any) -> Iterator[tuple[str, Any]]:
-    """The items of an object of a heartbeat; nothing where it is none."""
+    """Yield the items of a heartbeat object; nothing if the value is no mapping."""
     if isinstance(told, Mapping):
         yield from told.items()

@@ -1,4 +1,5 @@
-"""What Prometheus is told of the streams, at the moment when it asks. Labels: the stream's name, nothing of a patient."""
+"""Prometheus metrics of the streams, collected at scrape time. Labels hold the stream name and no
+patient data."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ STATES = ("stopped", "starting", "live", "stale", "frozen", "source lost", "fail
 
 
 class StreamMeasures(Collector):
-    """Collects from the streams; `count` is told what happens to their processes."""
+    """Collector for the streams; `count` receives process events."""
 
     streams: SupervisedStreams | None = None
 
@@ -31,7 +32,7 @@ class StreamMeasures(Collector):
         self._events: Counter[tuple[str, str, str]] = Counter()
 
     def count(self, event: StreamEvent) -> None:
-        """Something happened to a process."""
+        """Count a process event."""
         self._events[event.stream, event.role, event.kind] += 1
 
     def collect(self) -> Iterable[Metric]:

@@ -1,4 +1,4 @@
-"""The console's routes: its files are public, what they ask for is not."""
+"""Routes of the web console. Its files are public; its API requests need a key."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ router = new_router("console", prefix="")
 @router.get("/", include_in_schema=False)
 @requires("public")
 async def console() -> Response:
-    """The page."""
+    """Return the console page."""
     return FileResponse(PAGE / "index.html", media_type="text/html")
 
 
 @router.get("/console/{file}", include_in_schema=False)
 @requires("public")
 async def console_file(file: str) -> Response:
-    """A file of the page."""
+    """Return a static file of the console."""
     if file not in FILES:
         raise Missing("the console has no such file")
     return FileResponse(PAGE / file, media_type=FILES[file])

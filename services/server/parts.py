@@ -1,4 +1,4 @@
-"""The parts of a server, as its settings want them."""
+"""Assembly of a server's parts from its settings."""
 
 from __future__ import annotations
 
@@ -50,7 +50,12 @@ ERRORS: dict[type[Exception], type[Problem]] = {
 
 
 def assembled(settings: ServiceSettings) -> Parts:
-    """Everything that the control plane serves. Raises RuntimeFolderUnusable, StoreUnavailable."""
+    """Create all parts of the control plane.
+
+    Raises:
+        RuntimeFolderUnusable: if the runtime folder cannot be used.
+        StoreUnavailable: if the database or the files cannot be used.
+    """
     measures = StreamMeasures()
     events = SystemEvents()
     streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), told(measures, events), settings.limits.streams)
@@ -115,8 +120,11 @@ def assembled(settings: ServiceSettings) -> Parts:
 
 
 def told(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEvent], None]:
-    """Who hears what happens to the streams' processes. In the audit log a reason stands only in the supervisor's own words: others could name
-    a file, and so a patient."""
+    """Return the receiver of process events, for metrics and audit log.
+
+    The audit log records a reason only if the supervisor worded it. Other texts could contain a
+    file name that identifies a patient.
+    """
 
     def tell(event: StreamEvent) -> None:
         measures.count(event)
@@ -131,7 +139,11 @@ def told(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEven
 
 
 def registry_of(settings: ServiceSettings) -> ModelRegistry:
-    """The registry in the service's folder, or where the settings say. Raises StoreUnavailable."""
+    """Open the registry in the service's folder or as configured.
+
+    Raises:
+        StoreUnavailable: if it cannot be opened.
+    """
     wanted = settings.registry
     options = {name: value.get_secret_value() for name, value in wanted.blob_options.items()}
     return ModelRegistry(
@@ -145,7 +157,8 @@ def registry_of(settings: ServiceSettings) -> ModelRegistry:
 
 @asynccontextmanager
 async def recovered(models: ModelRegistry, events: SystemEvents) -> AsyncIterator[None]:
-    """Clear away what a server that died had half written, say what else is wrong, and check what waits to be checked; close it in the end."""
+    """Recover the registry at start: delete leftovers, report damage and run pending checks. Close
+    the registry at the end of the block."""
     found = await asyncio.to_thread(models.recover)
     for name, version, sentence in found.damaged:
         log.error("the file of %s/%d is damaged: %s", name, version, sentence)

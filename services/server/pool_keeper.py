@@ -1,4 +1,4 @@
-"""Keeps the process of the pool running while there are jobs for it."""
+"""Supervision of the job pool process."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from services.supervisor.restarts import Restarts
 log = logging.getLogger(__name__)
 RELAY_S = 1.0
 LEVELS = {"WARNING": logging.WARNING, "ERROR": logging.ERROR, "CRITICAL": logging.ERROR, "Traceback": logging.ERROR}
-"""First words of a line, and how it is logged."""
+"""Log levels by the first word of a pool's output line."""
 LOOK_S = 0.5
 END_S = 10.0
-"""How long a pool may take to give its jobs back."""
+"""Seconds that a pool may take to requeue its jobs."""
 PASSED_ON = (
     "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OMP_WAIT_POLICY",
     "OPENBLAS_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "INTRASPLAT_ISA",
 )  # fmt: skip
-"""What a pool gets of the environment: no credentials are among it."""
+"""Environment variables passed to a pool; none holds credentials."""
 
 
 class PoolKeeper:
-    """Starts the pool when jobs wait for one, and again when it has died; what it prints goes to standard error."""
+    """Starts the pool process when jobs are queued and restarts it after a crash. Its output is
+    logged."""
 
     def __init__(self, pool: PoolProcess, open_jobs: Callable[[], int]) -> None:
         self._pool, self._open_jobs = pool, open_jobs
@@ -37,13 +38,13 @@ class PoolKeeper:
 
     @property
     def pid(self) -> int | None:
-        """Of the pool; None while there is none."""
+        """Return the process id of the pool, or None."""
         process = self._process
         return None if process is None or process.returncode is not None else process.pid
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Until the block is left, the pool runs whenever there are jobs; then it gives its jobs back and ends."""
+        """Run the pool on demand while the block runs, then stop it; its jobs are requeued."""
         task = asyncio.create_task(self._keep(), name="pool of jobs")
         try:
             yield
@@ -85,7 +86,7 @@ class PoolKeeper:
         code = await process.wait()
         await asyncio.wait(
             {self._relaying}, timeout=RELAY_S
-        )  # what the pool has started may have the pipe, too, for longer
+        )  # child processes of the pool may keep the pipe open longer
         self._relaying.cancel()
         return code
 
@@ -106,11 +107,11 @@ class PoolKeeper:
 
 
 async def relayed(said: asyncio.StreamReader) -> None:
-    """Log each line that a process prints to its standard error, so that this program's log has one format."""
+    """Log each line of a process's standard error in this program's log format."""
     while True:
         try:
             line = await said.readline()
-        except ValueError:  # longer than the reader takes; the rest of it comes as the next line
+        except ValueError:  # the line exceeds the reader's limit; the rest arrives as the next line
             continue
         if not line:
             return

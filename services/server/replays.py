@@ -1,4 +1,4 @@
-"""Replays as jobs of a server: the store of jobs, and the files that they have made."""
+"""Replay jobs of a server: job store and result files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from services.registry.errors import NotFound, StoreUnavailable
 
 
 class Replays:
-    """See `services.control.replay_parts.Jobs`."""
+    """Implementation of `services.control.replay_parts.Jobs`."""
 
     def __init__(self, store: JobStore, results: Results) -> None:
         self._store, self._results = store, results
@@ -50,10 +50,18 @@ class Replays:
         return record
 
     def expire(self, max_age_s: float | None, most: int | None) -> list[Expired]:
-        """Delete replays that ended longer ago than that, and the oldest beyond so many that have ended."""
+        """Delete ended replays beyond the limits on age and number.
+
+        Args:
+            max_age_s: age limit in seconds, or None.
+            most: number limit, or None.
+
+        Returns:
+            The deleted replays, each with the reason.
+        """
         gone = []
         for job_id, why in self._store.surplus(max_age_s, most):
-            with suppress(NotFound):  # somebody has deleted it meanwhile
+            with suppress(NotFound):  # deleted by a concurrent request
                 self.delete(job_id)
                 gone.append(Expired(job_id, why))
         return gone
@@ -63,7 +71,12 @@ class Replays:
         return self._results.files(job.folder) if job.state == JobState.DONE else []
 
     def file(self, job_id: str, name: str) -> Path:
-        """See `Jobs`. Raises NotFound, and StoreUnavailable where the replay is done and its result is not on the disk."""
+        """See `Jobs`.
+
+        Raises:
+            NotFound: if there is no such result file.
+            StoreUnavailable: if the replay is done and its result is missing on the disk.
+        """
         job = self.get(job_id)
         if job.state == JobState.DONE and not self.files(job):
             raise StoreUnavailable(

@@ -1,5 +1,5 @@
-"""Recordings, and replays that have ended, are removed when there are more or older ones than the settings allow: at start and every few minutes,
-each in the audit log."""
+"""Retention of recordings and ended replays. Limits are enforced at start and every few minutes,
+and each deletion is in the audit log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DAY_S = 86400.0
 
 
 class RecordingRetention:
-    """Looks after a store of recordings while the server runs."""
+    """Retention task for the recording store."""
 
     def __init__(
         self,
@@ -29,14 +29,22 @@ class RecordingRetention:
         events: SystemEvents,
         trusts_ages: Callable[[], bool] = lambda: True,
     ) -> None:
-        """trusts_ages: whether something may be removed now because it is old (`ClockGuard`)."""
+        """Set the limits.
+
+        Args:
+            store: recordings.
+            keep_days: age limit, or None.
+            keep_bytes: size limit, or None.
+            events: receives events for the audit log.
+            trusts_ages: returns True if data may be deleted by age now (`ClockGuard`).
+        """
         self._store, self._keep_bytes, self._events = store, keep_bytes, events
         self._trusts_ages = trusts_ages
         self._max_age_s = None if keep_days is None else keep_days * DAY_S
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Clear away what a server that died had half done, check what waits for it, and enforce the bounds until the block is left."""
+        """Recover the store, check pending recordings, and enforce the limits while the block runs."""
         waiting = await asyncio.to_thread(self._store.recover)
         tasks = [
             asyncio.create_task(self._check(waiting), name="checks of waiting recordings"),
@@ -51,7 +59,11 @@ class RecordingRetention:
             await asyncio.to_thread(self._store.close)
 
     async def enforce(self) -> None:
-        """Remove what is too old or too much. Raises StoreUnavailable."""
+        """Delete recordings beyond the limits.
+
+        Raises:
+            StoreUnavailable: if the database does not answer.
+        """
         if self._max_age_s is None and self._keep_bytes is None:
             return
         max_age_s = self._max_age_s if self._trusts_ages() else None
@@ -68,7 +80,7 @@ class RecordingRetention:
 
 
 class ReplayRetention:
-    """Looks after replays that have ended, and their results, while the server runs."""
+    """Retention task for ended replays and their results."""
 
     def __init__(
         self,
@@ -78,14 +90,14 @@ class ReplayRetention:
         events: SystemEvents,
         trusts_ages: Callable[[], bool] = lambda: True,
     ) -> None:
-        """trusts_ages: as for `RecordingRetention`."""
+        """Set the limits; see `RecordingRetention`."""
         self._replays, self._most, self._events = replays, keep_results, events
         self._trusts_ages = trusts_ages
         self._max_age_s = None if keep_days is None else keep_days * DAY_S
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Enforce the bounds until the block is left."""
+        """Enforce the limits while the block runs."""
         task = asyncio.create_task(again_and_again(self.enforce), name="retention of replays")
         try:
             yield
@@ -94,7 +106,11 @@ class ReplayRetention:
             await asyncio.gather(task, return_exceptions=True)
 
     async def enforce(self) -> None:
-        """Remove what is too old or too much. Raises StoreUnavailable."""
+        """Delete replays beyond the limits.
+
+        Raises:
+            StoreUnavailable: if the database does not answer.
+        """
         if self._max_age_s is None and self._most is None:
             return
         max_age_s = self._max_age_s if self._trusts_ages() else None
@@ -104,7 +120,7 @@ class ReplayRetention:
 
 
 async def again_and_again(enforce: Callable[[], Awaitable[None]]) -> None:
-    """Until it is cancelled. A database that does not answer is asked again the next time."""
+    """Run `enforce` periodically until cancelled. Database failures are logged and retried."""
     while True:
         try:
             await enforce()

@@ -1,4 +1,5 @@
-"""Streams that show a model follow the registry: the active version is shown, and one that an engine gave up is rolled back."""
+"""Synchronisation of streams with the registry: the active version is displayed, and a version that
+the engine rejects is rolled back."""
 
 from __future__ import annotations
 
@@ -18,11 +19,12 @@ from services.server.streams import Stream, SupervisedStreams
 log = logging.getLogger(__name__)
 LOOK_S = 0.25
 MOST_MS = 200.0
-"""A model whose pictures take longer again and again gives way to the one before it."""
+"""Time limit per picture in milliseconds. A model that repeatedly exceeds it is replaced by the
+previous one."""
 PREPARE_S = 60.0
-"""How long loading a model and drawing its first picture may take."""
+"""Seconds allowed for loading a model and rendering its first picture."""
 AGAIN_S = 5.0
-"""After a refusal an engine is asked again so much later."""
+"""Seconds before a refused request to an engine is repeated."""
 
 
 GivenUp = tuple[tuple[str, int, str], ...]
@@ -30,7 +32,7 @@ GivenUp = tuple[tuple[str, int, str], ...]
 
 @dataclass(frozen=True)
 class Asked:
-    """What an engine was asked to show, and which models it had taken back by then."""
+    """Last request to an engine, and the models it had rolled back by then."""
 
     name: str
     version: int
@@ -38,19 +40,20 @@ class Asked:
 
 
 class ShownModels:
-    """Looks four times a second whether each stream shows what it is to show. An engine that is started again is told again."""
+    """Polls four times a second that each stream displays its configured model. A restarted engine
+    gets the request again."""
 
     def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, events: SystemEvents | None = None) -> None:
         self._streams, self._registry = streams, registry
         self._events = events or SystemEvents()
         self._refused: dict[tuple[str, str, int], float] = {}
-        """When an engine refused a version, by stream, model and version."""
+        """Time of an engine's refusal, by stream, model and version."""
         self._asked: dict[str, Asked] = {}
-        """What each stream's engine was asked for last."""
+        """Last request to each stream's engine."""
 
     @asynccontextmanager
     async def following(self) -> AsyncIterator[None]:
-        """Follow until the block is left."""
+        """Synchronise while the block runs."""
         task = asyncio.create_task(self._follow(), name="shown models")
         try:
             yield
@@ -68,7 +71,12 @@ class ShownModels:
             await asyncio.sleep(LOOK_S)
 
     async def look_at(self, stream: Stream) -> None:
-        """Have one stream show the active version of its model. Raises BusError, RegistryError."""
+        """Make a stream display the active version of its model.
+
+        Raises:
+            BusError: if the engine does not answer.
+            RegistryError: if the registry fails.
+        """
         kind, _, name = stream.wanted.show.partition(" ")
         supervisor = stream.supervisor
         if kind != "model" or supervisor is None:
@@ -95,7 +103,7 @@ class ShownModels:
         log.info("%s shows %s/%d", stream.wanted.name, name, active.version)
 
     async def _roll_back_if_given_up(self, stream: str, figures: Mapping[str, Any]) -> None:
-        """Have the registry serve the version before, where the engine found that the one it was asked for cannot be shown."""
+        """Roll back the active version if the engine reports that it cannot be displayed."""
         asked, given_up = self._asked.get(stream), _given_up(figures)
         if asked is None or given_up == asked.given_up_before:
             return
@@ -111,5 +119,5 @@ class ShownModels:
 
 
 def _given_up(figures: Mapping[str, Any]) -> GivenUp:
-    """The newest models that an engine took back, the newest last."""
+    """Return the models that an engine rolled back, newest last."""
     return tuple((each["name"], each["version"], each["reason"]) for each in figures.get("gave_way") or ())

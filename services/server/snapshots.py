@@ -1,4 +1,4 @@
-"""Snapshots of live streams, and exports of them and of the registry's models."""
+"""Snapshots of live streams, and exports of snapshots and registry models."""
 
 from __future__ import annotations
 
@@ -19,18 +19,26 @@ from services.registry.records import State, VersionRecord
 from services.server.streams import SupervisedStreams
 
 WRITE_S = 60.0
-"""How long an engine may take to write its model."""
+"""Seconds that an engine may take to write its model."""
 CHECKED = (State.READY, State.ACTIVE, State.RETIRED)
 
 
 class StreamSnapshots:
-    """See `services.control.snapshot_parts.Snapshots`."""
+    """Implementation of `services.control.snapshot_parts.Snapshots`."""
 
     def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, store: SnapshotStore) -> None:
         self._streams, self._registry, self._store = streams, registry, store
 
     async def take(self, stream: str, model: str | None, by: str) -> tuple[Snapshot, VersionRecord | None]:
-        """See `Snapshots`. Raises Missing, Conflicting (a stream that is stopped or just starting), BusError, ExportFailed, RegistryError."""
+        """See `Snapshots`.
+
+        Raises:
+            Missing: if the stream does not exist.
+            Conflicting: if the stream is stopped or just starting.
+            BusError: if the engine does not answer.
+            ExportFailed: if the snapshot cannot be stored.
+            RegistryError: if the registry does not take it.
+        """
         supervisor = self._streams.with_engine(stream)
         with self._store.new() as new:
             folder = new / "model"
@@ -60,7 +68,11 @@ class StreamSnapshots:
 
 
 def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
-    """Before a process is started for it. Raises Unprocessable for a time that the model has not seen."""
+    """Refuse times outside the model's window before an export process is started.
+
+    Raises:
+        Unprocessable: if a time is outside.
+    """
     start_s, end_s = window_s
     try:
         wish.times_in((start_s, end_s))
@@ -69,21 +81,27 @@ def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
 
 
 class ModelExports:
-    """See `services.control.snapshot_parts.Exports`."""
+    """Implementation of `services.control.snapshot_parts.Exports`."""
 
     def __init__(self, registry: ModelRegistry, store: SnapshotStore, cache: ExportCache) -> None:
         self._registry, self._store, self._cache = registry, store, cache
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """What is still being made when the block is left is ended."""
+        """Abort running exports at the end of the block."""
         try:
             yield
         finally:
             await asyncio.to_thread(self._cache.close)
 
     def of_version(self, name: str, number: int, wish: ExportWish) -> Exported:
-        """See `Exports`. Raises RegistryError, ExportsError, Conflicting for a version that was not checked."""
+        """See `Exports`.
+
+        Raises:
+            RegistryError: if the version does not exist.
+            ExportsError: if the export fails.
+            Conflicting: if the version was not checked.
+        """
         version: Any = self._registry.version(name, number)
         if version.state not in CHECKED:
             raise Conflicting(f"{name}/{number} is {version.state}; only a version that passed its check is exported")

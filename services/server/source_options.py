@@ -1,6 +1,8 @@
-"""Options in a source's address, checked when a stream is made and not when its capture process opens the source.
+"""Options in source addresses, checked when a stream is created, before the capture process opens
+the source.
 
-The sources load OpenCV, the control plane does not: what each takes is listed here. A test holds the list against the sources.
+The source modules load OpenCV and the control plane does not, so their options are repeated here. A
+test compares both.
 """
 
 from __future__ import annotations
@@ -70,7 +72,11 @@ OPTIONS: Mapping[str, Mapping[str, Check]] = {
 
 
 def check_source_options(address: str) -> None:
-    """Raise InvalidSetting, which names the option, for an address whose source would refuse its options."""
+    """Check the options in a source address.
+
+    Raises:
+        InvalidSetting: if the source would refuse an option; the message names it.
+    """
     if address.startswith("stereo:"):
         for eye in address.removeprefix("stereo:").split("|"):
             check_source_options(eye)
@@ -91,7 +97,7 @@ def check_source_options(address: str) -> None:
 
 
 def _without_layout(scheme: str, query: str) -> str:
-    """The options without `stereo=LAYOUT`, which every source takes."""
+    """Remove `stereo=LAYOUT`, which every source accepts, from the options."""
     layouts = StereoLayout.__args__  # type: ignore[attr-defined]
     kept = []
     for pair in query.split("&"):

@@ -1,4 +1,5 @@
-"""Looks whether every model, recording and result that the database names is on the disk: at start, and again while the service runs."""
+"""Check that the file of every model, recording and result in the database exists, at start and
+during operation."""
 
 from __future__ import annotations
 
@@ -21,11 +22,12 @@ from services.registry.errors import StoreUnavailable
 
 log = logging.getLogger(__name__)
 FRESH_S = 60.0
-"""Time for which an answer of the disk is kept: /readyz is asked every few seconds."""
+"""Seconds for which a disk check is cached, because /readyz is polled every few seconds."""
 
 
 class StoredFilesWatch(Collector):
-    """Missing files of one service. /readyz is asked without a key, so that it gets numbers; names are in the log and in the API's states."""
+    """Watch on missing files. /readyz needs no key and reports numbers only; names are in the log
+    and the API states."""
 
     def __init__(
         self,
@@ -41,7 +43,7 @@ class StoredFilesWatch(Collector):
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Look once at the start, and have what is missing in the log and in the audit log."""
+        """Check once at start and report missing files to the log and the audit log."""
         try:
             missing = await asyncio.to_thread(self.missing)
         except StoreUnavailable as error:
@@ -54,7 +56,11 @@ class StoredFilesWatch(Collector):
         yield
 
     def missing(self) -> list[MissingFile]:
-        """Rows without files, as they are or were a moment ago. Raises StoreUnavailable."""
+        """Return rows whose files are missing, cached for `FRESH_S`.
+
+        Raises:
+            StoreUnavailable: if the database does not answer.
+        """
         with self._lock:
             if self._looked_s is None or self._clock() - self._looked_s > FRESH_S:
                 with self._database.reading() as connection:
@@ -63,7 +69,7 @@ class StoredFilesWatch(Collector):
             return self._missing
 
     async def check(self) -> CheckResult:
-        """For /readyz: missing files make the service degraded."""
+        """Report missing files for /readyz; they make the service degraded."""
         try:
             missing = await asyncio.to_thread(self.missing)
         except StoreUnavailable as error:

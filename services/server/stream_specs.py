@@ -1,4 +1,4 @@
-"""From a stream of the API to what its processes are asked for."""
+"""Conversion of an API stream to the specification of its processes."""
 
 from __future__ import annotations
 
@@ -22,14 +22,19 @@ KNOWN: Mapping[str, tuple[str, ...]] = {
     "tool_mask": ("recorded", "builtin", "onnx", "none"),
     "depth": ("auto", "recorded", "stereo", "light", "parallax", "onnx", "none"),
 }
-"""Names that the engine's registries have, which load torch. A test holds them against the registries."""
+"""Names in the engine's registries, repeated here because the registries load torch. A test
+compares both."""
 WITH_FILE = frozenset({"onnx"})
-"""Names of `KNOWN` that a file follows, as in `onnx:/models/depth.onnx`."""
+"""Names of `KNOWN` that need a file, as in `onnx:/models/depth.onnx`."""
 NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
 def spec_of(stream: NewStream) -> StreamSpec:
-    """The specification of a stream. Raises InvalidSetting for an option that there is not, or a value out of its range."""
+    """Build the specification of a stream.
+
+    Raises:
+        InvalidSetting: if an option is unknown or out of range.
+    """
     options = {name: value for name, value in stream.options.items() if value is not None}
     for name in sorted(set(options) - OF_SOURCE - OF_ENGINE):
         near = difflib.get_close_matches(name, OF_SOURCE | OF_ENGINE, n=1, cutoff=0.0)[0]
@@ -51,7 +56,11 @@ def spec_of(stream: NewStream) -> StreamSpec:
 
 
 def _check_choice(option: str, given: Any, known: Sequence[str]) -> None:
-    """Raise InvalidSetting for a name that is not known, a name without the file that it needs, and a file after a name that takes none."""
+    """Check the value of a named option.
+
+    Raises:
+        InvalidSetting: if the name is unknown, or a file is missing or superfluous.
+    """
     name, colon, file = str(given).partition(":")
     if name not in known or not isinstance(given, str):
         raise InvalidSetting(f"{option} is {given!r:.60}; choose {', '.join(known)}")
@@ -66,7 +75,7 @@ def _check_choice(option: str, given: Any, known: Sequence[str]) -> None:
 
 
 def gpus() -> int:
-    """How many NVIDIA GPUs the driver shows, without loading anything of theirs."""
+    """Return the number of NVIDIA GPUs from the driver's files, without loading a library."""
     return len(list(NVIDIA.iterdir())) if NVIDIA.is_dir() else 0
 
 

@@ -1,4 +1,4 @@
-"""The streams of a server, each kept running by a supervisor of its own."""
+"""Streams of a server, each run by a supervisor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """See `services.control.parts.StreamState`."""
+    """Implementation of `services.control.parts.StreamState`."""
 
     name: str
     source: str
@@ -40,21 +40,21 @@ class StreamFacts:
 
 
 OUT_OF_BODY = "out of body"
-"""Reason with which the engine's out-of-body gate withholds a frame."""
+"""Reason string of frames withheld by the engine's out-of-body gate."""
 
 
 class Stream:
-    """A stream that was asked for: its supervisor and its viewers, while it runs."""
+    """Configured stream, with its supervisor and display hub while it runs."""
 
     def __init__(self, wanted: NewStream, spec: StreamSpec) -> None:
         self.wanted, self.spec = wanted, spec
         self.supervisor: StreamSupervisor | None = None
         self.hub: DisplayHub | None = None
         self.changing = asyncio.Lock()
-        """Held while it is started, stopped or changed: one after another."""
+        """Serialises start, stop and changes of the stream."""
 
     def facts(self) -> StreamFacts:
-        """What it is and does now."""
+        """Return configuration and current state."""
         wanted = self.wanted
         engine = self.spec.engine
         device = engine.device if engine.gpu is None else f"{engine.device}:{engine.gpu}"
@@ -69,7 +69,7 @@ class Stream:
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:
-    """What a stream with such processes is, and why it is not live."""
+    """Derive the state of a stream and the reason from its processes."""
     for process in (capture, engine):
         if process.state == "failed":
             return "failed", process.reason
@@ -86,7 +86,8 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
 
 
 def _withheld(engine: ProcessState) -> str | None:
-    """Say why a running engine has shown nothing although frames came; None where none was withheld."""
+    """Explain why a running engine has shown no picture although frames arrived; None if no frame
+    was withheld."""
     frames, withheld = engine.figures.get("frames"), engine.figures.get("withheld")
     if not frames or not isinstance(withheld, Mapping) or not withheld:
         return None
@@ -96,17 +97,24 @@ def _withheld(engine: ProcessState) -> str | None:
 
 
 class SupervisedStreams:
-    """See `services.control.parts.Streams`; `running` is entered with the server."""
+    """Implementation of `services.control.parts.Streams`; `running` is entered with the server."""
 
     def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None], most: int = 16) -> None:
-        """most: streams at one time, stopped ones among them (`limits.streams`)."""
+        """Create the manager without streams.
+
+        Args:
+            runtime: runtime folder of the service.
+            on_event: receives process events.
+            most: limit on the number of streams, including stopped ones (`limits.streams`).
+        """
         self._runtime, self._on_event, self._most = runtime, on_event, most
         self._launcher = ByLauncher(runtime)
         self._streams: dict[str, Stream] = {}
 
     @asynccontextmanager
     async def running(self, at_start: Sequence[NewStream], started: Sequence[str]) -> AsyncIterator[None]:
-        """Make the streams `at_start`, start those named in `started`; when the server ends, they end with it."""
+        """Create the streams `at_start` and start those named in `started`. All streams are stopped
+        at the end of the block."""
         await asyncio.to_thread(remove_dead)
         for stream in at_start:
             await self.create(stream)
@@ -120,26 +128,26 @@ class SupervisedStreams:
             await asyncio.to_thread(remove_dead)
 
     def hub(self, name: str) -> DisplayHub | None:
-        """The viewers of a stream; None while it does not run."""
+        """Return the display hub of a stream, or None if it does not run."""
         stream = self._streams.get(name)
         return None if stream is None else stream.hub
 
     def measures(self, name: str, role: Role) -> Mapping[str, Any]:
-        """What a process of a stream tells for Prometheus; nothing while it does not run."""
+        """Return the Prometheus measures of a process; empty if the stream does not run."""
         supervisor = self._streams[name].supervisor if name in self._streams else None
         return {} if supervisor is None else supervisor.measures(role)
 
     def causes(self, name: str, role: Role) -> Mapping[str, int]:
-        """How often a process has ended since its stream was started, by cause."""
+        """Return the number of process ends by cause since the stream was started."""
         supervisor = self._streams[name].supervisor if name in self._streams else None
         return {} if supervisor is None else supervisor.causes(role)
 
     def now(self) -> Sequence[StreamFacts]:
-        """Every stream."""
+        """Return the state of every stream."""
         return [stream.facts() for stream in self._streams.values()]
 
     def running_streams(self) -> Sequence[Stream]:
-        """Those that run."""
+        """Return the running streams."""
         return [stream for stream in self._streams.values() if stream.supervisor is not None]
 
     async def all(self) -> Sequence[StreamFacts]:
@@ -147,11 +155,20 @@ class SupervisedStreams:
         return self.now()
 
     async def get(self, name: str) -> StreamFacts:
-        """See `Streams`. Raises Missing."""
+        """See `Streams`.
+
+        Raises:
+            Missing: if the stream does not exist.
+        """
         return self._stream(name).facts()
 
     async def create(self, stream: NewStream) -> StreamFacts:
-        """See `Streams`. Raises Conflicting for a name that is taken, Unprocessable for what cannot be a stream."""
+        """See `Streams`.
+
+        Raises:
+            Conflicting: if the name is taken or the limit is reached.
+            Unprocessable: if the configuration is not valid.
+        """
         if stream.name in self._streams:
             raise Conflicting(f"there is a stream {stream.name}; delete it first, or choose another name")
         if len(self._streams) >= self._most:
@@ -160,24 +177,37 @@ class SupervisedStreams:
         return made.facts()
 
     async def start(self, name: str) -> StreamFacts:
-        """See `Streams`. Raises Missing."""
+        """See `Streams`.
+
+        Raises:
+            Missing: if the stream does not exist.
+        """
         stream = self._stream(name)
         async with stream.changing:
             if stream.supervisor is None:
-                self._launcher.open()  # with the first stream: it loads what engines need, and takes memory for it
+                self._launcher.open()  # opened with the first stream, because its preloaded modules take memory
                 supervisor = StreamSupervisor(stream.spec, self._runtime, start=self._launcher, on_event=self._on_event)
                 await supervisor.start()
                 stream.supervisor, stream.hub = supervisor, DisplayHub(supervisor.folder)
         return stream.facts()
 
     async def stop(self, name: str) -> StreamFacts:
-        """See `Streams`. Raises Missing."""
+        """See `Streams`.
+
+        Raises:
+            Missing: if the stream does not exist.
+        """
         stream = self._stream(name)
         await self._stop(stream, "it was asked for")
         return stream.facts()
 
     async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamFacts:
-        """See `Streams`: a stream that runs is started again with them. Raises Missing and Unprocessable."""
+        """See `Streams`. A running stream is restarted with the new options.
+
+        Raises:
+            Missing: if the stream does not exist.
+            Unprocessable: if an option is not valid.
+        """
         stream = self._stream(name)
         wanted = replace(stream.wanted, options={**stream.wanted.options, **options})
         spec = self._spec(wanted)
@@ -187,23 +217,43 @@ class SupervisedStreams:
         return await self.start(name) if runs else stream.facts()
 
     async def delete(self, name: str) -> None:
-        """See `Streams`. Raises Missing."""
+        """See `Streams`.
+
+        Raises:
+            Missing: if the stream does not exist.
+        """
         await self._stop(self._stream(name), "it is deleted")
         self._streams.pop(name, None)
 
     async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
-        """See `Streams`. Raises Missing, Conflicting for a stream that does not run or is just starting, BusError."""
+        """See `Streams`.
+
+        Raises:
+            Missing: if the stream does not exist.
+            Conflicting: if the stream does not run or is just starting.
+            BusError: if the engine does not answer.
+        """
         return await self.with_engine(name).command("engine", "camera", **camera)
 
     def supervisor(self, name: str) -> StreamSupervisor:
-        """Of a stream that runs. Raises Missing, Conflicting."""
+        """Return the supervisor of a running stream.
+
+        Raises:
+            Missing: if the stream does not exist.
+            Conflicting: if it is stopped.
+        """
         supervisor = self._stream(name).supervisor
         if supervisor is None:
             raise Conflicting(f"the stream {name} is stopped; start it first")
         return supervisor
 
     def with_engine(self, name: str) -> StreamSupervisor:
-        """Of a stream whose engine runs, for a command to it. Raises Missing, Conflicting."""
+        """Return the supervisor of a stream with a running engine, for a command.
+
+        Raises:
+            Missing: if the stream does not exist.
+            Conflicting: if the engine does not run.
+        """
         supervisor = self.supervisor(name)
         engine = supervisor.state().engine
         if engine.state != "running":

@@ -1,4 +1,4 @@
-"""The settings of the service: what they are, and how they are read from a file, the environment and the command line."""
+"""Settings of the service, read from a file, the environment and the command line."""
 
 from services.settings.errors import SettingsInvalid
 from services.settings.load import ENVIRONMENT_PREFIX, load_settings

@@ -1,4 +1,4 @@
-"""Addresses of sources as they may be shown."""
+"""Source addresses without secrets, for display."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ MASK = "**********"
 
 
 def masked_address(address: str) -> str:
-    """The address without the user, password and tokens in it."""
+    """Return the address with user, password and tokens masked."""
     return _SECRET_OPTION.sub(rf"\1={MASK}", _CREDENTIALS.sub(f"{MASK}@", address))

@@ -1,4 +1,4 @@
-"""What is wrong with settings."""
+"""Errors of settings."""
 
 from __future__ import annotations
 
@@ -6,4 +6,5 @@ from gsplat_core.errors import UserError
 
 
 class SettingsInvalid(UserError, ValueError):
-    """A settings file, an environment variable or a flag cannot be used; says which, and what to do."""
+    """A settings file, environment variable or flag is invalid. The message names it and the
+    remedy."""

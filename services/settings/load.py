@@ -1,4 +1,5 @@
-"""Settings from a YAML file, the environment and flags. What cannot be used is refused by its place, with the nearest key that there is."""
+"""Loading of settings from a YAML file, the environment and flags. Errors name the place and the
+nearest valid key."""
 
 from __future__ import annotations
 
@@ -26,9 +27,15 @@ Location = tuple[int | str, ...]
 
 
 def load_settings(file: Path | None = None, flags: Mapping[str, str] | None = None) -> ServiceSettings:
-    """Defaults, overridden by `file`, by variables like INTRASPLAT_SERVER__PORT, and by flags like {"server.port": "8080"}.
+    """Load the settings. `file` overrides the defaults, variables such as INTRASPLAT_SERVER__PORT
+    override the file, and flags override all.
 
-    Raises SettingsInvalid: a key that is not known, a value out of its range, a file that cannot be read.
+    Args:
+        file: YAML file, or None.
+        flags: values by key, such as {"server.port": "8080"}.
+
+    Raises:
+        SettingsInvalid: if a key is unknown, a value is out of range, or the file is unreadable.
     """
     document = YamlFile.read(file) if file is not None else YamlFile({}, {}, "")
     given = _nested(flags or {})
@@ -57,7 +64,7 @@ def load_settings(file: Path | None = None, flags: Mapping[str, str] | None = No
 
 
 def _nested(flags: Mapping[str, str]) -> dict[str, Any]:
-    """`{"server.port": "1"}` as `{"server": {"port": "1"}}`; values are read as YAML, as in the file."""
+    """Convert `{"server.port": "1"}` to `{"server": {"port": "1"}}`; values are parsed as YAML."""
     values: dict[str, Any] = {}
     for name, text in flags.items():
         *sections, key = name.split(".")
@@ -74,7 +81,7 @@ def _nested(flags: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _refuse_unknown_variables() -> None:
-    """pydantic-settings passes over variables of sections that it does not know; a misspelt one must not be lost."""
+    """Refuse environment variables with an unknown section, which pydantic-settings would ignore."""
     for variable in sorted(os.environ):
         section = variable.removeprefix(ENVIRONMENT_PREFIX).partition("__")
         if variable.startswith(ENVIRONMENT_PREFIX) and section[1] and section[0].lower() not in _keys(()):
@@ -87,7 +94,7 @@ def _sentence(location: Location, error: Any, document: YamlFile, flags: Mapping
 
 
 def _place(location: Location, document: YamlFile, flags: Mapping[str, str]) -> str:
-    """Where a value came from, the winning one first."""
+    """Return the place of a value for an error message: flag, variable or line of the file."""
     dotted = _dotted(location)
     for name in flags:
         if dotted == name or dotted.startswith(f"{name}.") or name.startswith(f"{dotted}."):
@@ -113,7 +120,7 @@ def _unknown(location: Location) -> str:
 
 
 def _keys(location: Location) -> list[str]:
-    """The keys of the section at a location."""
+    """Return the valid keys of the section at a location."""
     kind: Any = ServiceSettings
     for part in location:
         if isinstance(kind, type) and issubclass(kind, BaseModel):
@@ -125,7 +132,7 @@ def _keys(location: Location) -> list[str]:
 
 
 def _without_none(kind: Any) -> Any:
-    """The section of one that may be absent."""
+    """Return the section type of an optional section."""
     kinds = [each for each in get_args(kind) if each is not type(None)]
     return kinds[0] if len(kinds) == 1 and type(None) in get_args(kind) else kind
 

@@ -32,7 +32,7 @@ Url = Annotated[str, AfterValidator(_url), Field(examples=["https://login.exampl
 
 
 class OidcSettings(Section):
-    """Persons of an OpenID Connect issuer, beside API keys; needs the extra oidc."""
+    """OpenID Connect issuer whose users are admitted in addition to API keys; needs the extra oidc."""
 
     issuer: Url = Field(description="As the issuer calls itself, to the letter.")
     audience: str = Field(

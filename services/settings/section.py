@@ -1,4 +1,4 @@
-"""Base class of the settings' sections: the rules that hold for every value."""
+"""Base class of the settings sections, with rules for every value."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ MOST_DAYS = 36_600.0
 
 
 class Section(BaseModel):
-    """Immutable values without unknown keys. Errors do not repeat a secret. Numbers are finite and bounded, and no number is true or false."""
+    """Immutable settings section without unknown keys. Errors do not repeat secrets. Numbers are
+    finite, and booleans are not accepted as numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _of_its_kind(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse what pydantic would convert: true as 1, 1 as true, 8000.0 as 8000."""
+        """Refuse implicit conversions of pydantic: true as 1, 1 as true, 8000.0 as 8000."""
         kinds = _kinds(cls.model_fields[str(info.field_name)].annotation)
         if isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
             raise ValueError(f"it must be a number, not {str(value).lower()}")

@@ -1,4 +1,4 @@
-"""The sections of the settings, one class each. Times in seconds, sizes in bytes."""
+"""Settings sections, one class each. Times are in seconds, sizes in bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from services.settings.section import Section
 
 NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
 ResourceName = Annotated[str, Field(pattern=NAME_PATTERN, examples=["theatre-1"])]
-"""What streams, models and keys are called: short, and safe in an address, a file name and a metric's label."""
+"""Name of a stream, model or key: short, and safe in a URL, a file name and a metrics label."""
 MIB, GIB = 2**20, 2**30
 
 
@@ -39,7 +39,7 @@ HostPattern = Annotated[str, AfterValidator(_host_pattern), Field(examples=["roo
 
 
 class ServerSettings(Section):
-    """Where the API listens, and who stands before it."""
+    """Listening address of the API, TLS and proxies."""
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any that is free.")
@@ -74,7 +74,7 @@ class ServerSettings(Section):
 
 
 class PathSettings(Section):
-    """Folders of the service; made where they are missing, for their owner alone."""
+    """Folders of the service; created if missing, accessible to their owner only."""
 
     data: Path | None = Field(default=None, description="What is kept. Default: $XDG_DATA_HOME/intrasplat.")
     runtime: Path | None = Field(
@@ -94,7 +94,7 @@ class AuthSettings(Section):
 
 
 class AuditSettings(Section):
-    """How long the audit log's files grow, and how long they are kept: for ever, unless one of the last two says otherwise."""
+    """Size of audit log segments and their retention. By default segments are kept indefinitely."""
 
     segment_bytes: int = Field(
         default=16 * MIB, ge=64 * 1024, description="A file that is longer is closed, and the next one goes on."
@@ -108,7 +108,7 @@ class AuditSettings(Section):
 
 
 class LimitSettings(Section):
-    """What one caller may take."""
+    """Resource limits per caller."""
 
     body_bytes: int = Field(default=MIB, ge=1024, description="Longest body of a request that is not an upload.")
     model_bytes: int = Field(default=2048 * MIB, ge=MIB, description="Longest uploaded model.")
@@ -145,7 +145,7 @@ class LimitSettings(Section):
 
 
 class SourceRules(Section):
-    """Which sources a caller of the API may name: a stream makes this machine open what its address says."""
+    """Sources that an API caller may use. A stream makes this machine open the address."""
 
     schemes: tuple[str, ...] = Field(
         default=("synthetic", "rtsp", "rtsps", "v4l2"), description="Schemes of addresses that may be used."
@@ -159,7 +159,7 @@ class SourceRules(Section):
 
 
 class RegistrySettings(Section):
-    """Where models are kept."""
+    """Storage of models."""
 
     database: SecretStr | None = Field(
         default=None, description="SQLAlchemy URL. Default: an SQLite file in paths.data."
@@ -173,7 +173,7 @@ class RegistrySettings(Section):
 
 
 class RecordingSettings(Section):
-    """Uploaded recordings, and how long they stay. One that a replay uses is never removed."""
+    """Uploaded recordings and their retention. A recording in use is never deleted."""
 
     folder: Path | None = Field(default=None, description="Where they lie. Default: recordings in paths.data.")
     unpacked_bytes: int = Field(default=64 * GIB, ge=MIB, description="Most that an archive may hold.")
@@ -184,7 +184,7 @@ class RecordingSettings(Section):
 
 
 class JobSettings(Section):
-    """Replays as jobs."""
+    """Replay jobs."""
 
     folder: Path | None = Field(default=None, description="Where results lie. Default: replays in paths.data.")
     workers: int = Field(default=1, ge=1, le=256, description="Replays at one time.")
@@ -210,7 +210,7 @@ class JobSettings(Section):
 
 
 class LogSettings(Section):
-    """What is written to standard error."""
+    """Log output on standard error."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
     format: Literal["auto", "json", "text"] = Field(
@@ -219,7 +219,7 @@ class LogSettings(Section):
 
 
 class StreamSettings(Section):
-    """A stream that is there from the start."""
+    """Stream that exists from the start."""
 
     source: str = Field(
         max_length=1000,

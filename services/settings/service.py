@@ -1,4 +1,4 @@
-"""All settings of the service."""
+"""Complete settings of the service."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from services.settings.sections import (
 
 
 class ServiceSettings(BaseSettings):
-    """Settings of `intrasplat serve`: defaults, then the file, then the environment, then flags, the later ones winning."""
+    """Settings of `intrasplat serve`. Later sources win: defaults, file, environment, flags."""
 
     model_config = SettingsConfigDict(
         env_prefix="INTRASPLAT_", env_nested_delimiter="__", extra="forbid", frozen=True, hide_input_in_errors=True
@@ -61,12 +61,12 @@ class ServiceSettings(BaseSettings):
 
     @cached_property
     def data_dir(self) -> Path:
-        """Where everything that is kept lies."""
+        """Return the folder of all persistent data."""
         return self.paths.data or _base("XDG_DATA_HOME", Path.home() / ".local" / "share") / "intrasplat"
 
     @cached_property
     def runtime_dir(self) -> Path:
-        """Where the sockets of running processes lie: a short path."""
+        """Return the folder of the sockets; a short path, because socket paths are limited."""
         if self.paths.runtime is not None:
             return self.paths.runtime
         if os.environ.get("XDG_RUNTIME_DIR"):
@@ -75,11 +75,11 @@ class ServiceSettings(BaseSettings):
 
     @property
     def admin_key_file(self) -> Path:
-        """Where the first administrator's key is found, or put."""
+        """Return the file of the first administrator's key."""
         return self.auth.admin_key_file or self.data_dir / "admin.key"
 
     def shown(self) -> dict[str, Any]:
-        """The settings as JSON, secrets and the passwords in addresses of sources masked."""
+        """Return the settings as JSON, with secrets and passwords in source addresses masked."""
         values = self.model_dump(mode="json")
         for stream in values["streams"].values():
             stream["source"] = masked_address(stream["source"])

@@ -1,4 +1,4 @@
-"""A YAML file with the line of each of its keys."""
+"""YAML file with the line number of each key."""
 
 from __future__ import annotations
 
@@ -19,16 +19,20 @@ _NAME_TAGS = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge")
 
 @dataclass(frozen=True)
 class YamlFile:
-    """The values of a settings file."""
+    """Values of a settings file."""
 
     values: dict[str, Any]
     lines: dict[tuple[str, ...], int]
-    """The line of each key, by the keys that lead there."""
+    """Line number of each key, by its path of keys."""
     name: str
 
     @classmethod
     def read(cls, path: Path) -> YamlFile:
-        """Read a file; raises SettingsInvalid for one that is not there, not YAML, or names a key twice."""
+        """Read a file.
+
+        Raises:
+            SettingsInvalid: if the file is missing, is not YAML, or repeats a key.
+        """
         try:
             data = read_regular(path, MOST_BYTES)
         except OSError as error:
@@ -50,7 +54,7 @@ class YamlFile:
         return cls(values or {}, lines, path.name)
 
     def line_of(self, location: tuple[int | str, ...]) -> int | None:
-        """The line of a key, or of the nearest section around it."""
+        """Return the line of a key or of the nearest enclosing section."""
         for length in range(len(location), 0, -1):
             line = self.lines.get(tuple(str(part) for part in location[:length]))
             if line is not None:
@@ -59,10 +63,11 @@ class YamlFile:
 
 
 def yaml_value(text: str) -> Any:
-    """Return the value that a YAML text states. Raises ValueError, in one line, for what is not YAML or is beyond these bounds.
+    """Parse a YAML text. Nesting is limited to MOST_NESTING and the number of values to
+    MOST_VALUES, counting each use of an alias. Keys are text.
 
-    Lists and sections are at most MOST_NESTING deep and have at most MOST_VALUES values, those that aliases repeat counted each time. Names in
-    sections are text.
+    Raises:
+        ValueError: if the text is not YAML or exceeds a limit; the message has one line.
     """
     try:
         _check_nesting(text)
@@ -70,7 +75,7 @@ def yaml_value(text: str) -> Any:
         if root is not None:
             _count(root, {})
         return yaml.safe_load(text)
-    except (yaml.YAMLError, OverflowError, ValueError) as error:  # ValueError: also days and numbers that are none
+    except (yaml.YAMLError, OverflowError, ValueError) as error:  # ValueError: also invalid dates and numbers
         raise ValueError(" ".join(str(error).split())) from error
 
 
@@ -84,7 +89,11 @@ def _check_nesting(text: str) -> None:
 
 
 def _count(node: yaml.Node, counted: dict[int, int]) -> int:
-    """Return how many values a node has. Raises ValueError for more than MOST_VALUES, and for names and texts that settings cannot have."""
+    """Return the number of values of a node.
+
+    Raises:
+        ValueError: if there are more than MOST_VALUES, or a key or text is not allowed.
+    """
     line = node.start_mark.line + 1
     if isinstance(node, yaml.ScalarNode):
         if "\0" in node.value:
