@@ -1,4 +1,4 @@
-"""One entry of the audit log, and the digest that chains it to the one before."""
+"""Audit entries and the digests that chain them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 FIRST = 64 * "0"
-"""What the first entry has as the digest of the one before."""
+"""Predecessor digest of the first entry."""
 MOST_LINE_BYTES = 8192
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _PLAIN = re.compile(r"[\w .:@/+*=,;()'?&#%|-]{0,400}", re.ASCII)
@@ -20,18 +20,18 @@ Detail = dict[str, str | int | float | bool | None]
 
 @dataclass(frozen=True)
 class Entry:
-    """What was done. It names a key, never a person, and an object by its name in the service, never a recording's file or a patient."""
+    """Audit entry. It names keys and objects of the service, never persons, file names or patients."""
 
     seq: int
     at: str
-    """Wall clock, UTC, ISO 8601."""
+    """Wall-clock time, UTC, ISO 8601."""
     event: str
-    """`resource.verb`, as in `model.activate`."""
+    """Event as `resource.verb`, such as `model.activate`."""
     actor: str
-    """Name and id of the API key, `system` for the service itself."""
+    """Name and id of the API key, or `system` for the service itself."""
     role: str
     subject: str
-    """What it was done to, as in `liver/3`."""
+    """Affected object, such as `liver/3`."""
     outcome: Outcome
     request_id: str = ""
     detail: Detail = field(default_factory=dict)
@@ -46,13 +46,20 @@ class Entry:
                 raise ValueError(f"audit: the detail {key:.40} is not a short plain value")
 
     def line(self) -> bytes:
-        """The entry with its digest as a line of JSON."""
+        """Return the entry with its digest as a JSON line."""
         values = asdict(self)
         return _canonical(values | {"digest": digest_of(values)}) + b"\n"
 
 
 def parse_line(line: bytes) -> tuple[Entry, str]:
-    """An entry and the digest that its line states; raises ValueError for anything but a line that `Entry.line` wrote."""
+    """Parse a line of `Entry.line`.
+
+    Returns:
+        The entry and the stated digest.
+
+    Raises:
+        ValueError: if the line has another format.
+    """
     try:
         values = json.loads(line)
     except RecursionError as error:
@@ -73,12 +80,12 @@ def parse_line(line: bytes) -> tuple[Entry, str]:
 
 
 def digest_of(values: dict[str, Any]) -> str:
-    """SHA-256 over an entry's values, the digest of the one before among them."""
+    """Return the SHA-256 of an entry's values, including the predecessor's digest."""
     return hashlib.sha256(_canonical(values)).hexdigest()
 
 
 def digest_of_entry(entry: Entry) -> str:
-    """The digest that an entry's line should state."""
+    """Return the correct digest of an entry."""
     return digest_of(asdict(entry))
 
 

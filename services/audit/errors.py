@@ -4,12 +4,12 @@ from gsplat_core.errors import UserError
 
 
 class AuditError(Exception):
-    """Base of everything that the audit log raises on purpose."""
+    """Base class of the audit log's errors."""
 
 
 class AuditUnwritable(AuditError, UserError):
-    """An entry, or the log itself, could not be written to the disk. The message names the file and the cause."""
+    """An entry or the log itself could not be written. The message names the file and the cause."""
 
 
 class AuditInUse(AuditError, UserError):
-    """Another process writes this log: one service for each folder."""
+    """Another process writes this log. Each folder belongs to one service."""

@@ -1,5 +1,8 @@
-"""Numbers and digests of entries in files of their own: the head is the newest entry, and shows that whole lines were cut off the log's end; the
-anchor is the newest of those that were removed because they were old, which the first entry that is kept must follow."""
+"""Head and anchor files next to the log.
+
+The head is the newest entry and reveals lines cut off the end. The anchor is the last entry removed
+by retention, and the first kept entry must follow it.
+"""
 
 from __future__ import annotations
 
@@ -17,39 +20,47 @@ MOST_BYTES = 4096
 
 @dataclass(frozen=True)
 class Head:
-    """An entry, the newest of its kind. `seq` is -1 before the first one."""
+    """Number and digest of an entry. `seq` is -1 before the first entry."""
 
     seq: int = -1
     digest: str = FIRST
 
 
 def head_path(log: Path) -> Path:
-    """Where the head of a log lies."""
+    """Return the path of a log's head file."""
     return log.with_suffix(".head")
 
 
 def anchor_path(log: Path) -> Path:
-    """Where the anchor of a log lies, from which entries were removed."""
+    """Return the path of a log's anchor file."""
     return log.with_suffix(".anchor")
 
 
 def read_head(log: Path) -> Head | None:
-    """The head beside a log; None where there is none, ValueError where it is none."""
+    """Read the head of a log; None if the file is missing.
+
+    Raises:
+        ValueError: if the file is malformed.
+    """
     return _read(head_path(log))
 
 
 def read_anchor(log: Path) -> Head | None:
-    """The anchor beside a log; None where nothing was removed, ValueError where it is none."""
+    """Read the anchor of a log; None if nothing was removed.
+
+    Raises:
+        ValueError: if the file is malformed.
+    """
     return _read(anchor_path(log))
 
 
 def write_head(log: Path, head: Head) -> None:
-    """Replace the head, whole or not at all."""
+    """Replace the head atomically."""
     _write(head_path(log), head)
 
 
 def write_anchor(log: Path, anchor: Head) -> None:
-    """Replace the anchor, whole or not at all."""
+    """Replace the anchor atomically."""
     _write(anchor_path(log), anchor)
 
 
@@ -73,7 +84,8 @@ def _read(path: Path) -> Head | None:
 
 
 def _write(path: Path, head: Head) -> None:
-    """Replace a file as a whole. Nothing can fail after the rename: an error means that the earlier content is still there."""
+    """Replace a file atomically. No step after the rename can fail, so an error means that the
+    earlier content is unchanged."""
     unfinished = path.with_suffix(f"{path.suffix}.new")
     data = json.dumps(asdict(head)).encode()
     descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)

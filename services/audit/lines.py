@@ -1,4 +1,4 @@
-"""Lines of a file from its end, whatever a crash has left after the last whole one."""
+"""Backward reading of a file's lines, tolerating an incomplete last line after a crash."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BLOCK_BYTES = 1 << 16
 
 
 def whole_lines_bytes(path: Path, size: int) -> int:
-    """Bytes up to the end of the last whole line."""
+    """Return the number of bytes up to the end of the last complete line."""
     with open_regular(path) as file:
         end = size
         while end:
@@ -26,7 +26,7 @@ def whole_lines_bytes(path: Path, size: int) -> int:
 
 
 def lines_backwards(path: Path, size: int | None = None) -> Iterator[bytes]:
-    """The whole lines of a file, the last one first."""
+    """Yield the complete lines of a file, last one first."""
     with open_regular(path) as file:
         end = whole_lines_bytes(path, os.fstat(file.fileno()).st_size) if size is None else size
         rest = b""

@@ -1,8 +1,9 @@
-"""Writing the audit log: one line at a time, on the disk before `append` returns.
+"""Writer of the audit log. Each line is on the disk before `append` returns.
 
-An entry counts when its line *and* the head that names it are on the disk. Where either cannot be written the line is taken back, and
-`append` raises AuditUnwritable. A kill between the two leaves a log that is ahead of its head; the next start follows the chain from the head to
-the end and moves the head forward.
+An entry is valid once its line and the head that names it are on the disk. If either write fails,
+the line is removed again and `append` raises AuditUnwritable. A kill between both writes leaves the
+log ahead of its head; the next start follows the chain from the head to the end and moves the head
+forward.
 """
 
 from __future__ import annotations
@@ -29,22 +30,28 @@ log = logging.getLogger(__name__)
 
 
 class AuditLog:
-    """The log at a path, for one process at a time; any thread may append. A file that is long is closed, and the next one goes on.
+    """Audit log for one process at a time, thread-safe. Long files are closed as segments.
 
-    Opening it repairs the traces of a crash, and an entry `audit.recovered` tells of each repair: a last line without an end is taken off, and
-    a valid chain that is ahead of its head moves the head forward. A log whose end does not fit is put aside as `…broken-TIME` for inspection,
-    and a new log begins with an entry that names it.
+    Opening repairs the traces of a crash and records each repair as `audit.recovered`. An
+    incomplete last line is removed, and a valid chain ahead of its head moves the head forward. A
+    log with an inconsistent end is renamed to `…broken-TIME`, and a new log begins with an entry
+    that names it.
     """
 
     def __init__(self, path: Path, keeping: Keeping | None = None) -> None:
-        """Open the log, which is made where it is missing. Raises AuditInUse, and AuditUnwritable for a disk that takes nothing."""
+        """Open the log, creating it if missing.
+
+        Raises:
+            AuditInUse: if another process writes it.
+            AuditUnwritable: if the disk refuses writes.
+        """
         self.path = path
         self._keeping = keeping or Keeping()
         self._lock = threading.Lock()
         self._descriptor = self._owned = -1
         self._head = Head()
         self._untaken: int | None = None
-        """Length of the file without the line that a failed append left behind and that could not be taken back yet."""
+        """File length without the line of a failed append that could not be removed yet."""
         self._failure: str | None = None
         try:
             with self._unwritable():
@@ -61,9 +68,15 @@ class AuditLog:
         self, event: str, *, actor: str, role: str = "", subject: str = "", outcome: Outcome = "done",
         request_id: str = "", detail: Detail | None = None,
     ) -> Entry:  # fmt: skip
-        """Write an entry. Raises AuditUnwritable when it cannot be brought to the disk, ValueError for what must not be written."""
+        """Write an entry.
+
+        Raises:
+            AuditUnwritable: if the entry cannot be written to the disk.
+            ValueError: if a value is not permitted in the log.
+        """
         with self._lock:
-            self._next(event, actor, role, subject, outcome, request_id, detail or {})  # before anything is changed
+            # validates the entry before anything is changed
+            self._next(event, actor, role, subject, outcome, request_id, detail or {})
             with self._unwritable():
                 self._take_back()
                 if os.fstat(self._descriptor).st_size >= self._keeping.segment_bytes:
@@ -72,29 +85,30 @@ class AuditLog:
             return self._add(self._next(event, actor, role, subject, outcome, request_id, detail or {}))
 
     def newest(self, count: int, before: int | None = None) -> list[Entry]:
-        """Up to `count` entries, the newest first; those before number `before`."""
+        """Return up to `count` entries below number `before`, newest first."""
         return newest(self.path, count, before)
 
     def search(self, wanted: Wanted, count: int, before: int | None = None) -> Page:
-        """Return up to `count` wanted entries, the newest first; those before number `before`."""
+        """Return up to `count` matching entries below number `before`, newest first."""
         return search(self.path, wanted, count, before)
 
     def exported(self, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
-        """Yield the wanted entries as a file, the oldest first; see `services.audit.pages.exported`."""
+        """Yield the matching entries as a file, oldest first; see `services.audit.pages.exported`."""
         return exported(self.path, wanted, form)
 
     @property
     def head(self) -> Head:
-        """Number and digest of the newest entry: keep a copy elsewhere, and nobody can shorten the log unseen."""
+        """Return number and digest of the newest entry. A copy elsewhere reveals truncation of the
+        log."""
         return self._head
 
     @property
     def failure(self) -> str | None:
-        """Reason of the last failed write; None once an entry could be written again."""
+        """Return the reason of the last failed write, or None after a successful one."""
         return self._failure
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file and release the lock."""
         for descriptor in (self._descriptor, self._owned):
             if descriptor >= 0:
                 os.close(descriptor)
@@ -131,7 +145,7 @@ class AuditLog:
 
     @contextmanager
     def _unwritable(self) -> Iterator[None]:
-        """Turn errors of the disk into AuditUnwritable, and remember the reason for `failure`."""
+        """Convert disk errors to AuditUnwritable and store the reason for `failure`."""
         try:
             yield
         except OSError as error:
@@ -139,7 +153,11 @@ class AuditLog:
             raise AuditUnwritable(self._failure) from error
 
     def _take_back(self) -> None:
-        """Cut off what a failed append has left. Raises OSError where the disk does not even do that: the next append tries again first."""
+        """Remove the line of a failed append.
+
+        Raises:
+            OSError: if that fails; the next append retries.
+        """
         if self._untaken is not None:
             os.ftruncate(self._descriptor, self._untaken)
             self._untaken = None
@@ -148,7 +166,8 @@ class AuditLog:
         self._add(self._next(event, "system", "", "audit", outcome, "", {**detail}))
 
     def _close_segment(self) -> None:
-        """Go on in a new file. Every step may fail or be the last one before a crash: the next append, or start, goes on from there."""
+        """Close the file as a segment and open a new one. After a failure or a crash, the next
+        append or start continues."""
         if self._is_current():
             with self.path.open("rb") as file:
                 try:
@@ -162,16 +181,17 @@ class AuditLog:
         self._descriptor = descriptor
 
     def _is_current(self) -> bool:
-        """Return True if the open file is still the one at the log's path, and not a closed segment."""
+        """Return True if the open file is still at the log's path, and not renamed to a segment."""
         try:
             return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(self._descriptor))
         except FileNotFoundError:
             return False
 
     def _remove_old(self) -> None:
-        """Remove closed segments beyond what is kept: an entry says so first, then the anchor takes their place, then the files go.
+        """Delete segments beyond the retention limits. Order: audit entry, anchor, files.
 
-        What the disk refuses is logged and done the next time: old segments that stay are no reason to refuse an entry.
+        Disk errors are logged and retried later, because leftover segments do not justify refusing
+        an entry.
         """
         old = too_old(closed_segments(self.path), self._keeping)
         if old:
@@ -208,7 +228,11 @@ class AuditLog:
             self._say("audit.recovered", "done", **found)
 
     def _checked_end(self, whole_bytes: int) -> Head:
-        """The newest entry, which becomes the head. ValueError where the chain does not lead from the head that was kept to it."""
+        """Return the newest entry, which becomes the head.
+
+        Raises:
+            ValueError: if the chain does not lead to it from the stored head.
+        """
         kept = read_head(self.path)
         closed = closed_segments(self.path)
         last = next(lines_backwards(self.path, whole_bytes), None)
@@ -226,7 +250,11 @@ class AuditLog:
         return here
 
     def _check_chain(self, kept: Head, whole_bytes: int) -> None:
-        """Follow the digests from the newest entry back to the one that the head names. Raises ValueError where they do not lead there."""
+        """Follow the digests from the newest entry back to the one in the head.
+
+        Raises:
+            ValueError: if the chain is broken.
+        """
         files = [(self.path, whole_bytes), *((each.path, None) for each in reversed(closed_segments(self.path)))]
         expected: Head | None = None
         for line in (line for path, size in files for line in lines_backwards(path, size)):
@@ -257,7 +285,7 @@ class AuditLog:
 
 
 def _advice(error: OSError) -> str:
-    """A remedy for an error of the disk."""
+    """Return a remedy for a disk error."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "free space on that disk"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP):
@@ -266,7 +294,15 @@ def _advice(error: OSError) -> str:
 
 
 def _owned(lock: Path, log: Path) -> int:
-    """A lock that is held as long as the log is open: the log's own file changes."""
+    """Lock a separate file while the log is open, because the log's own file is replaced by
+    segments.
+
+    Returns:
+        The descriptor of the lock.
+
+    Raises:
+        AuditInUse: if another process holds the lock.
+    """
     descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Reading the log back: its newest entries, those that fit a filter, and all of it as a file for other programs."""
+"""Reading of the log: newest entries, search, and export for other programs."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ from services.audit.lines import lines_backwards
 from services.audit.segments import closed_segments
 
 MOST_LOOKED_AT = 50_000
-"""Entries that one search reads, so that it ends within a second or so; the next page continues where it stopped."""
+"""Entries read per search, which bounds its time to about a second. The next page continues at that
+position."""
 PIECE_BYTES = 1 << 16
 CSV_FIELDS = ("seq", "at", "event", "actor", "role", "subject", "outcome", "request_id", "detail", "digest")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""A spreadsheet takes a cell that begins with one of these for a formula."""
+"""First characters that spreadsheets interpret as a formula."""
 ExportFormat = Literal["csv", "jsonl"]
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Entries to look for; None takes any value."""
+    """Filter for entries; None matches any value."""
 
     event: str | None = None
-    """`model.activate`, or `model` for all of its events."""
+    """Event name such as `model.activate`, or `model` for all its events."""
     actor: str | None = None
-    """Part of the actor: the name or the number of a key."""
+    """Part of the actor: name or id of a key."""
     subject: str | None = None
     """Part of the subject."""
     outcome: Outcome | None = None
     since: datetime | None = None
     until: datetime | None = None
-    """Entries before this moment. Both times have a zone."""
+    """End of the time range, exclusive. Both times have a zone."""
 
     def fits(self, values: Mapping[str, Any]) -> bool:
-        """Return True for an entry, as its line has it, that is looked for."""
-        at = values["at"]  # all are in UTC to the millisecond: their order is that of their text
+        """Return True if the values of an entry match."""
+        at = values["at"]  # all in UTC with milliseconds, so text order is time order
         return (
             (self.outcome is None or values["outcome"] == self.outcome)
             and (self.event is None or f"{values['event']}.".startswith(f"{self.event.rstrip('.')}."))
@@ -55,28 +56,33 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Page:
-    """Entries, the newest first, and the number before which the next page begins; None when the log was read to its beginning."""
+    """Entries, newest first, and the number before which the next page begins. None at the
+    beginning of the log."""
 
     entries: list[Entry]
     before: int | None
 
 
 def newest(log: Path, count: int, before: int | None = None) -> list[Entry]:
-    """Up to `count` entries, the newest first; those before number `before`. Raises ValueError for a line that is no entry."""
+    """Return up to `count` entries below number `before`, newest first.
+
+    Raises:
+        ValueError: if a line is no entry.
+    """
     return search(log, Wanted(), count, before).entries
 
 
 def search(log: Path, wanted: Wanted, count: int, before: int | None = None) -> Page:
-    """Return up to `count` entries that are wanted, the newest first.
+    """Return up to `count` matching entries, newest first.
 
     Args:
-        log: the log's path.
-        wanted: what to look for.
-        count: at most so many.
-        before: only entries with a smaller number.
+        log: path of the log.
+        wanted: filter.
+        count: maximum number of entries.
+        before: return only entries below this number.
 
     Raises:
-        ValueError: for a line that is no entry.
+        ValueError: if a line is no entry.
     """
     while True:
         closed = closed_segments(log)
@@ -85,7 +91,8 @@ def search(log: Path, wanted: Wanted, count: int, before: int | None = None) -> 
             found = _search([*([log] if log.exists() else []), *older], wanted, count, before)
         except FileNotFoundError:  # closed or removed just now
             continue
-        if closed == closed_segments(log):  # else one was closed or removed meanwhile, and its entries may be missing
+        # otherwise a segment was closed or removed meanwhile, and entries may be missing
+        if closed == closed_segments(log):
             return found
 
 
@@ -96,7 +103,7 @@ def _search(files: list[Path], wanted: Wanted, count: int, before: int | None) -
         if wanted == Wanted():
             entry, _ = parse_line(line)
             number, fits = entry.seq, True
-        else:  # checking a line in full takes five times as long as reading it
+        else:  # full validation of a line takes five times as long as parsing
             values = json.loads(line)
             number, fits = int(values["seq"]), wanted.fits(values)
         if before is not None and number >= before:
@@ -110,10 +117,10 @@ def _search(files: list[Path], wanted: Wanted, count: int, before: int | None) -
 
 
 def exported(log: Path, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
-    """Yield the wanted entries as a file, the oldest first.
+    """Yield the matching entries as a file, oldest first.
 
-    `jsonl` has the lines as they were written, with their digests. `csv` has a heading; a cell that a spreadsheet would take for a formula begins
-    with an apostrophe.
+    `jsonl` has the original lines with their digests. `csv` has a heading, and cells that a
+    spreadsheet would interpret as a formula are prefixed with an apostrophe.
     """
     if form == "csv":
         yield (",".join(CSV_FIELDS) + "\r\n").encode()
@@ -134,7 +141,7 @@ def exported(log: Path, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
 
 
 def _opened(log: Path, opened: ExitStack) -> list[BinaryIO]:
-    """Open the log's files, the oldest first, all at one moment: what is removed afterwards is read to its end."""
+    """Open all files of the log, oldest first. Files deleted afterwards remain readable."""
     while True:
         closed = closed_segments(log)
         with ExitStack() as trying:

@@ -24,24 +24,28 @@ from services.audit.lines import lines_backwards
 
 @dataclass(frozen=True)
 class Keeping:
-    """How long a file grows, and how many closed ones are kept: all, unless one of the two says otherwise."""
+    """Size limit of a file, and retention of closed files. By default all are kept."""
 
     segment_bytes: int = 16 * 2**20
     segments: int | None = None
     days: float | None = None
     trusts_ages: Callable[[], bool] = lambda: True
-    """Return True if the clock is trusted. While it is not, no file is removed by its age."""
+    """Return True if the clock is trusted. Otherwise no file is removed by age."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A closed file of the log."""
+    """Closed file of the log."""
 
     first_seq: int
     path: Path
 
     def last(self) -> tuple[Entry, str]:
-        """Its last entry, with the digest that it states; ValueError where it has none."""
+        """Return its last entry and the stated digest.
+
+        Raises:
+            ValueError: if the file has no valid entry.
+        """
         line = next(lines_backwards(self.path), None)
         if line is None:
             raise ValueError(f"{self.path.name} is empty")
@@ -49,26 +53,30 @@ class Segment:
 
 
 def closed_segments(log: Path) -> list[Segment]:
-    """The closed segments that are kept, the oldest first. ValueError where the anchor is none."""
+    """Return the retained segments, oldest first.
+
+    Raises:
+        ValueError: if the anchor is malformed.
+    """
     anchor = read_anchor(log)
     removed = -1 if anchor is None else anchor.seq
     return [each for each in all_segments(log) if each.first_seq > removed]
 
 
 def all_segments(log: Path) -> list[Segment]:
-    """Those too that were to be removed, when the service was killed meanwhile."""
+    """Return all segments on the disk, including those whose removal was interrupted."""
     name = re.compile(rf"{re.escape(log.stem)}\.(\d{{12}}){re.escape(log.suffix)}")
     found = ((name.fullmatch(each), log.parent / each) for each in os.listdir(log.parent))
     return sorted((Segment(int(match[1]), path) for match, path in found if match), key=lambda each: each.first_seq)
 
 
 def segment_path(log: Path, first_seq: int) -> Path:
-    """What the file is called once it is closed."""
+    """Return the path of a closed segment."""
     return log.with_name(f"{log.stem}.{first_seq:012d}{log.suffix}")
 
 
 def too_old(segments: list[Segment], keeping: Keeping) -> list[Segment]:
-    """The oldest of the segments that are kept no longer."""
+    """Return the oldest segments, beyond the retention limits."""
     surplus = 0 if keeping.segments is None else max(0, len(segments) - keeping.segments)
     if keeping.days is not None and keeping.trusts_ages():
         until = datetime.now(UTC) - timedelta(days=keeping.days)
@@ -78,7 +86,7 @@ def too_old(segments: list[Segment], keeping: Keeping) -> list[Segment]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring renamed and removed files of a folder to the disk."""
+    """Sync renames and deletions in a folder to the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

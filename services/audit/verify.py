@@ -1,4 +1,4 @@
-"""Reading an audit log from its first line to its last, and saying what was done to it."""
+"""Verification of an audit log from its first line to its last."""
 
 from __future__ import annotations
 
@@ -13,54 +13,56 @@ from services.audit.segments import closed_segments
 
 MOST_FINDINGS = 100
 MOST_READINGS = 5
-"""Of a log that the service closes segments of meanwhile."""
+"""Attempts to read a log whose segments change meanwhile."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that does not fit."""
+    """Detected inconsistency."""
 
     line: int
-    """Counted from 1 in its file; the line after the last one for what is missing at the end."""
+    """Line number in its file, from 1; one past the last line for entries missing at the end."""
     what: str
     file: str = ""
-    """Name of the closed segment; empty for the file that is written now."""
+    """Name of the closed segment; empty for the current file."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What `verify` found."""
+    """Result of `verify`."""
 
     entries: int
     head: Head
     findings: tuple[Finding, ...]
     cut_by_a_crash: bool
-    """The last line has no end and was never finished: the service stopped while it wrote. Its next start takes the line off."""
+    """True if the last line is incomplete because the service stopped during a write. Its next
+    start removes the line."""
     removed: int = 0
-    """Older entries that the service removed, as its settings say; an entry names the last of them."""
+    """Number of older entries removed by retention; an entry names the last of them."""
 
     @property
     def intact(self) -> bool:
-        """Nothing was changed, removed, inserted or cut off, but for what the service itself says that it removed."""
+        """Return True if nothing was changed, removed, inserted or truncated, except by the
+        recorded retention."""
         return not self.findings
 
 
 @dataclass
 class _Walk:
-    """What is known after some lines."""
+    """State of the verification after some lines."""
 
     before: Head
-    """The last entry."""
+    """Last entry."""
     count: int = 0
     last_line: int = 0
     unfinished: bool = False
     findings: list[Finding] = field(default_factory=list)
     digests: dict[str, int] = field(default_factory=dict)
     retired: set[Head] = field(default_factory=set)
-    """What entries say was removed."""
+    """Removed ranges according to entries."""
 
     def read(self, path: Path, name: str) -> None:
-        """Take the lines of a file; `name` is empty for the one that is written now."""
+        """Process the lines of a file; `name` is empty for the current file."""
         self.last_line = 0
         for number, line in enumerate(_lines(path), start=1):
             if not line.endswith(b"\n") and len(line) <= MOST_LINE_BYTES and not name:
@@ -81,9 +83,19 @@ class _Walk:
 
 
 def verify(path: Path, expected_head: str | None = None) -> Verdict:
-    """Check every line's digest, number and predecessor, from the oldest segment that is kept to the end, and the end against the head beside
-    the log, and against `expected_head`, a digest that was noted elsewhere: it must be some entry's. Raises OSError for a file that cannot be
-    read."""
+    """Verify digest, number and predecessor of every entry, from the oldest segment on, and the end
+    against the head file.
+
+    Args:
+        path: path of the log.
+        expected_head: digest noted elsewhere, which some entry must have, or None.
+
+    Returns:
+        The findings.
+
+    Raises:
+        OSError: if a file cannot be read.
+    """
     for _ in range(MOST_READINGS):
         try:
             kept, anchor = read_head(path), read_anchor(path)  # first: the service may be writing
@@ -100,7 +112,7 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
         except FileNotFoundError:
             if closed == closed_segments(path):
                 raise
-        if closed == closed_segments(path):  # else the service has closed one or removed one meanwhile
+        if closed == closed_segments(path):  # otherwise the service closed or removed a segment meanwhile
             break
     return _verdict(path, walk, kept, anchor, expected_head)
 
@@ -142,7 +154,7 @@ def _misfits_at_the_end(
         yield f"{kept.seq - last.seq} entries were cut off the end{cut}"
     elif kept.seq >= 0 and digests.get(kept.digest) != kept.seq:
         yield f"entry {kept.seq} is not the one that was written"
-    elif last.seq > kept.seq + 1:  # a crash leaves the head one entry behind; a service that is writing moves it on
+    elif last.seq > kept.seq + 1:  # a crash leaves the head one entry behind; a running service moves the head on
         now = read_head(path)
         if now is None or last.seq > now.seq + 1:
             yield (

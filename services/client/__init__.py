@@ -1,4 +1,4 @@
-"""A client of the service's API, for programs and for `intrasplat ctl`."""
+"""Python client of the service's API, also used by `intrasplat ctl`."""
 
 from services.client.client import Client
 from services.client.errors import ClientError, Refused, Unreachable

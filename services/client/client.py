@@ -1,4 +1,4 @@
-"""The API as methods. One `Client` is for one thread at a time."""
+"""API client class. Use one `Client` per thread."""
 
 from __future__ import annotations
 
@@ -26,33 +26,49 @@ WAITING = ("uploaded", "validated")
 
 
 class Client(ReplayMethods, SnapshotMethods):
-    """A server's API, with one key.
+    """Client of one server with one API key.
 
         with Client("http://127.0.0.1:8000", key) as client:
             version = client.upload("liver", Path("liver.isplat"))
             client.checked("liver", version.version)
             client.activate("liver", version.version, expected_current=None)
 
-    Methods raise Unreachable and Refused.
+    All methods raise Unreachable and Refused.
     """
 
     def __init__(self, url: str, key: str, *, timeout_s: float = TIMEOUT_S, verify: bool | str = True) -> None:
-        """verify: whether the server's certificate is checked, or the file of the authority that signed it."""
+        """Create a client.
+
+        Args:
+            url: address of the server.
+            key: API key.
+            timeout_s: timeout of one read in seconds.
+            verify: check the server's certificate, or path of a CA certificate to check against.
+        """
         super().__init__(url, key, timeout_s, verify)
 
     def streams(self) -> list[StreamView]:
-        """Every stream."""
+        """Return every stream."""
         return TypeAdapter(list[StreamView]).validate_python(self._ask("GET", "/v1/streams"))
 
     def stream(self, name: str) -> StreamView:
-        """One stream."""
+        """Return one stream."""
         return StreamView.model_validate(self._ask("GET", f"/v1/streams/{name}"))
 
     def create_stream(
         self, name: str, source: str, *, show: str = "live", device: str = "auto", start: bool = True,
         options: Mapping[str, Any] | None = None,
     ) -> StreamView:  # fmt: skip
-        """Make a stream. source: an address that the server's settings allow."""
+        """Create a stream.
+
+        Args:
+            name: name of the stream.
+            source: address that the server's settings allow.
+            show: `live` or `model NAME`.
+            device: auto, cpu, cuda or cuda:N.
+            start: start the stream.
+            options: source and reconstruction options.
+        """
         wanted = dict(name=name, source=source, show=show, device=device, start=start, options=dict(options or {}))
         return StreamView.model_validate(self._ask("POST", "/v1/streams", json=wanted))
 
@@ -65,50 +81,62 @@ class Client(ReplayMethods, SnapshotMethods):
         return StreamView.model_validate(self._ask("POST", f"/v1/streams/{name}/stop"))
 
     def delete_stream(self, name: str) -> None:
-        """Stop a stream and forget it."""
+        """Stop and delete a stream."""
         self._ask("DELETE", f"/v1/streams/{name}")
 
     def turn_camera(self, stream: str, azimuth_deg: float = 0, elevation_deg: float = 0, zoom: float = 1) -> None:
-        """Turn a stream's virtual camera, whose view is the picture `orbit`."""
+        """Move a stream's virtual camera, the viewpoint of the picture `orbit`."""
         wanted = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg, "zoom": zoom}
         self._ask("PUT", f"/v1/streams/{stream}/camera", json=wanted)
 
     def pictures(self, stream: str, kind: str = "shown", quality: int = 75) -> Iterator[Picture]:
-        """What a stream shows, as it comes, until the stream or the server ends. Close the iterator to leave."""
+        """Yield a stream's pictures until the stream or the server stops. Close the iterator to
+        unsubscribe."""
         path = f"/v1/streams/{stream}/display"
         ticket = self._ask("POST", "/v1/tickets", json={"path": path})["ticket"]
         return pictures(self.url, path, ticket, kind, quality, self._verify)
 
     def models(self) -> list[ModelView]:
-        """Every model, with its active version."""
+        """Return every model with its active version."""
         return TypeAdapter(list[ModelView]).validate_python(self._ask("GET", "/v1/models"))
 
     def versions(self, name: str) -> list[VersionView]:
-        """The versions of a model."""
+        """Return the versions of a model."""
         return TypeAdapter(list[VersionView]).validate_python(self._ask("GET", f"/v1/models/{name}/versions"))
 
     def version(self, name: str, number: int) -> VersionView:
-        """One version."""
+        """Return one version."""
         return VersionView.model_validate(self._ask("GET", f"/v1/models/{name}/versions/{number}"))
 
     def upload(self, name: str, file: Path) -> VersionView:
-        """Upload a file that `intrasplat pack` made; the server checks it afterwards (`checked` waits for that). Raises ClientError for a file
-        that cannot be read."""
+        """Upload a file of `intrasplat pack`. The server checks it afterwards; `checked` waits for
+        that.
+
+        Raises:
+            ClientError: if the file cannot be read.
+        """
         return VersionView.model_validate(self._put_file(f"/v1/models/{name}/versions", file))
 
     def checked(self, name: str, number: int, *, within_s: float = 300.0) -> VersionView:
-        """A version once the server has checked it: `ready`, or `rejected` with a reason. Raises ClientError when that takes too long."""
+        """Wait until the server has checked a version.
+
+        Returns:
+            The version, `ready` or `rejected` with a reason.
+
+        Raises:
+            ClientError: after `within_s` seconds.
+        """
         return waited_for(
             lambda: self.version(name, number), lambda found: found.state not in WAITING, within_s, f"{name}/{number}"
         )
 
     def activate(self, name: str, number: int, expected_current: int | None) -> VersionView:
-        """Let a version be shown in place of `expected_current` (None: no one is active)."""
+        """Activate a version in place of `expected_current` (None if no version is active)."""
         wanted = {"version": number, "expected_current": expected_current}
         return VersionView.model_validate(self._ask("POST", f"/v1/models/{name}/activate", json=wanted))
 
     def rollback(self, name: str) -> VersionView:
-        """Show the version before again."""
+        """Activate the previous version again."""
         return VersionView.model_validate(self._ask("POST", f"/v1/models/{name}/rollback"))
 
     def delete_version(self, name: str, number: int) -> None:
@@ -116,23 +144,24 @@ class Client(ReplayMethods, SnapshotMethods):
         self._ask("DELETE", f"/v1/models/{name}/versions/{number}")
 
     def about(self) -> dict[str, Any]:
-        """The server's version, and which parts it has."""
+        """Return the server's version and its parts."""
         return dict(self._ask("GET", "/v1/version"))
 
     def keys(self) -> list[KeyView]:
-        """Every API key, without what makes it one."""
+        """Return every API key without its secret."""
         return TypeAdapter(list[KeyView]).validate_python(self._ask("GET", "/v1/keys"))
 
     def make_key(
         self, name: str, role: str, *, expires_at: datetime | None = None, streams: Sequence[str] | None = None
     ) -> MadeKey:
-        """Make a key, which is shown this once. A name may have two valid ones, while its callers change over.
+        """Create a key. The token is returned only here. A name may have two valid keys for a
+        change-over.
 
         Args:
-            name: whom it is for.
+            name: owner.
             role: viewer, operator or admin.
-            expires_at: from when on it is refused, with a time zone; None: never.
-            streams: names of the streams that it is limited to; None: not limited.
+            expires_at: expiry with a time zone, or None.
+            streams: streams that the key is limited to, or None for all.
         """
         wanted = {
             "name": name,
@@ -143,11 +172,11 @@ class Client(ReplayMethods, SnapshotMethods):
         return MadeKey.model_validate(self._ask("POST", "/v1/keys", json=wanted))
 
     def myself(self) -> Myself:
-        """Name, role and limits of this client's key."""
+        """Return name, role and limits of this client's key."""
         return Myself.model_validate(self._ask("GET", "/v1/me"))
 
     def ready(self) -> Readiness:
-        """Each check of /readyz, whether the server is ready or not."""
+        """Return the checks of /readyz, also if the server is not ready."""
         try:
             answer = self._http.request("GET", "/readyz", params={"verbose": "1"})
         except httpx2.HTTPError as error:
@@ -160,7 +189,7 @@ class Client(ReplayMethods, SnapshotMethods):
             raise ClientError(f"{self.url}/readyz answers with something else; is it an IntraSplat server?") from error
 
     def revoke_key(self, key_id: str) -> None:
-        """End a key at once."""
+        """Revoke a key at once."""
         self._ask("DELETE", f"/v1/keys/{key_id}")
 
     def audit(
@@ -175,17 +204,17 @@ class Client(ReplayMethods, SnapshotMethods):
         since: datetime | None = None,
         until: datetime | None = None,
     ) -> AuditPage:
-        """Return entries of the audit log, the newest first.
+        """Return entries of the audit log, newest first.
 
         Args:
-            count: at most so many.
-            before: those before that number.
-            event: as `model.activate`, or `model` for all of its events.
+            count: maximum number of entries.
+            before: return only entries below this number.
+            event: event name such as `model.activate`, or `model` for all its events.
             actor: part of the actor.
             subject: part of the subject.
             outcome: done, refused or failed.
-            since: from this moment on, with a time zone.
-            until: before this moment.
+            since: earliest time, with a time zone.
+            until: end of the time range, exclusive.
         """
         wanted = {"count": count, "before": before} | _filter(event, actor, subject, outcome, since, until)
         given = {name: value for name, value in wanted.items() if value is not None}
@@ -202,7 +231,8 @@ class Client(ReplayMethods, SnapshotMethods):
         since: datetime | None = None,
         until: datetime | None = None,
     ) -> Iterator[str]:
-        """Yield the lines of the audit log as `jsonl` or `csv`, the oldest entry first. The filter is that of `audit`."""
+        """Yield the lines of the audit log as `jsonl` or `csv`, oldest first. The filter is that of
+        `audit`."""
         wanted = {"format": form} | _filter(event, actor, subject, outcome, since, until)
         given = {name: value for name, value in wanted.items() if value is not None}
         try:
@@ -215,7 +245,7 @@ class Client(ReplayMethods, SnapshotMethods):
             raise self._unreachable(error) from error
 
     def metrics(self) -> str:
-        """What is measured, in Prometheus' format."""
+        """Return the metrics in the Prometheus format."""
         return self._answer("GET", "/metrics").text
 
     def close(self) -> None:

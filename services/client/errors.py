@@ -11,15 +11,15 @@ from gsplat_core.errors import UserError
 
 
 class ClientError(UserError):
-    """Base of everything the client raises on purpose."""
+    """Base class of the client's errors."""
 
 
 class Unreachable(ClientError):
-    """No server answers there, or the connection broke off."""
+    """No server answers at the address, or the connection broke."""
 
 
 class Refused(ClientError):
-    """The server said no, in its own words."""
+    """The server refused the request. The message is the server's."""
 
     def __init__(self, status: int, sentence: str) -> None:
         super().__init__(f"the server refuses ({status}): {sentence}")

@@ -1,4 +1,4 @@
-"""A stream's pictures over a WebSocket."""
+"""Stream pictures over a WebSocket."""
 
 from __future__ import annotations
 
@@ -22,15 +22,19 @@ MOST_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a viewer gets it."""
+    """Received picture."""
 
     header: dict[str, Any]
-    """Its number, times, age and state (docs/design/processes.md)."""
+    """Sequence number, timestamps, age and state (docs/design/processes.md)."""
     jpeg: bytes
 
 
 def pictures(url: str, path: str, ticket: str, kind: str, quality: int, verify: bool | str) -> Iterator[Picture]:
-    """Pictures until the other side ends. Raises Unreachable."""
+    """Yield pictures until the server closes the connection.
+
+    Raises:
+        Unreachable: if the connection fails.
+    """
     parts = urlsplit(url)
     query = urlencode({"kind": kind, "quality": quality, "ticket": ticket})
     scheme = "wss" if parts.scheme == "https" else "ws"
@@ -50,13 +54,17 @@ def pictures(url: str, path: str, ticket: str, kind: str, quality: int, verify: 
 
 
 def picture_of(message: bytes) -> Picture:
-    """From one message: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
+    """Parse a message: header length (4 bytes, big-endian), JSON header, JPEG."""
     (length,) = struct.unpack_from(">I", message)
     return Picture(json.loads(message[4 : 4 + length]), message[4 + length :])
 
 
 def tls_context(verify: bool | str) -> ssl.SSLContext:
-    """How a server's certificate is checked: as the system does, against the authority in a file, or not at all (False)."""
+    """Return the TLS context: system authorities (True), a CA file (path) or no check (False).
+
+    Raises:
+        ClientError: if the file is unusable.
+    """
     authority = None
     if isinstance(verify, str):
         try:

@@ -1,4 +1,4 @@
-"""Requests to a server: with one key, errors as sentences."""
+"""HTTP requests of the client, with the API key and readable errors."""
 
 from __future__ import annotations
 
@@ -22,15 +22,19 @@ MOST_ANSWER_BYTES = 64 << 20
 MOST_PROBLEM_BYTES = 1 << 16
 MOST_KEY_CHARACTERS = 4096
 SLOWEST = 10
-"""An answer that has not ended after so many times the timeout of one read is given up."""
+"""Multiple of the read timeout after which an unfinished answer is abandoned."""
 Found = TypeVar("Found")
 
 
 class Requests:
-    """What all methods of a client go through."""
+    """Base class of the client with the request methods."""
 
     def __init__(self, url: str, key: str, timeout_s: float, verify: bool | str) -> None:
-        """Raises ClientError for an address, a key or a certificate that cannot be used."""
+        """Open the HTTP client.
+
+        Raises:
+            ClientError: if the address, the key or the certificate is unusable.
+        """
         self.url = checked_url(url)
         self._key = checked_key(key)
         self._verify = verify
@@ -39,12 +43,19 @@ class Requests:
             base_url=self.url,
             headers={"Authorization": f"Bearer {self._key}"},
             timeout=timeout_s,
-            # Reading the system's authorities takes longer than a request without TLS, which does not need them.
+            # Loading the system's authorities takes longer than a plain HTTP request, which does
+            # not need them.
             verify=tls_context(verify) if self.url.startswith("https:") or isinstance(verify, str) else False,
         )
 
     def _ask(self, method: str, path: str, **options: Any) -> Any:
-        """The JSON of the answer, None where it has none. Raises Unreachable, Refused, ClientError for an answer that is no JSON."""
+        """Send a request and return the JSON of the answer, or None for an empty answer.
+
+        Raises:
+            Unreachable: if the server does not answer.
+            Refused: if the server refuses.
+            ClientError: if the answer is no JSON.
+        """
         answer = self._answer(method, path, **options)
         try:
             return answer.json() if answer.content else None
@@ -52,7 +63,13 @@ class Requests:
             raise not_from_us(self.url, "is no JSON") from error
 
     def _answer(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        """An answer that is a success. Raises Unreachable, Refused, ClientError."""
+        """Send a request and return the successful answer.
+
+        Raises:
+            Unreachable: if the server does not answer.
+            Refused: if the server refuses.
+            ClientError: if the answer is too large or too slow.
+        """
         try:
             with self._http.stream(method, path, **options) as answer:
                 content = bytearray()
@@ -73,7 +90,11 @@ class Requests:
         raise refused_by(whole, self.url)
 
     def _put_file(self, path: str, file: Path) -> Any:
-        """Send a file as the body, with its digest. Raises ClientError for one that cannot be read."""
+        """Send a file as the body, with its digest.
+
+        Raises:
+            ClientError: if the file cannot be read.
+        """
         try:
             with open_regular(file) as content:
                 digest, size = _digest_of(content)
@@ -88,10 +109,14 @@ class Requests:
             raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
 
     def _get_file(self, path: str, file: Path, *, overwrite: bool = False, **options: Any) -> int:
-        """Write the body of an answer into a file, which is whole or not there, and return its size.
+        """Download an answer's body to a file, atomically, verifying the stated length and digest.
 
-        The body must be as long as the answer says, and have the digest that the answer states. Raises ClientError where it does not, and where the
-        file cannot be written: a file that is there is replaced with `overwrite` alone.
+        Returns:
+            Size of the file.
+
+        Raises:
+            ClientError: if the verification fails, the file cannot be written, or it exists and
+                `overwrite` is False.
         """
         if os.path.lexists(file) and not overwrite:
             raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it")
@@ -120,7 +145,11 @@ class Requests:
 
 
 def checked_url(url: str) -> str:
-    """Return the address of a server without a slash at its end. Raises ClientError for anything else."""
+    """Return a server address without trailing slash.
+
+    Raises:
+        ClientError: if the address is not valid.
+    """
     try:
         parts = urlsplit(url)
         usable = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and url.isprintable()
@@ -135,7 +164,11 @@ def checked_url(url: str) -> str:
 
 
 def checked_key(key: str) -> str:
-    """Return a key without spaces around it. Raises ClientError for a text that cannot be one."""
+    """Return a key without surrounding whitespace.
+
+    Raises:
+        ClientError: if the text cannot be a key.
+    """
     key = key.strip()
     if not key:
         raise ClientError("the API key is empty; give the one that `intrasplat keys add` printed")
@@ -147,17 +180,17 @@ def checked_key(key: str) -> str:
 
 
 def not_from_us(url: str, what: str) -> ClientError:
-    """The error for an answer that no IntraSplat server gives."""
+    """Return the error for an answer that is not from an IntraSplat server."""
     return ClientError(f"the answer of {url} {what}; is it an IntraSplat server?")
 
 
 def _with_body(answer: httpx2.Response, content: bytes | bytearray) -> httpx2.Response:
-    """Return an answer whose decoded body was read."""
+    """Return a copy of an answer with its decoded body."""
     return httpx2.Response(answer.status_code, content=bytes(content))
 
 
 def _read_some(answer: httpx2.Response) -> bytes:
-    """Read the body of a refusal, as much of it as a problem document may have."""
+    """Read the body of a refusal, up to the size limit of a problem document."""
     content = bytearray()
     for piece in answer.iter_bytes(1 << 16):
         content += piece
@@ -178,7 +211,11 @@ def _check_whole(answer: httpx2.Response, digest: bytes, size: int, name: str) -
 
 
 def _pieces(content: BinaryIO, size: int, file: Path) -> Iterator[bytes]:
-    """The bytes of a file, as many as were announced. Raises ClientError for one that changes meanwhile."""
+    """Yield the announced number of bytes of a file.
+
+    Raises:
+        ClientError: if the file changes meanwhile.
+    """
     left = size
     while piece := content.read(min(CHUNK_BYTES, left)):
         left -= len(piece)
@@ -188,7 +225,11 @@ def _pieces(content: BinaryIO, size: int, file: Path) -> Iterator[bytes]:
 
 
 def waited_for(ask: Callable[[], Found], is_over: Callable[[Found], bool], within_s: float, what: str) -> Found:
-    """Ask again and again, less and less often, until it is over. Raises ClientError when that takes too long."""
+    """Poll with increasing intervals until `is_over` returns True.
+
+    Raises:
+        ClientError: after `within_s` seconds.
+    """
     until_s, wait_s = time.monotonic() + within_s, 0.1
     while True:
         found = ask()
@@ -201,7 +242,7 @@ def waited_for(ask: Callable[[], Found], is_over: Callable[[Found], bool], withi
 
 
 def refused_by(answer: httpx2.Response, url: str) -> Refused:
-    """What a server said that said no; its answer was read."""
+    """Build the error for a refusal from its problem document."""
     try:
         said = answer.json()
         sentence = str(said.get("detail") or said.get("title"))
@@ -211,7 +252,7 @@ def refused_by(answer: httpx2.Response, url: str) -> Refused:
 
 
 def _digest_of(content: BinaryIO) -> tuple[str, int]:
-    """SHA-256 in base64, and the size."""
+    """Return the SHA-256 in base64, and the size."""
     digest = hashlib.sha256()
     while piece := content.read(CHUNK_BYTES):
         digest.update(piece)

@@ -1,4 +1,4 @@
-"""The web page of the service: what is in `page/`, as it is. No build, and nothing loaded from elsewhere."""
+"""Web console, served unchanged from `page/`. No build step and no external resources."""
 
 from __future__ import annotations
 
@@ -11,4 +11,4 @@ FILES = {
     "icon.svg": "image/svg+xml",
     **{f"{name}.js": "text/javascript" for name in MODULES.split()},
 }
-"""What may be asked for, and its type."""
+"""Public files and their content types."""

@@ -1,1 +1,1 @@
-"""Pictures for people: encoded once, handed to any number of viewers."""
+"""Picture distribution to viewers: each picture is encoded once for any number of viewers."""

@@ -1,4 +1,5 @@
-"""From a stream's processes to its viewers: each picture is encoded once for each quality that somebody watches, and not at all without viewers."""
+"""Distribution of a stream's pictures: each is encoded once per requested quality, and not at all
+without viewers."""
 
 from __future__ import annotations
 
@@ -23,17 +24,18 @@ from services.display.viewer import Viewer
 log = logging.getLogger(__name__)
 Pictures = Literal["raw", "shown", Layer]
 KINDS: tuple[Pictures, ...] = ("raw", "shown", *LAYERS)
-"""Each has a socket of its name."""
+"""Picture kinds; each has a socket of the same name."""
 QUALITY = 80
 STALE_S, FROZEN_S = 0.5, 1.0
-"""When no picture has come for so long, its process has died: the last one is shown once more, dimmed, and then again and again with its age."""
+"""Seconds without pictures after which the process counts as dead. The last picture is repeated
+dimmed, first once and then periodically with its age."""
 LAYER_STALE_S, LAYER_FROZEN_S = 1.5, 3.0
-"""The same of pictures that are made in what time is left."""
+"""Like STALE_S and FROZEN_S, for layers that are drawn at low priority."""
 REPEAT_S = 1.0
 
 
 class DisplayHub:
-    """The viewers of one stream, in an event loop. `counts` has what was encoded and dropped, by reason."""
+    """Viewers of one stream, in an event loop. `counts` has encoded and dropped pictures by reason."""
 
     def __init__(self, folder: StreamFolder) -> None:
         self._folder = folder
@@ -41,7 +43,11 @@ class DisplayHub:
         self._encoders = ThreadPoolExecutor(max_workers=2, thread_name_prefix="jpeg")
 
     def subscribe(self, kind: Pictures, quality: int = QUALITY) -> Viewer:
-        """A new viewer; it is one until it is closed. Raises InvalidSetting for a quality out of range."""
+        """Add a viewer, active until closed.
+
+        Raises:
+            InvalidSetting: if the quality is out of range.
+        """
         check_quality(quality)
         channel = self._channels.get(kind)
         if channel is None:
@@ -49,29 +55,29 @@ class DisplayHub:
         return channel.add(quality)
 
     def viewers(self, kind: Pictures) -> int:
-        """How many there are."""
+        """Return the number of viewers."""
         channel = self._channels.get(kind)
         return 0 if channel is None else len(channel.viewers)
 
     def counts(self, kind: Pictures) -> dict[str, int]:
-        """`encoded`, and pictures that viewers missed, by reason."""
+        """Return the number of `encoded` pictures, and of pictures that viewers missed, by reason."""
         channel = self._channels.get(kind)
         return {} if channel is None else dict(channel.counts)
 
     def ages(self, kind: Pictures) -> Mapping[str, Any]:
-        """From the arrival of frames to when their pictures were there for viewers."""
+        """Return the distribution of picture ages at encoding, since frame arrival."""
         channel = self._channels.get(kind)
         return {} if channel is None else channel.ages.told()
 
     async def close(self) -> None:
-        """Let all viewers go."""
+        """Disconnect all viewers."""
         for channel in self._channels.values():
             await channel.close()
         self._encoders.shutdown(wait=False)
 
 
 class _Channel:
-    """The viewers of one of a stream's kinds of picture. It listens only while there are any."""
+    """Viewers of one kind of picture. Subscribes only while there are viewers."""
 
     def __init__(self, endpoint: str, kind: Pictures, encoders: ThreadPoolExecutor) -> None:
         self._endpoint, self._kind, self._encoders = endpoint, kind, encoders
@@ -102,7 +108,7 @@ class _Channel:
             await asyncio.gather(task, return_exceptions=True)
 
     async def _show(self) -> None:
-        """Encode and hand out what comes, until the last viewer has left."""
+        """Encode and distribute pictures until the last viewer leaves."""
         socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), self._endpoint)
         last: Picture | None = None
         came_s = time.monotonic()
@@ -123,7 +129,7 @@ class _Channel:
             socket.close()
 
     async def _newest(self, socket: Any, timeout_s: float) -> Picture | None:
-        """The newest picture that waits; None when none comes in time."""
+        """Return the newest pending picture, or None after the timeout."""
         if not await socket.poll(round(timeout_s * 1000)):
             return None
         parts = await socket.recv_multipart(copy=False)
@@ -151,7 +157,7 @@ class _Channel:
 
 
 def _header(picture: Picture, kind: Pictures) -> dict[str, object]:
-    """What is said to viewers; the age is that at this moment."""
+    """Return the header for viewers, with the current age."""
     header = {name: value for name, value in picture.header.items() if name not in ("pixels", "run")}
     arrived_ns = header.get("arrived_ns")
     if isinstance(arrived_ns, int):

@@ -1,4 +1,4 @@
-"""One viewer of a stream: a slot for the newest picture."""
+"""Viewer of a stream: a slot for the newest picture."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from services.display.encoder import EncodedPicture
 
 SLOW = "slow client"
 DEAD_S = 30.0
-"""A viewer that takes no picture for so long is dropped."""
+"""Seconds without a taken picture after which a viewer is dropped."""
 
 
 class Viewer(AsyncIterator[EncodedPicture]):
-    """The newest picture, whenever the viewer is ready for one; those in between are counted and never seen. Used as
+    """Iterator over the newest picture at each step. Skipped pictures are counted.
 
     async with hub.subscribe("shown") as viewer:
         async for picture in viewer: ...
@@ -29,10 +29,10 @@ class Viewer(AsyncIterator[EncodedPicture]):
         self._closed = False
         self._taken_s = asyncio.get_running_loop().time()
         self.given = 0
-        """Pictures that the viewer took."""
+        """Pictures taken by the viewer."""
 
     def offer(self, picture: EncodedPicture) -> None:
-        """Put the newest picture there."""
+        """Replace the pending picture by the newest one."""
         now_s = asyncio.get_running_loop().time()
         if self._slot is not None:
             self._drops[SLOW] += 1
@@ -44,7 +44,7 @@ class Viewer(AsyncIterator[EncodedPicture]):
         self._changed.set()
 
     def close(self) -> None:
-        """Give no more pictures."""
+        """End the iteration."""
         if not self._closed:
             self._closed = True
             self._leave(self)

@@ -1,1 +1,1 @@
-"""Models and snapshots as files for other programs: made in a process of their own, kept within bounds."""
+"""Models and snapshots as files for other programs, created in a separate process within limits."""

@@ -1,4 +1,4 @@
-"""Exports that were made, found again by the digest of what they were made of; the oldest leave when there are too many."""
+"""Cache of created exports by the digest of their input; the oldest are evicted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from services.exports.errors import ExportBusy, ExportFailed
 from services.exports.programs import ExportPrograms
 
 REVISION = 1
-"""Changes when the same model gives other bytes."""
+"""Version of the exporters' output. Increment when the same model gives other bytes."""
 MOST_BYTES = 2 << 30
 AT_ONCE = 1
 MOST_WAITING = 8
@@ -27,16 +27,16 @@ MOST_WAITING = 8
 
 @dataclass(frozen=True)
 class Exported:
-    """A file that was made. `file` is open, so that it can be read to its end whatever leaves the cache meanwhile."""
+    """Created file. `file` is open, so it stays readable after an eviction."""
 
     file: BinaryIO
     sha256: str
-    """In hex."""
+    """SHA-256 in hex."""
     size_bytes: int
 
 
 class ExportCache:
-    """Makes exports, one at a time, and keeps them. Any thread may use it; one process uses a folder."""
+    """Cache that creates missing exports one at a time. Thread-safe; one process per folder."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class ExportCache:
         most_waiting: int = MOST_WAITING,
         programs: ExportPrograms | None = None,
     ) -> None:
-        """folder: made, and emptied of what was left half made."""
+        """Open the cache. The folder is created, and incomplete files are deleted."""
         self._folder, self._most_bytes = folder, most_bytes
         self._programs = programs or ExportPrograms()
         self._lock = threading.Lock()
@@ -54,15 +54,23 @@ class ExportCache:
         self._turn = threading.BoundedSemaphore(AT_ONCE)
         self._waiting, self._most_waiting = 0, most_waiting
         self.made = 0
-        """Exports that were made, and not found."""
+        """Number of created exports, without cache hits."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for left in folder.glob("new-*"):
             shutil.rmtree(left)
 
     def get(self, digest: str, folder_of: Callable[[], Path], wish: ExportWish) -> Exported:
-        """An export of the model that has this digest; `folder_of` gives its unpacked files where it has to be made.
+        """Return an export of the model with this digest, creating it if missing.
 
-        Raises ExportRefused, ExportBusy, ExportFailed.
+        Args:
+            digest: digest of the model.
+            folder_of: returns the folder of the unpacked model; called only if needed.
+            wish: format and times.
+
+        Raises:
+            ExportRefused: if the model cannot be exported to the format.
+            ExportBusy: if too many exports wait.
+            ExportFailed: if the program or the disk fails.
         """
         key = hashlib.sha256(
             json.dumps([REVISION, digest, wish.format.name, wish.time_s, wish.times]).encode()
@@ -78,7 +86,7 @@ class ExportCache:
         return found
 
     def close(self) -> None:
-        """End what is being made."""
+        """Abort running exports."""
         self._programs.end()
 
     @contextlib.contextmanager
@@ -95,7 +103,7 @@ class ExportCache:
 
     @contextlib.contextmanager
     def _lock_of(self, key: str) -> Iterator[None]:
-        """Who asks for the same waits for the first one."""
+        """Serialise requests for the same export; later ones find the first one's file."""
         with self._lock:
             lock = self._making.setdefault(key, threading.Lock())
         with lock:
@@ -108,7 +116,7 @@ class ExportCache:
         with self._lock:
             try:
                 about = json.loads((self._folder / f"{key}.json").read_text())
-                file = open(self._folder / f"{key}.data", "rb")  # noqa: SIM115 - whoever asked closes it
+                file = open(self._folder / f"{key}.data", "rb")  # noqa: SIM115 - the caller closes the file
             except (FileNotFoundError, ValueError):
                 return None
             os.utime(self._folder / f"{key}.data")
@@ -137,7 +145,8 @@ class ExportCache:
             shutil.rmtree(new, ignore_errors=True)
 
     def _evict(self) -> None:
-        """Under the lock: let go of the oldest until the rest is small enough."""
+        """Evict the oldest files until the total size is within the limit. The caller holds the
+        lock."""
         files = sorted(self._folder.glob("*.data"), key=lambda path: path.stat().st_mtime_ns)
         total = sum(path.stat().st_size for path in files)
         for path in files:

@@ -13,20 +13,20 @@ from gsplat_core.errors import UserError
 
 
 class ExportsError(UserError):
-    """Base of everything that exports raise on purpose."""
+    """Base class of the export errors."""
 
 
 class ExportRefused(ExportsError):
-    """The model cannot be had like that, in one sentence."""
+    """The model cannot be exported to the format. The message is one sentence."""
 
 
 class ExportBusy(ExportsError):
-    """As many exports wait as may."""
+    """Too many exports are waiting."""
 
 
 class ExportFailed(ExportsError):
-    """The program that makes it has failed, or the disk."""
+    """The export program or the disk failed."""
 
 
 class NoSnapshot(ExportsError):
-    """There is no such snapshot."""
+    """The snapshot does not exist."""

@@ -1,4 +1,5 @@
-"""The formats that the service gives: those for other programs, and the packed model that can be uploaded again."""
+"""Export formats of the service: those for other programs, and the packed model that can be
+uploaded again."""
 
 from __future__ import annotations
 
@@ -8,12 +9,12 @@ from gsplat_core.io.exports.formats import FORMATS, ExportFormat, ExportWish
 from services.registry.bundle_file import SUFFIX
 
 ISPLAT = ExportFormat("isplat", SUFFIX, "application/octet-stream")
-"""The whole model with its deformation; it has no time."""
+"""Complete model with its deformation, independent of time."""
 ALL: Mapping[str, ExportFormat] = {**FORMATS, ISPLAT.name: ISPLAT}
 
 
 def arguments_of(wish: ExportWish) -> list[str]:
-    """For the program that makes it."""
+    """Return the command line arguments of the export program."""
     given = {"--time": wish.time_s, "--times": wish.times}
     named = [f"{name}={value!r}" for name, value in given.items() if value is not None]
     return [f"--format={wish.format.name}", *named]

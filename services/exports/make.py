@@ -1,7 +1,8 @@
-"""Makes an export of an unpacked model, as a program of its own: `python -m services.exports.make FOLDER FILE --format glb`.
+"""Export of an unpacked model as a separate program: `python -m services.exports.make FOLDER FILE
+--format glb`.
 
-Nothing else of the service imports this module: it loads torch, but for `isplat`. Exit code 0: the file is there; 2: it cannot be had like that, and standard error
-says why in one sentence.
+The service never imports this module, because it loads torch, except for `isplat`. Exit code 0: the
+file was written. Exit code 2: the export was refused, with the reason on standard error.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from services.private_files import keep_files_private
 from services.registry.bundle_file import pack
 
 NICENESS = 10
-"""Streams that run on this machine go before an export."""
+"""Nice value of an export; running streams have priority."""
 REFUSED = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make one file."""
+    """Create one file."""
     keep_files_private()
     parser = argparse.ArgumentParser(prog="python -m services.exports.make", description="Export an unpacked model.")
     parser.add_argument("folder", type=Path, metavar="FOLDER")
@@ -47,7 +48,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def export(folder: Path, file: Path, wish: ExportWish) -> None:
-    """For other programs. What it needs takes seconds to load, and packing does not need it."""
+    """Export to a format of other programs. Imports here take seconds, and packing does not need
+    them."""
     from gsplat_core.io.bundle import load_bundle
     from gsplat_core.io.exports.export import export_model
 

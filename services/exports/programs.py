@@ -1,4 +1,5 @@
-"""Runs the program that makes an export, within a time; nothing of the model enters this process."""
+"""Runner of the export program with a time limit. No content of the model is loaded into this
+process."""
 
 from __future__ import annotations
 
@@ -22,11 +23,11 @@ MOST_S = 300.0
 PASSED_ON = (
     "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS",
 )  # fmt: skip
-"""What the program gets of the environment: no credentials are among it."""
+"""Environment variables passed to the program; none holds credentials."""
 
 
 class ExportPrograms:
-    """The programs that run now. Any thread may use it."""
+    """Running export programs. Thread-safe."""
 
     def __init__(self, program: tuple[str, ...] = PROGRAM, most_s: float = MOST_S) -> None:
         self._program, self._most_s = program, most_s
@@ -35,7 +36,12 @@ class ExportPrograms:
         self._ended = False
 
     def make(self, folder: Path, file: Path, wish: ExportWish) -> None:
-        """Make one file from an unpacked model; blocks. Raises ExportRefused, ExportFailed."""
+        """Create one file from an unpacked model; blocks.
+
+        Raises:
+            ExportRefused: if the model cannot be exported to the format.
+            ExportFailed: if the program fails.
+        """
         command = [*self._program, str(folder), str(file), *arguments_of(wish)]
         environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         with tempfile.TemporaryFile() as said:
@@ -61,7 +67,7 @@ class ExportPrograms:
             raise ExportFailed(f"the export ended with code {code}: {words[-1][:300]}; the server's log may say more")
 
     def end(self) -> None:
-        """End those that run, and every one that is begun from now on."""
+        """Kill running programs and every later one."""
         with self._lock:
             self._ended = True
             for process in self._running:
@@ -81,7 +87,8 @@ class ExportPrograms:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a program that leads a session of its own; the number of one that was waited for may be another's by now."""
+    """Kill the process group of a program that leads its own session. A reaped process is skipped,
+    because its id may be reused."""
     if process.poll() is None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Snapshots of streams that are kept as files: the newest ones of each stream."""
+"""Store of stream snapshots as files; the newest of each stream are kept."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST = 20
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What is known of a snapshot."""
+    """Record of a snapshot."""
 
     id: str
     stream: str
@@ -39,11 +39,11 @@ class Snapshot:
     pause_ms: float
     size_bytes: int
     digest: str
-    """SHA-256 of its manifest, which has that of its tensors."""
+    """SHA-256 of the manifest, which contains the digest of the tensors."""
 
 
 def described(folder: Path, stream: str, by: str, said: Mapping[str, Any]) -> Snapshot:
-    """What an engine has written into a folder, with what it said of it."""
+    """Create the record of a bundle written by an engine, from the folder and the engine's answer."""
     return Snapshot(
         id=secrets.token_hex(8),
         stream=stream,
@@ -56,7 +56,7 @@ def described(folder: Path, stream: str, by: str, said: Mapping[str, Any]) -> Sn
 
 
 class SnapshotStore:
-    """Snapshots in a folder, at most `most` of each stream: then the oldest one leaves. Any thread may use it."""
+    """Snapshot folder with at most `most` snapshots per stream; the oldest is deleted. Thread-safe."""
 
     def __init__(self, folder: Path, most: int = MOST) -> None:
         self._folder, self._most = folder, most
@@ -66,7 +66,7 @@ class SnapshotStore:
 
     @contextmanager
     def new(self) -> Iterator[Path]:
-        """A folder that is written into; what was not kept when the block ends is removed."""
+        """Provide a temporary folder, deleted at the end of the block unless it was stored."""
         path = self._folder / f".new-{secrets.token_hex(8)}"
         try:
             path.mkdir(mode=0o700)
@@ -77,7 +77,7 @@ class SnapshotStore:
             shutil.rmtree(path, ignore_errors=True)
 
     def keep(self, path: Path, made: Snapshot) -> None:
-        """Keep what lies in a folder of `new`."""
+        """Store the content of a folder from `new`."""
         (path / ABOUT).write_text(json.dumps(asdict(made)))
         of_stream = self._folder / made.stream
         of_stream.mkdir(mode=0o700, exist_ok=True)
@@ -87,7 +87,7 @@ class SnapshotStore:
             self.delete(made.stream, old.id)
 
     def all(self, stream: str) -> list[Snapshot]:
-        """Those of a stream, the newest first."""
+        """Return the snapshots of a stream, newest first."""
         folder = self._folder / stream
         found = []
         for name in os.listdir(folder) if folder.is_dir() else ():
@@ -96,21 +96,33 @@ class SnapshotStore:
         return sorted(found, key=lambda each: (each.taken_at, each.id), reverse=True)
 
     def get(self, stream: str, number: str) -> Snapshot:
-        """One of them. Raises NoSnapshot."""
+        """Return one snapshot.
+
+        Raises:
+            NoSnapshot: if the snapshot does not exist.
+        """
         try:
             return Snapshot(**json.loads((self.folder_of(stream, number) / ABOUT).read_text()))
         except FileNotFoundError:
             raise self._absent(stream) from None
 
     def folder_of(self, stream: str, number: str) -> Path:
-        """Its bundle. Raises NoSnapshot."""
+        """Return the bundle folder of a snapshot.
+
+        Raises:
+            NoSnapshot: if the snapshot does not exist.
+        """
         path = self._folder / stream / number
         if not NUMBER.fullmatch(number) or not path.is_dir():
             raise self._absent(stream)
         return path
 
     def delete(self, stream: str, number: str) -> None:
-        """Remove one. Raises NoSnapshot."""
+        """Delete a snapshot.
+
+        Raises:
+            NoSnapshot: if the snapshot does not exist.
+        """
         path = self.folder_of(stream, number)
         gone = self._folder / f".new-{secrets.token_hex(8)}"
         os.rename(path, gone)

@@ -1,1 +1,1 @@
-"""A model in a browser, to be turned and played, by viser (extra `viser`)."""
+"""Interactive model viewer in a browser, by viser (extra `viser`)."""

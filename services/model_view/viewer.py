@@ -1,4 +1,4 @@
-"""Serves a model's Gaussians to browsers: turned by mouse, its time chosen by a slider."""
+"""Browser viewer for a model's Gaussians, with free viewpoint and a time slider."""
 
 from __future__ import annotations
 
@@ -20,14 +20,19 @@ from gsplat_core.scene.model import Model
 
 log = logging.getLogger(__name__)
 DISTANCE = 100.0
-"""From the camera to the middle of the scene, as it is shown: viser keeps sizes in half precision, which has most of it there."""
+"""Distance from the camera to the scene's centre in viewer units. viser stores sizes in half
+precision, which is most accurate at this scale."""
 STEPS = 200
-"""Places of the slider."""
+"""Positions of the slider."""
 LOOK_S = 0.05
 
 
 def viser() -> Any:
-    """The library. Raises InvalidSetting where it is not installed."""
+    """Import viser.
+
+    Raises:
+        InvalidSetting: if it is not installed.
+    """
     try:
         import viser as library
     except ImportError:
@@ -36,10 +41,16 @@ def viser() -> Any:
 
 
 class ModelView:
-    """A server for browsers, while entered. It shows colours without view dependence, as viser does."""
+    """Viewer server, used as context manager. Colours have no view dependence, a limitation of
+    viser."""
 
     def __init__(self, model: Model, host: str, port: int) -> None:
-        """Raises InvalidSetting where viser is not installed, ExportError for a model with values that are not finite."""
+        """Start the server.
+
+        Raises:
+            InvalidSetting: if viser is not installed.
+            ExportError: if the model has non-finite values.
+        """
         library = viser()
         self._model = model
         self._place = scene_to_view(model)
@@ -69,7 +80,7 @@ class ModelView:
         self._server.stop()
 
     def run(self, stop_requested: Callable[[], bool]) -> None:
-        """Follow the slider until it is to end."""
+        """Follow the slider until a stop is requested."""
         start_s, end_s = self._model.time_window_s
         wait = threading.Event()
         before_s = time.monotonic()
@@ -88,7 +99,7 @@ class ModelView:
             self._server.scene.add_gaussian_splats("/model", **splats)
 
     def _splats(self, time_s: float) -> dict[str, NDArray[np.float32]]:
-        """What viser takes, in camera axes of the endoscope, scaled."""
+        """Return viser's splat arrays at a time, in the endoscope's camera axes, scaled."""
         with torch.inference_mode():
             rows = rows_of(self._model.at(time_s))
         rotation, offset, scale = self._place
@@ -101,7 +112,7 @@ class ModelView:
         }
 
     def _look_from_the_scope(self, client: Any) -> None:
-        """A browser begins where the endoscope was."""
+        """Place a new browser's camera at the endoscope's position."""
         client.camera.position = (0.0, 0.0, 0.0)
         client.camera.look_at = (0.0, 0.0, DISTANCE)
         client.camera.up_direction = (0.0, -1.0, 0.0)
@@ -110,7 +121,8 @@ class ModelView:
 
 
 def _private(library: Any) -> Any:
-    """viser's server without the public address that any browser could otherwise ask it to open."""
+    """Return viser's server class without the public share URL, which any browser could otherwise
+    request."""
 
     class PrivateServer(library.ViserServer):
         def request_share_url(self, verbose: bool = True) -> None:
@@ -120,7 +132,8 @@ def _private(library: Any) -> Any:
 
 
 def scene_to_view(model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Rotation and translation into the camera's axes, and the scale that brings the middle of the scene to `DISTANCE`."""
+    """Return rotation and translation into camera axes, and the scale that moves the scene's centre
+    to `DISTANCE`."""
     pose = model.camera.world_to_camera
     rotation, offset = pose[:3, :3], pose[:3, 3]
     depths = model.gaussians.means.detach().cpu().double().numpy() @ rotation[2] + offset[2]
@@ -129,7 +142,7 @@ def scene_to_view(model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def rotation_matrices(quats: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Of unit quaternions wxyz [N, 4]: [N, 3, 3]."""
+    """Convert unit quaternions wxyz [N, 4] to rotation matrices [N, 3, 3]."""
     w, x, y, z = quats.astype(np.float64).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -1,1 +1,2 @@
-"""A stream's pictures for 3D Slicer, PLUS and others over OpenIGTLink; see docs/exports.md."""
+"""OpenIGTLink output of a stream's pictures for 3D Slicer, PLUS and other programs; see
+docs/exports.md."""

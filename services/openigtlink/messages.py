@@ -1,4 +1,4 @@
-"""OpenIGTLink messages of a stream: the picture, the pose of its camera, and what it is worth."""
+"""OpenIGTLink messages of a stream: picture, camera pose, and state."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 
 MOST_NAME = 20
-"""What a device name may have in the protocol."""
+"""Longest device name in the protocol."""
 _LONGEST_ENDING = "_Camera"
 
 
 def pyigtl() -> Any:
-    """The library that packs messages. Raises InvalidSetting where it is not installed."""
+    """Import pyigtl.
+
+    Raises:
+        InvalidSetting: if it is not installed.
+    """
     try:
         import pyigtl as library
     except ImportError:
@@ -26,11 +30,15 @@ def pyigtl() -> Any:
 
 
 class StreamMessages:
-    """Packs the messages of one stream. Raises InvalidSetting for a name or a spacing that cannot be.
+    """Packer of one stream's messages.
 
-    The picture's axes: i to the right, j down, as they are in the picture, k = 0; three components, red, green, blue. One voxel is `spacing_mm` wide and
-    high, and the middle of the picture is the origin. The coordinates are those of the camera (x right, y down, z forward) and are sent as RAS, so
-    that a receiver changes no sign: what is right or left of the patient is not known here.
+    Picture axes: i right, j down, k = 0, with three components (red, green, blue). A voxel is
+    `spacing_mm` wide and high, and the origin is the picture's centre. Camera coordinates (x right,
+    y down, z forward) are sent as RAS, so receivers change no sign. The patient's left and right
+    are unknown.
+
+    Raises:
+        InvalidSetting: if the name or the spacing is not valid.
     """
 
     def __init__(self, name: str, spacing_mm: float = 1.0) -> None:
@@ -44,7 +52,7 @@ class StreamMessages:
         self._name, self._spacing_mm = name, spacing_mm
 
     def packed(self, header: Mapping[str, Any], image: NDArray[np.uint8]) -> bytes:
-        """IMAGE, TRANSFORM and STRING of a picture, RGB uint8 [H, W, 3], one after another."""
+        """Pack IMAGE, TRANSFORM and STRING of a picture, RGB uint8 [H, W, 3], in this order."""
         at_s = taken_at(header)
         place = ijk_to_camera(image.shape[1], image.shape[0], self._spacing_mm)
         picture = self._library.ImageMessage(
@@ -56,7 +64,7 @@ class StreamMessages:
         return picture.pack() + camera.pack() + self.state(said, at_s)
 
     def state(self, said: str, at_s: float | None = None) -> bytes:
-        """A STRING that says what the picture is worth."""
+        """Pack a STRING with the state of the picture."""
         message: bytes = self._library.StringMessage(
             said, timestamp=at_s or time.time(), device_name=f"{self._name}_State"
         ).pack()
@@ -64,14 +72,15 @@ class StreamMessages:
 
 
 def ijk_to_camera(width_px: int, height_px: int, spacing_mm: float) -> NDArray[np.float64]:
-    """From voxel indices to camera coordinates, the middle of the picture at the origin."""
+    """Return the 4x4 matrix from voxel indices to camera coordinates, with the origin at the
+    picture's centre."""
     place = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
     place[:2, 3] = -0.5 * spacing_mm * np.array([width_px - 1, height_px - 1])
     return place
 
 
 def taken_at(header: Mapping[str, Any]) -> float:
-    """When the newest frame of a picture came in, in seconds since 1970."""
+    """Return the arrival time of a picture's newest frame as Unix time in seconds."""
     arrived_ns = header.get("arrived_ns")
     since_s = (time.monotonic_ns() - arrived_ns) * 1e-9 if isinstance(arrived_ns, int) else 0.0
     return time.time() - since_s

@@ -1,4 +1,5 @@
-"""From a stream's socket to OpenIGTLink clients; without clients the socket is not read, and what is made only for readers is not made."""
+"""Forwarding of a stream's socket to OpenIGTLink clients. Without clients the socket is not read,
+so layers are not drawn."""
 
 from __future__ import annotations
 
@@ -20,7 +21,12 @@ SILENT_S = 1.0
 
 
 def folder_of(runtime: Path, stream: str) -> StreamFolder:
-    """The folder of a stream that runs. Raises InvalidSetting, RuntimeFolderUnusable."""
+    """Return the folder of a running stream.
+
+    Raises:
+        InvalidSetting: if the stream does not run.
+        RuntimeFolderUnusable: if the folder cannot be used.
+    """
     path = runtime / stream
     if "/" in stream or not path.is_dir():
         raise InvalidSetting(
@@ -32,7 +38,11 @@ def folder_of(runtime: Path, stream: str) -> StreamFolder:
 def send(
     endpoint: str, messages: StreamMessages, server: MessageServer, stop_requested: Callable[[], bool]
 ) -> dict[str, int]:
-    """Send what comes until it is to end; returns how many pictures were sent and how many could not be read."""
+    """Send pictures until a stop is requested.
+
+    Returns:
+        Numbers of sent and of unreadable pictures.
+    """
     counts = {"sent": 0, "bad": 0}
     while not stop_requested():
         if not server.clients:

@@ -1,4 +1,5 @@
-"""Sends messages to any number of OpenIGTLink clients, none of whom slows the others: the newest one wins."""
+"""Message server for OpenIGTLink clients. Each client gets the newest message, and slow clients
+delay no other client."""
 
 from __future__ import annotations
 
@@ -13,14 +14,18 @@ from operators.errors import OutputError
 log = logging.getLogger(__name__)
 MOST_CLIENTS = 16
 STALLED_S = 10.0
-"""A client that takes nothing for so long is dropped."""
+"""Seconds after which a client that accepts no data is dropped."""
 
 
 class MessageServer:
-    """Listens at an address, and gives each client the newest message as soon as it has taken the one before."""
+    """Server that sends each client the newest message once the previous one is sent."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Raises OutputError where the address cannot be listened on."""
+        """Listen at an address.
+
+        Raises:
+            OutputError: if that fails.
+        """
         try:
             self._listener = socket.create_server((host, port))
         except OSError as error:
@@ -37,24 +42,24 @@ class MessageServer:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Return the number of connected clients."""
         with self._changed:
             return len(self._clients)
 
     def send(self, message: bytes) -> None:
-        """Make this the newest message; it returns at once."""
+        """Set the newest message; returns at once."""
         with self._changed:
             self._message, self._number = message, self._number + 1
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Let all clients go."""
+        """Disconnect all clients."""
         with self._changed:
             self._closed = True
             clients = list(self._clients)
             self._changed.notify_all()
         for client in [self._listener, *clients]:
-            with contextlib.suppress(OSError):  # one that has gone by itself
+            with contextlib.suppress(OSError):  # already disconnected
                 client.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self._accepting.join()
@@ -92,7 +97,8 @@ class MessageServer:
             client.close()
 
     def _newer_than(self, sent: int, client: socket.socket) -> tuple[int, bytes] | None:
-        """The newest message and its number; an empty one now and then, None when the client has left or the server closes."""
+        """Return the newest message and its number. Empty after a timeout; None if the client has
+        left or the server closes."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._number > sent, 0.5)
             if self._closed:
@@ -102,7 +108,8 @@ class MessageServer:
 
 
 def _has_left(client: socket.socket) -> bool:
-    """Whether the other side has closed. What clients say, such as requests, is read and forgotten."""
+    """Return True if the client has closed the connection. Received data, such as requests, is
+    discarded."""
     while select.select([client], [], [], 0)[0]:
         if not client.recv(65536):
             return True

@@ -1,1 +1,1 @@
-"""Recordings that were uploaded: kept in a folder, checked in a process of their own, removed by age and size."""
+"""Uploaded recordings: stored in a folder, checked in a separate process, deleted by age and size."""

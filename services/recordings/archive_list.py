@@ -1,7 +1,7 @@
-"""What a zip archive says that it holds, looked at before anything is unpacked.
+"""Validation of a zip archive's directory before anything is unpacked.
 
-Python's own reader loads the whole list of an archive, whatever its length, and believes it. So the end of the file is read here first, and
-every entry is held against the rules of `entries_of`.
+Python's zipfile loads a directory of any length and trusts it. The end of the file is therefore
+parsed here first, and every entry is checked by `entries_of`.
 """
 
 from __future__ import annotations
@@ -27,23 +27,31 @@ _ENCRYPTED = 0x1 | 0x40 | 0x2000
 _PLAIN = (0, stat.S_IFREG, stat.S_IFDIR)
 _LEFT_OUT = "__MACOSX"
 _OF_A_LAYOUT = {"images", "images_right", "masks", "depth", "segments"}
-"""Folders that mean something in a recording: one of them alone at the top is not the recording's own folder."""
+"""Folder names of a recording's layout. A single such folder at the top is not the recording's own
+folder."""
 
 
 class ArchiveInvalid(Exception):
-    """Why an archive is not unpacked, in a sentence without the names in it: they may say whose recording it is."""
+    """The archive is refused. The message contains no names, because they may identify a patient."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A file of an archive and where it goes, which stays inside of the folder."""
+    """File in an archive and its target path inside the folder."""
 
     info: zipfile.ZipInfo
     path: PurePosixPath
 
 
 def check_end(file: BinaryIO) -> int:
-    """The number of entries; raises ArchiveInvalid unless the file ends with one small list of them and nothing behind it."""
+    """Check that the file ends with one small directory and nothing after it.
+
+    Returns:
+        Number of entries.
+
+    Raises:
+        ArchiveInvalid: if not.
+    """
     size = file.seek(0, 2)
     if size < _END.size:
         raise ArchiveInvalid(f"the archive is cut off: it has {size} bytes")
@@ -73,7 +81,11 @@ def check_end(file: BinaryIO) -> int:
 
 
 def entries_of(archive: zipfile.ZipFile, file: BinaryIO, stated: int, limits: RecordingLimits) -> list[Entry]:
-    """The files to unpack, in the archive's order. Raises ArchiveInvalid for an entry that breaks a rule; nothing is unpacked then."""
+    """Return the files to unpack, in archive order.
+
+    Raises:
+        ArchiveInvalid: if an entry breaks a rule.
+    """
     infos = archive.infolist()
     if len(infos) != stated:
         raise ArchiveInvalid(f"the archive lists {len(infos)} files and says that there are {stated}; pack it again")
@@ -116,7 +128,7 @@ def _check_entry(info: zipfile.ZipInfo, number: int, limits: RecordingLimits) ->
 
 
 def _check_places(infos: list[zipfile.ZipInfo], file: BinaryIO, list_at: int) -> None:
-    """No two entries may share bytes: by that a small file unpacks to a huge one."""
+    """Check that no two entries share bytes, by which a small file could unpack to a huge one."""
     end = 0
     for info in sorted(infos, key=lambda each: each.header_offset):
         if info.header_offset < end:
@@ -132,13 +144,13 @@ def _check_places(infos: list[zipfile.ZipInfo], file: BinaryIO, list_at: int) ->
 
 
 def _is_left_out(info: zipfile.ZipInfo) -> bool:
-    """What file managers add: hidden files, and a Mac's folder of them."""
+    """Return True for files added by file managers: hidden files, and the resource folder of macOS."""
     parts = info.orig_filename.removesuffix("/").split("/")
     return parts[0] == _LEFT_OUT or any(part.startswith(".") for part in parts)
 
 
 def _without_their_common_folder(entries: list[Entry]) -> list[Entry]:
-    """Often the recording's folder itself was packed: what lies in it is the recording."""
+    """Strip a common top folder, because often the recording's folder itself was packed."""
     first = {entry.path.parts[0] for entry in entries}
     if len(first) != 1 or first & _OF_A_LAYOUT or any(len(entry.path.parts) == 1 for entry in entries):
         return entries

@@ -1,8 +1,10 @@
-"""The check of an uploaded recording, run as a program of its own: `python -m services.recordings.check FOLDER --kind KIND --name NAME`.
+"""Check of an uploaded recording as a separate program: `python -m services.recordings.check FOLDER
+--kind KIND --name NAME`.
 
-FOLDER has the uploaded file, `upload`. An archive is unpacked into FOLDER/NAME, a video gets the name NAME with its usual suffix; then every frame is
-read, as `intrasplat validate` does. One line of JSON is the verdict: `{"stage": "ready", …}` or `{"stage": "rejected", "reason": …}`. Exit code 0: there
-is a verdict. Nothing else imports this module: it loads OpenCV and the decoders.
+FOLDER contains the uploaded file `upload`. An archive is unpacked into FOLDER/NAME; a video becomes
+NAME with its suffix. Then every frame is read, as in `intrasplat validate`. The verdict is one JSON
+line: `{"stage": "ready", …}` or `{"stage": "rejected", "reason": …}`. Exit code 0 means that there
+is a verdict. The service never imports this module, because it loads OpenCV and the decoders.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ MOST_PROBLEMS = 3
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Check one upload and print what was found."""
+    """Check one upload and print the verdict."""
     keep_files_private()
     options = _options(arguments)
     limits = RecordingLimits(**json.loads(options.limits))
@@ -74,7 +76,7 @@ def _file_name(options: argparse.Namespace) -> str:
 
 
 def _put(options: argparse.Namespace, path: Path, limits: RecordingLimits) -> None:
-    """Bring the recording to its place; what an earlier check that was ended has left there goes first."""
+    """Move the recording to its place, after deleting leftovers of an interrupted check."""
     upload = options.folder / UPLOAD
     if options.kind == ARCHIVE:
         shutil.rmtree(path, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What an uploaded file is, by its first bytes."""
+"""File type detection of uploads by their first bytes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ ARCHIVE = "archive"
 
 
 def kind_of(file: Path) -> str:
-    """`archive`, or a video's usual suffix (`.mp4`, `.avi`, `.mkv`). Raises Rejected for anything else."""
+    """Return `archive`, or the suffix of a video (`.mp4`, `.avi`, `.mkv`).
+
+    Raises:
+        Rejected: if the type is unknown.
+    """
     with open(file, "rb") as opened:
         head = opened.read(16)
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):

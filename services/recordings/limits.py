@@ -1,4 +1,4 @@
-"""How much an uploaded recording and its check may take."""
+"""Resource budgets of an uploaded recording and its check."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ GIB = 1 << 30
 
 @dataclass(frozen=True)
 class RecordingLimits:
-    """Bounds of one recording. Every bound is included."""
+    """Inclusive limits for one recording."""
 
     unpacked_bytes: int = 64 * GIB
-    """What all files of an archive hold together."""
+    """Total unpacked size of an archive in bytes."""
     entry_bytes: int = 16 * GIB
-    """What one of them holds."""
+    """Unpacked size of one file in bytes."""
     entries: int = 65_000
-    """Files and folders of an archive."""
+    """Number of files and folders in an archive."""
     ratio: int = 100
-    """So many times as long as it was packed a file of over a megabyte may be."""
+    """Largest compression ratio of a file above one megabyte."""
     check_memory_bytes: int = 4 * GIB
-    """What the check may take beside the libraries that it loads."""
+    """Memory of the check beyond its libraries, in bytes."""
     check_s: float = 3600.0
-    """Processor time of the check. More rejects the recording."""
+    """Processor time of the check in seconds. Exceeding it rejects the recording."""
     check_passed_s: float = 4 * 3600.0
-    """How long the check may last. More says that the machine is too busy, and nothing about the recording."""
+    """Wall-clock time of the check in seconds. Exceeding it means that the machine is too busy, and
+    the recording is not rejected."""
     checks_at_once: int = 1
-    """Further checks wait for their turn."""
+    """Number of concurrent checks; further checks wait."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -1,4 +1,4 @@
-"""What callers get to know of a recording."""
+"""Records of recordings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import sqlalchemy as sa
 
 
 class State(StrEnum):
-    """`uploaded` → `ready`, or `rejected` with a reason. `missing` where a start did not find its files."""
+    """State of a recording: `uploaded` → `ready`, or `rejected` with a reason. `missing` if a start
+    did not find its files."""
 
     UPLOADED = "uploaded"
     READY = "ready"
@@ -22,35 +23,35 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class RecordingRecord:
-    """An uploaded recording."""
+    """Uploaded recording."""
 
     name: str
     kind: str
-    """`video` or `archive`."""
+    """Kind of upload: `video` or `archive`."""
     state: State
     reason: str | None
     digest: str
-    """SHA-256 of the uploaded file, in hexadecimal."""
+    """SHA-256 of the uploaded file in hex."""
     size_bytes: int
-    """Of the uploaded file."""
+    """Size of the uploaded file."""
     kept_bytes: int
-    """What it takes on the disk now."""
+    """Current size on the disk."""
     uploaded_by: str
     uploaded_at: datetime
     description: Mapping[str, Any]
-    """Once it is ready: layout, frames, size, rate and fields."""
+    """Layout, frames, size, rate and fields; available once the recording is ready."""
 
 
 @dataclass(frozen=True)
 class Expired:
-    """What retention has removed, and why: a recording by its name, a replay by its id."""
+    """Item deleted by retention, with the reason: a recording by name, or a replay by id."""
 
     name: str
     why: str
 
 
 def recording_record(row: sa.RowMapping) -> RecordingRecord:
-    """From the row."""
+    """Convert a row to a recording record."""
     return RecordingRecord(
         name=row["name"],
         kind="archive" if row["kind"] == "archive" else "video",

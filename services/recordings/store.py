@@ -1,4 +1,4 @@
-"""The store of uploaded recordings."""
+"""Store of uploaded recordings."""
 
 from __future__ import annotations
 
@@ -39,10 +39,11 @@ def _nobody(_: sa.Connection, __: str) -> bool:
 
 
 class RecordingStore:
-    """Recordings by name. Synchronous; any thread may call it. Every method raises StoreUnavailable where database or files do not answer.
+    """Recordings by name. Synchronous and thread-safe. Every method raises StoreUnavailable if the
+    database or the files are unavailable.
 
-    A recording is a row and a folder. The folder is there before the row and goes after it, so that a process that ends in between leaves at most a
-    folder without a row, which `recover` removes.
+    A recording is a row and a folder. The folder is created before the row and deleted after it. A
+    crash in between leaves at most a folder without a row, which `recover` deletes.
     """
 
     def __init__(
@@ -54,7 +55,16 @@ class RecordingStore:
         in_use: Callable[[sa.Connection, str], bool] = _nobody,
         check_program: tuple[str, ...] = PROGRAM,
     ) -> None:
-        """in_use: whether a job that has not ended reads a recording; asked in the transaction that would remove it."""
+        """Open the store, creating its folder.
+
+        Args:
+            folder: folder of the recordings.
+            database_url: URL of the database.
+            limits: budgets of recordings and checks.
+            in_use: returns True if an unfinished job reads a recording; called in the deleting
+                transaction.
+            check_program: command that checks a folder.
+        """
         self._folder, self._limits, self._in_use, self._program = folder, limits, in_use, check_program
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -69,9 +79,20 @@ class RecordingStore:
         self._database.migrate()
 
     def add(self, name: str, file: Path, digest: str, by: str) -> tuple[RecordingRecord, bool]:
-        """Move a whole file, whose SHA-256 is `digest`, into the store as a recording; True where it is new, False where that very file had this name.
+        """Move an uploaded file into the store.
 
-        Raises Rejected for a file that is neither video nor archive, Conflict for another recording of this name.
+        Args:
+            name: name of the recording.
+            file: path of the upload.
+            digest: its SHA-256 in hex.
+            by: the caller, for the record.
+
+        Returns:
+            The record, and False if the same file is already stored under this name.
+
+        Raises:
+            Rejected: if the file is neither video nor archive.
+            Conflict: if another recording has this name.
         """
         kind = kind_of(file)
         folder = self._folder / f"{name}-{secrets.token_hex(6)}"
@@ -97,9 +118,12 @@ class RecordingStore:
         return recording_record(there), False
 
     def check(self, name: str) -> RecordingRecord:
-        """Unpack and read an uploaded recording in a process of its own; blocks until it is `ready` or `rejected`.
+        """Unpack and read an uploaded recording in a separate process; blocks until it is `ready`
+        or `rejected`. A recording that was already checked is returned unchanged.
 
-        One that was checked before is answered as it is. Raises NotFound, and CheckFailed where the check could not be run: it then waits for another one.
+        Raises:
+            NotFound: if the recording does not exist.
+            CheckFailed: if the check could not run; the recording stays unchecked.
         """
         with self._checks:
             with self._database.reading() as connection:
@@ -109,24 +133,38 @@ class RecordingStore:
             return self._after_check(row, self._verdict(row))
 
     def all(self) -> list[RecordingRecord]:
-        """Every recording, by name."""
+        """Return every recording, ordered by name."""
         with self._database.reading() as connection:
             return [recording_record(row) for row in _rows(connection)]
 
     def get(self, name: str) -> RecordingRecord:
-        """One recording. Raises NotFound."""
+        """Return one recording.
+
+        Raises:
+            NotFound: if the recording does not exist.
+        """
         with self._database.reading() as connection:
             return recording_record(_found(connection, name))
 
     def path_of(self, connection: sa.Connection, name: str) -> Path:
-        """Where a recording lies that can be read, asked in the transaction of who wants to read it. Raises NotFound, Conflict."""
+        """Return the path of a ready recording, inside the reader's transaction.
+
+        Raises:
+            NotFound: if the recording does not exist.
+            Conflict: if it is not ready.
+        """
         row = _found(connection, name)
         if State(row["state"]) is not State.READY:
             raise Conflict(f"the recording {name} is {row['state']}, not ready; GET /v1/recordings/{name} says why")
         return self._folder / row["folder"] / file_name(row)
 
     def delete(self, name: str) -> RecordingRecord:
-        """Remove a recording. Raises NotFound, Conflict while a job reads it or waits to."""
+        """Delete a recording.
+
+        Raises:
+            NotFound: if the recording does not exist.
+            Conflict: if an unfinished job uses it.
+        """
         with self._database.writing() as connection:
             row = _found(connection, name)
             if self._in_use(connection, name):
@@ -136,8 +174,8 @@ class RecordingStore:
         return recording_record(row)
 
     def expire(self, max_age_s: float | None, max_bytes: int | None) -> list[Expired]:
-        """Remove recordings that are older than they may be, then the oldest until all of them take no more than `max_bytes`. Those that a job uses stay,
-        and those that wait for their check."""
+        """Delete recordings above the age limit, then the oldest until the total is at most
+        `max_bytes`. Recordings in use or waiting for their check are kept."""
         kept = [
             record
             for record in sorted(self.all(), key=lambda each: each.uploaded_at)
@@ -158,11 +196,13 @@ class RecordingStore:
         return removed
 
     def recover(self) -> list[str]:
-        """Called at start: remove folders without a row, mark recordings without files as `missing`, and those whose files are back as they were.
+        """Recover at start: delete folders without a row, mark recordings without files as
+        `missing`, and restore the state of those whose files are back.
 
-        Returns: names of recordings that wait for their check.
+        Returns:
+            Names of recordings that wait for their check.
         """
-        on_disk = sorted(self._folder.iterdir())  # before the rows: one that comes in between has both
+        on_disk = sorted(self._folder.iterdir())  # listed before the rows: a recording added in between has both
         with self._database.reading() as connection:
             rows = _rows(connection)
         known = {row["folder"] for row in rows}
@@ -191,7 +231,7 @@ class RecordingStore:
             log.log(logging.ERROR if reason else logging.WARNING, "the recording %s is %s", row["name"], found)
 
     def close(self) -> None:
-        """End the checks that run and close the connections."""
+        """Kill running checks and close the database."""
         self._running.end()
         self._database.close()
 
@@ -233,7 +273,8 @@ class RecordingStore:
         same = (RECORDINGS.c.name == row["name"], RECORDINGS.c.folder == row["folder"])
         with self._database.writing() as connection:
             connection.execute(sa.update(RECORDINGS).where(*same).values(values))
-        # What is not needed any more: the archive of a recording that was unpacked, everything of one that cannot be used.
+        # Delete what is no longer needed: the archive of an unpacked recording, all files of a
+        # rejected one.
         (folder / UPLOAD).unlink(missing_ok=True)
         if not ready:
             shutil.rmtree(folder, ignore_errors=True)
@@ -259,7 +300,7 @@ def _bytes_below(path: Path) -> int:
 
 
 def file_name(row: sa.RowMapping) -> str:
-    """Name of a checked recording in its folder."""
+    """Return the name of a checked recording in its folder."""
     return str(row["name"]) if row["kind"] == ARCHIVE else f"{row['name']}{row['kind']}"
 
 

@@ -1,4 +1,4 @@
-"""The recordings' table. A change here needs a new file in `migrations/versions`."""
+"""Table of the recordings. Each change here needs a new file in `migrations/versions`."""
 
 from __future__ import annotations
 
@@ -26,4 +26,5 @@ RECORDINGS = sa.Table(
     sa.Column("uploaded_at", sa.String(40), nullable=False),
     sa.Column("description", sa.JSON, nullable=False),
 )
-"""`folder` is below the store's folder and has the recording in it; `size_bytes` is what was uploaded, `kept_bytes` what lies there now."""
+"""Recordings. `folder` is below the store's folder, `size_bytes` is the upload's size, `kept_bytes`
+the current size."""

@@ -1,4 +1,4 @@
-"""Unpacking an archive into a folder, after its list was looked at."""
+"""Unpacking of an archive after validation of its directory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,13 @@ PIECE_BYTES = 1 << 20
 
 
 def unpack(archive: Path, folder: Path, limits: RecordingLimits) -> None:
-    """Write the files of `archive` into the new folder `folder`. Raises ArchiveInvalid, with what was unpacked by then still there, and OSError."""
+    """Write the files of `archive` into the new folder `folder`. After an error, files unpacked so
+    far remain.
+
+    Raises:
+        ArchiveInvalid: if the archive breaks a rule.
+        OSError: if a file cannot be written.
+    """
     with open(archive, "rb") as file:
         stated = check_end(file)
         try:
@@ -28,7 +34,7 @@ def unpack(archive: Path, folder: Path, limits: RecordingLimits) -> None:
             zipfile.LargeZipFile,
             zlib.error,
             EOFError,
-            NotImplementedError,  # what zipfile raises for a way of packing that it does not know
+            NotImplementedError,  # raised by zipfile for unknown compression methods
             ValueError,
         ) as error:
             raise ArchiveInvalid("the archive is damaged; pack and upload it again") from error

@@ -1,1 +1,1 @@
-"""The history of the recordings' schema (Alembic)."""
+"""Schema history of the recordings (Alembic)."""

@@ -1,4 +1,4 @@
-"""Uploaded recordings."""
+"""Initial table of uploaded recordings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make the table."""
+    """Create the table."""
     op.create_table(
         "recordings",
         sa.Column("name", sa.String(64), nullable=False),
@@ -31,5 +31,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Remove it, with everything that is known of the recordings."""
+    """Drop the table with all records of recordings."""
     op.drop_table("recordings")
