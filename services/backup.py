@@ -40,31 +40,31 @@ MANIFEST = "backup.json"
 DATA = "data"
 FORMAT = 1
 TRIES = 5
-"""Times that a running service may change something while it is copied."""
+"""Attempts to copy data that a running service may change meanwhile."""
 PIECE_BYTES = 1 << 20
 SPARE_BYTES = 64 << 20
 MOST_MANIFEST_BYTES = 256 << 20
 
 
 class BackupFailed(UserError):
-    """A backup cannot be made or restored; says why, and that nothing was changed."""
+    """A backup cannot be made or restored. Nothing was changed."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where a service keeps what belongs into a backup."""
+    """Locations of the data that belongs into a backup."""
 
     data: Path
     recordings: Path
     replays: Path
     database_is_ours: bool
-    """False: PostgreSQL, which has its own backups."""
+    """False for PostgreSQL, which has its own backup tools."""
     blobs_are_ours: bool
-    """False: an object store, which has its own backups."""
+    """False for an object store, which has its own backup tools."""
 
     @classmethod
     def of(cls, settings: ServiceSettings) -> Places:
-        """As the settings say."""
+        """Return the locations from the settings."""
         data, registry = settings.data_dir, settings.registry
         return cls(
             data=data,
@@ -76,13 +76,13 @@ class Places:
 
     @property
     def database(self) -> Path:
-        """The file of the database, where it is ours."""
+        """Return the SQLite database file."""
         return self.data / "registry" / DATABASE_FILE
 
 
 @dataclass(frozen=True)
 class Backup:
-    """A backup that was made or checked."""
+    """Backup that was made or checked."""
 
     files: int
     size_bytes: int
@@ -90,15 +90,19 @@ class Backup:
     version: str
     """Version of the program that made the backup."""
     elsewhere: tuple[str, ...]
-    """Data that the backup does not hold and that has to be backed up by other means."""
+    """Data not in the backup, which needs other means of backup."""
     missing: tuple[str, ...]
-    """Rows of the database whose files were missing already when it was made."""
+    """Rows of the database whose files were already missing at the time of the backup."""
     audit: str
-    """`intact`, or what is wrong with the audit log."""
+    """`intact`, or a description of the audit log's defect."""
 
 
 def make_backup(settings: ServiceSettings, target: Path) -> Backup:
-    """Copy everything into a new folder; the service may run. Raises BackupFailed."""
+    """Copy all data into a new folder; the service may run.
+
+    Raises:
+        BackupFailed: if the backup cannot be made.
+    """
     places = Places.of(settings)
     _refuse_target(places, target)
     try:
@@ -112,7 +116,12 @@ def make_backup(settings: ServiceSettings, target: Path) -> Backup:
 
 
 def check_backup(folder: Path) -> Backup:
-    """Hold a backup against its list, its database against its files, and its audit log against itself. Raises BackupFailed."""
+    """Check a backup: files against the manifest, database against files, and the audit log's
+    chain.
+
+    Raises:
+        BackupFailed: if the backup is damaged.
+    """
     described, files = _manifest(folder)
     for name, (size, digest) in files.items():
         path = folder / name
@@ -139,7 +148,12 @@ def check_backup(folder: Path) -> Backup:
 
 
 def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
-    """Check a backup and put it into the service's folders, which must be empty. Raises BackupFailed; nothing is ever replaced."""
+    """Check a backup and restore it into the service's folders, which must be empty. Nothing is
+    ever replaced.
+
+    Raises:
+        BackupFailed: if the backup is damaged or a folder is not empty.
+    """
     backup = check_backup(folder)
     places = Places.of(settings)
     moves = _moves(places, folder / DATA)
@@ -176,7 +190,7 @@ def _fill(places: Places, folder: Path) -> Backup:
             _copy_database(places.database, data / "registry" / DATABASE_FILE)
         _copy_files(places, data)
         missing = set(map(str, _missing(data))) if (data / "registry" / DATABASE_FILE).exists() else set()
-        if missing in (set(), known):  # those that are missing twice are missing in the service
+        if missing in (set(), known):  # files missing twice are missing in the service itself
             break
         known = missing
     _copy_audit(places.data, data)
@@ -226,13 +240,14 @@ def _require_space(folder: Path, wanted: int) -> None:
 
 
 def _sources(places: Places) -> dict[str, Path]:
-    """Folders that are copied, by their place in the backup."""
+    """Return the copied folders, by their place in the backup."""
     found = {"recordings": places.recordings, "replays": places.replays, "snapshots": places.data / "snapshots"}
     return found | ({"registry/blobs": places.data / "registry" / "blobs"} if places.blobs_are_ours else {})
 
 
 def _copy_files(places: Places, data: Path) -> None:
-    """Copy what is not copied yet. Files of the service never change once they have their name; one that goes meanwhile is left out."""
+    """Copy the files not copied yet. Named files of the service never change; files deleted
+    meanwhile are skipped."""
     for name, source in _sources(places).items():
         for path in _walk(source):
             relative = path.relative_to(source)
@@ -258,7 +273,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _copy_audit(source: Path, data: Path) -> None:
-    """Copy the audit log with its head, first the head: entries that are written meanwhile are cut off the copy."""
+    """Copy the audit log, its head first. Entries written meanwhile are cut off the copy."""
     for _ in range(TRIES):
         for left in data.glob("audit.*"):
             left.unlink()
@@ -302,7 +317,7 @@ def _missing(data: Path) -> list[Any]:
     engine = sa.create_engine(f"sqlite:///{(data / 'registry' / DATABASE_FILE).absolute()}")
     try:
         with engine.connect() as connection:
-            # Without its folder of files the registry kept them elsewhere.
+            # Without a folder of files in the backup, the registry uses an object store.
             return missing_files(
                 connection, StoredFiles(data / "recordings", data / "replays", blobs if blobs.is_dir() else None)
             )
@@ -313,14 +328,15 @@ def _missing(data: Path) -> list[Any]:
 
 
 def _moves(places: Places, data: Path) -> list[tuple[Path, Path]]:
-    """Folders of the backup and where their contents go. What lies elsewhere than in the data folder comes first."""
+    """Return pairs of backup folder and target. Folders outside the data folder come first."""
     apart = [(data / "recordings", places.recordings), (data / "replays", places.replays)]
     apart = [(source, target) for source, target in apart if target != places.data / source.name]
     return [*apart, (data, places.data)]
 
 
 def _stage(source: Path, target: Path, files: dict[str, tuple[int, str]], apart: set[str]) -> Path:
-    """Copy a folder of the backup into a new one in its target, each file against its digest. apart: folders with a target of their own."""
+    """Copy a folder of the backup into a new staging folder in its target, verifying each digest.
+    `apart` names folders with a target of their own."""
     target.mkdir(mode=0o700, parents=True, exist_ok=True)
     stage_ = target / f".restore-{os.getpid()}"
     stage_.mkdir(mode=0o700)
@@ -360,7 +376,7 @@ def _manifest(folder: Path) -> tuple[dict[str, Any], dict[str, tuple[int, str]]]
 
 
 def _walk(folder: Path) -> Iterator[Path]:
-    """Plain files below a folder, in order. Links and special files are no part of a backup."""
+    """Yield regular files below a folder, in order. Links and special files are excluded."""
     for path, folders, files in os.walk(folder):
         folders.sort()
         for name in sorted(files):
@@ -370,7 +386,11 @@ def _walk(folder: Path) -> Iterator[Path]:
 
 
 def _copy(source: Path, target: Path) -> str:
-    """Copy a file for this user alone and force it to the disk. Returns its SHA-256."""
+    """Copy a file for this user only and sync it to the disk.
+
+    Returns:
+        SHA-256 in hex.
+    """
     _make_parents(target)
     digest = hashlib.sha256()
     target.unlink(missing_ok=True)

@@ -1,4 +1,5 @@
-"""A guard against a clock that jumps: nothing is removed by its age until the time has been consistent for a while."""
+"""Guard against clock jumps: nothing is deleted by age until the clock has been consistent for some
+time."""
 
 from __future__ import annotations
 
@@ -13,17 +14,18 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 FILE = "clock.json"
 JUMP_S = 86_400.0
-"""A step of the clock, or a pause of the service, beyond which ages are not believed at once."""
+"""Clock step or service pause in seconds, beyond which ages are not trusted."""
 CONFIRM_S = 86_400.0
-"""Time of running without another step after which they are."""
+"""Seconds of running without another step after which ages are trusted again."""
 WRITE_S = 600.0
 
 
 class ClockGuard:
-    """Knows when the service last ran, and whether the clock has jumped since, or meanwhile. Any thread may use it.
+    """Detector of clock jumps during and between runs of the service. Thread-safe.
 
-    The time is kept in `clock.json` of the data folder. While it is not trusted the file keeps the last time that was, so that a restart does not
-    make a wrong clock right. Removing the file and starting the service confirms the clock at once.
+    `clock.json` in the data folder stores the time. While the clock is not trusted, the file keeps
+    the last trusted time, so a restart does not confirm a wrong clock. Deleting the file and
+    starting the service confirms the clock at once.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class ClockGuard:
 
     @property
     def doubt(self) -> str | None:
-        """A sentence while the clock is not trusted; None while it is. Looks at the clock."""
+        """Check the clock. Returns a message while it is not trusted, otherwise None."""
         with self._lock:
             self._look()
             if self._since_s is None:
@@ -57,7 +59,7 @@ class ClockGuard:
             )
 
     def trusts_ages(self) -> bool:
-        """Whether things may be removed because they are old."""
+        """Return True if data may be deleted by age."""
         return self.doubt is None
 
     def _look(self) -> None:
@@ -78,7 +80,7 @@ class ClockGuard:
         self._since_s = self._monotonic()
 
     def _read(self) -> float | None:
-        """When the service last ran; None where it has never kept the time, or somebody has removed the file."""
+        """Return the stored time; None if the file does not exist."""
         try:
             return float(json.loads(self._path.read_bytes())["seen_s"])
         except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Rows of the database whose files are not on the disk: models, recordings, results of replays."""
+"""Detection of database rows whose files are missing: models, recordings, results of replays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from services.registry.tables import VERSIONS
 
 @dataclass(frozen=True)
 class StoredFiles:
-    """Folders of a service, or of a backup of one. None: the files are kept elsewhere and are not looked at."""
+    """Folders of a service or a backup. None means that the files are in external storage and not
+    checked."""
 
     recordings: Path
     replays: Path
@@ -29,7 +30,7 @@ class StoredFiles:
 
 @dataclass(frozen=True)
 class MissingFile:
-    """A row without its file."""
+    """Row without its file."""
 
     kind: str
     """`model`, `recording` or `replay`."""
@@ -42,14 +43,14 @@ class MissingFile:
 
 
 def missing_files(connection: sa.Connection, files: StoredFiles) -> list[MissingFile]:
-    """Hold every row against the disk. Tables that the database does not have yet have no rows."""
+    """Return the rows whose files are missing. Missing tables count as empty."""
     tables = set(sa.inspect(connection).get_table_names())
     looked_at = {"versions": _models, "recordings": _recordings, "jobs": _replays}
     return [each for table, rows in looked_at.items() if table in tables for each in rows(connection, files)]
 
 
 def count_by_kind(missing: list[MissingFile]) -> Mapping[str, int]:
-    """How many rows of each kind have no file."""
+    """Return the number of missing files per kind."""
     return {kind: sum(each.kind == kind for each in missing) for kind in ("model", "recording", "replay")}
 
 

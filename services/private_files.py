@@ -1,4 +1,5 @@
-"""Files of the service that only its own user may read: a umask for every process, and the rights of what an earlier process has left."""
+"""Private files of the service: umask for each process, and tightened permissions of existing
+files."""
 
 from __future__ import annotations
 
@@ -13,33 +14,38 @@ from gsplat_core.errors import UserError
 log = logging.getLogger(__name__)
 UMASK = 0o077
 OTHERS = 0o077
-"""Rights of group and others."""
+"""Permission bits of group and others."""
 KEPT = frozenset(
     {"admin.key", "registry", "recordings", "replays", "snapshots", "uploads", "exports", "cache", "cuda-cache"}
 )
-"""Names in the data folder, with `audit.…` and `keys.…`."""
+"""Names in the data folder that belong to the service, in addition to `audit.…` and `keys.…`."""
 
 
 class FolderNotPrivate(UserError):
-    """A folder of the service belongs to another user, or its rights cannot be changed."""
+    """A service folder belongs to another user, or its permissions cannot be changed."""
 
 
 def keep_files_private() -> None:
-    """Create every file and folder of this process, and of those that it starts, for its user alone. Called first in each `main`."""
+    """Set the umask so that new files are private, also in child processes. Call first in each
+    `main`."""
     os.umask(UMASK)
 
 
 def make_state_private(data: Path, *further: Path | None) -> int:
-    """Make the service's folders where they are missing, and take the rights of group and others from all that the service keeps there.
-
-    Symbolic links are not followed. In the data folder only what the service names is touched: it may have been given a folder with other files.
+    """Create the service's folders and remove the permissions of group and others from its files.
+    Symbolic links are not followed. In the data folder only the service's own names are changed,
+    because the folder may contain other files.
 
     Args:
         data: data folder.
-        further: folders for recordings and results outside the data folder; None for those that are in it.
+        further: folders for recordings and results outside the data folder; None if they are
+            inside.
 
-    Returns: number of files and folders whose rights were changed.
-    Raises FolderNotPrivate for a folder that is open to other users and cannot be closed.
+    Returns:
+        Number of files and folders with changed permissions.
+
+    Raises:
+        FolderNotPrivate: if a folder is accessible to other users and cannot be changed.
     """
     own = [folder for folder in further if folder is not None]
     changed: int = _close(data, lambda: any(_is_ours(name) for name in os.listdir(data)))

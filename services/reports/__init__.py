@@ -1,4 +1,4 @@
-"""What a run leaves for people and programs: `report.json` and `report.html`."""
+"""Reports of a run: `report.json` for programs and `report.html` for people."""
 
 from services.reports.schema import RunReport
 

@@ -1,4 +1,4 @@
-"""From what a run has reached to its reports on disk."""
+"""Conversion of a run's outcome to its report files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,11 @@ from services.version import product_version
 
 
 def build_report(outcome: RunOutcome) -> RunReport:
-    """The outcome in the report's shape. Raises InvalidInput when the run had no source or measured nothing."""
+    """Convert the outcome to a report.
+
+    Raises:
+        InvalidInput: if the run had no source or measured nothing.
+    """
     source, quality = outcome.find(SourceResult), outcome.find(QualityResult)
     if source is None or quality is None:
         raise InvalidInput(f"a report needs a SourceResult and a QualityResult; the {outcome.command} has none")
@@ -89,7 +93,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
 
 
 def displayed(outcome: RunOutcome) -> int:
-    """Return the number of frames that a run showed."""
+    """Return the number of frames that a run displayed."""
     video, screen, quality = (outcome.find(kind) for kind in (DisplayResult, LiveDisplayResult, QualityResult))
     if isinstance(screen, LiveDisplayResult):
         return screen.pictures
@@ -189,7 +193,11 @@ def _depth(share: DepthShare | None) -> DepthErrors | None:
 
 
 def write_reports(outcome: RunOutcome, folder: Path) -> RunReport:
-    """Write `report.json` and `report.html`; each is whole or not there. Raises StorageFull."""
+    """Write `report.json` and `report.html`, each atomically.
+
+    Raises:
+        StorageFull: if the disk is full.
+    """
     report = build_report(outcome)
     report = report.model_copy(update={"outputs": {**report.outputs, "report": "report.json", "page": "report.html"}})
     report.write(folder / "report.json")
@@ -206,5 +214,5 @@ def _quality(tracker: QualityTracker) -> Quality:
 
 
 def _ms(value: float) -> float:
-    """Milliseconds, rounded to microseconds: the resolution of the clock."""
+    """Round milliseconds to microseconds, the resolution of the clock."""
     return round(value, 3)

@@ -1,4 +1,5 @@
-"""Charts as inline SVG, without a library: lines over time and distribution curves. Colours come from the page's CSS classes."""
+"""Inline SVG charts without a library: line charts over time and distribution curves. CSS classes
+of the page set the colours."""
 
 from __future__ import annotations
 
@@ -9,13 +10,14 @@ from html import escape
 
 HEIGHT = 290
 WIDE, NARROW = 1068, 500
-"""Widths in CSS pixels of the places that a chart may have, so that its text is as large as the page's."""
+"""Widths of the chart slots in CSS pixels. Matching widths keep the chart text at the page's text
+size."""
 LEFT, RIGHT, TOP, BOTTOM = 56, 16, 14, 44
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve. A None in `y` is a gap."""
+    """Curve of a chart. None in `y` is a gap."""
 
     name: str
     x: Sequence[float]
@@ -23,16 +25,16 @@ class Line:
     style: str
     """CSS class: `main`, `base`, `second`, `third`."""
     marks: bool = False
-    """Draw the points alone, without a line between them."""
+    """Draw points only, without a connecting line."""
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A titled chart with its lines and axes."""
+    """Titled chart with lines and axes."""
 
     title: str
     description: str
-    """What a reader who cannot see the chart should know."""
+    """Alternative text for screen readers."""
     x_label: str
     y_label: str
     lines: tuple[Line, ...]
@@ -43,7 +45,7 @@ class Chart:
     width: int = WIDE
 
     def svg(self) -> str:
-        """The chart as one `<svg>` element with a text alternative."""
+        """Return the chart as one `<svg>` element with alternative text."""
         x_low, x_high = self._extent([v for line in self.lines for v in line.x])
         values = [v for line in self.lines for v in line.y if v is not None]
         x_axis = _log_axis(x_low, x_high) if self.x_log else _axis(x_low, x_high, self.width // 110, tight=True)
@@ -79,7 +81,7 @@ class Chart:
         return "".join(parts)
 
     def figure(self) -> str:
-        """The chart with its legend and caption."""
+        """Return the chart with legend and caption."""
         keys = "".join(
             f'<li><span class="key {line.style}{" round" if line.marks else ""}"></span>{escape(line.name)}</li>'
             for line in self.lines
@@ -122,7 +124,7 @@ class _Axis:
     log: bool = False
 
     def position(self, value: float) -> float:
-        """Where a value lies on the axis, 0..1."""
+        """Return the position of a value on the axis, 0 to 1."""
         if self.log:
             low, high = math.log10(self.low), math.log10(self.high)
             return (math.log10(max(value, self.low)) - low) / (high - low)
@@ -130,7 +132,8 @@ class _Axis:
 
 
 def _axis(low: float, high: float, wanted: int, tight: bool) -> _Axis:
-    """Ticks at 1, 2 or 5 times a power of ten; a loose axis ends at a tick, a tight one at the data."""
+    """Create an axis with ticks at 1, 2 or 5 times a power of ten. A loose axis ends at ticks, a
+    tight one at the data."""
     if high - low < 1e-9 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
     rough = (high - low) / max(1, wanted)
@@ -151,7 +154,7 @@ def _log_axis(low: float, high: float) -> _Axis:
 
 
 def _number(value: float) -> str:
-    """At most four significant digits, without an exponent."""
+    """Format a number with at most four significant digits, without exponent."""
     if value == 0:
         return "0"
     digits = max(0, 3 - math.floor(math.log10(abs(value))))

@@ -1,4 +1,4 @@
-"""What lies at a path that is to be evaluated: a model bundle, or the folder of a run with its report."""
+"""Loading of an evaluation target: a model bundle, or a run's folder with its report."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ REPORT, MODEL = "report.json", "model"
 
 
 def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
-    """The model at `path`, and how it was made where a report says so: that of the run's folder, or the one beside a bundle when it is about
-    this very model.
+    """Load the model at `path`, with the report of the run that created it. The report is in the
+    run's folder, or next to the bundle if its digest matches.
 
-    Raises InvalidSetting for a run without a model or with a report that cannot be read; BundleError.
+    Returns:
+        The model, and the run or None.
+
+    Raises:
+        InvalidSetting: if a run has no model or an unreadable report.
+        BundleError: if the model cannot be loaded.
     """
     if os.path.lexists(path / REPORT):
         report = _read(path / REPORT)

@@ -1,4 +1,4 @@
-"""From what an evaluation has measured to its report on disk."""
+"""Conversion of an evaluation's measurements to its report files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ LABELS = {
 def build_evaluation(
     path: Path, model: Model, run: EvaluatedRun | None, settings: EvaluationSettings, evaluation: Evaluation
 ) -> EvaluationReport:
-    """The evaluation of what lies at `path` in the report's shape."""
+    """Convert the evaluation of the model at `path` to a report."""
     description = evaluation.description
     per_entry = {name: frames_per_entry(_lines(log), MAX_SERIES) for name, log in evaluation.logs.items()}
     retention = evaluation.retention
@@ -127,7 +127,11 @@ def _evaluated(
 
 
 def write_evaluation(report: EvaluationReport, folder: Path) -> EvaluationReport:
-    """Write `evaluation.json` and `evaluation.html`; each is whole or not there. Raises StorageFull."""
+    """Write `evaluation.json` and `evaluation.html`, each atomically.
+
+    Raises:
+        StorageFull: if the disk is full.
+    """
     outputs = {**report.outputs, "report": "evaluation.json", "page": "evaluation.html"}
     report = report.model_copy(update={"outputs": outputs})
     report.write(folder / "evaluation.json")
@@ -154,7 +158,7 @@ def _place(place: PlaceScore) -> PlaceFacts:
 
 
 def _baselines(evaluation: Evaluation) -> Iterator[BaselineFacts]:
-    """Every baseline that was measured, those of all frames first."""
+    """Yield every measured baseline, those over all frames first."""
     measured = evaluation.baselines
     for age, score in measured.copies.items():
         label = LABELS[PREVIOUS_FRAME] if age == 1 else f"Frame shown {age} frames late"

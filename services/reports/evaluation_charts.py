@@ -1,4 +1,4 @@
-"""Curves of `evaluation.html`: each protocol by frame, its baselines as lines, and the frame-hold curve."""
+"""Curves of `evaluation.html`: one chart per protocol with its baselines, and the frame-hold curve."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LINES = {
     ),
     "retention": ("Final model", ()),
 }
-"""By protocol: the name of its own curve; the baselines' figures, names and styles."""
+"""Curve name per protocol, and the keys, names and styles of its baselines."""
 _TITLES = {
     "live": "Live: on the screen when the next frame came (training error)",
     "causal": "Causal: predicted, then learned from",
@@ -34,7 +34,7 @@ _TITLES = {
 
 
 def charts_section(report: EvaluationReport) -> str:
-    """Tissue PSNR of each frame, by protocol."""
+    """Return the charts of tissue PSNR per frame, one per protocol."""
     charts = "".join(_chart(report, name) for name in _LINES if report.series.get(name))
     return charts
 
@@ -72,7 +72,8 @@ def _columns(points: list[tuple]) -> tuple[list[float], list[float | None]]:
 
 
 def hold_section(report: EvaluationReport) -> str:
-    """What a raw frame scores that is shown late: a live picture is worth showing above this curve."""
+    """Return the frame-hold curve: the score of a raw frame displayed late. A live picture is
+    useful if it scores above the curve at its age."""
     copies = [each for each in report.baselines if each.age_frames is not None and each.psnr_tissue_db is not None]
     if len(copies) < 2:
         return ""

@@ -1,4 +1,4 @@
-"""How true a model is in three dimensions, as rows: what was measured, in which unit, beside which trivial baseline."""
+"""Rows of 3D accuracy: measurement, unit and trivial baselines."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from services.reports.evaluation_rows import decibels
 from services.reports.evaluation_schema import EndPointFacts, EvaluationReport, GeometryFacts
 
 RELATIVE_FROM = 0.05
-"""A model whose lengths are off by a larger share than this is said to have no scale."""
+"""Scale error above which a model is reported as having no scale."""
 
 
 @dataclass(frozen=True)
 class GeometryRow:
-    """One figure, already in words."""
+    """Formatted measurement."""
 
     what: str
     value: str
     baselines: str
-    """What it is to be compared with: each trivial baseline with its value."""
+    """Trivial baselines with their values."""
     relative: bool = False
-    """It says nothing about lengths: one factor was taken out of it first."""
+    """True if a scale factor was removed first, so the value does not assess lengths."""
 
 
 def geometry_rows(geometry: GeometryFacts) -> list[GeometryRow]:
-    """Everything that was measured, in the order of the page."""
+    """Return all measured rows, in page order."""
     motion = [*_tracking(geometry), *_flow(geometry), *_trajectory(geometry)]
     return [*_depth(geometry), *_views(geometry), *motion, *_parts(geometry)]
 
 
 def scale_sentence(geometry: GeometryFacts) -> str | None:
-    """Whether lengths of the model mean anything, as far as the true depth tells."""
+    """Describe the model's length scale relative to the true depth; None without true depth."""
     if geometry.depth is None:
         return None
     scale = geometry.depth.scale
@@ -139,7 +139,7 @@ def _degrees(angle: float) -> str:
 
 
 def geometry_section(report: EvaluationReport) -> str:
-    """The rows as a table of `evaluation.html`."""
+    """Return the rows as a table of `evaluation.html`."""
     geometry = report.geometry
     rows = [] if geometry is None else geometry_rows(geometry)
     if geometry is None or not rows:
@@ -159,7 +159,7 @@ def geometry_section(report: EvaluationReport) -> str:
 
 
 def geometry_lines(report: EvaluationReport) -> list[str]:
-    """The rows for a terminal."""
+    """Return the rows as lines for a terminal."""
     geometry = report.geometry
     rows = [] if geometry is None else geometry_rows(geometry)
     if geometry is None or not rows:

@@ -1,4 +1,4 @@
-"""`evaluation.html`: one page that needs nothing but itself."""
+"""Self-contained page `evaluation.html`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from services.reports.html import POLICY, style
 
 
 def write_evaluation_html(report: EvaluationReport, path: Path) -> None:
-    """Write the page; the file is whole or not there."""
+    """Write the page atomically."""
     write_whole(path, render_evaluation(report).encode())
 
 
 def render_evaluation(report: EvaluationReport) -> str:
-    """The page as text: inline style, inline SVG, no script, no foreign origin."""
+    """Render the page: inline style and SVG, no script, no external resources."""
     evaluated, name = report.evaluated, escape(report.recording.name)
     small = [hold_section(report), ages_section(report), depth_section(report), facts_section(report)]
     sections = [

@@ -1,4 +1,4 @@
-"""The protocols of an evaluation, each with the baselines that belong to it: for the page's table and for the terminal."""
+"""Protocols of an evaluation with their baselines, for the page and the terminal."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, 
 
 @dataclass(frozen=True)
 class Measured:
-    """One protocol's figures beside its baselines, the one to compare with first."""
+    """Scores of one protocol and its baselines, primary baseline first."""
 
     key: str
     name: str
     what: str
-    """What is shown, in a few words."""
+    """Short description of the displayed pictures."""
     score: ScoreFacts
     baselines: tuple[BaselineFacts, ...]
 
     @property
     def versus(self) -> tuple[float, BaselineFacts] | None:
-        """Gain in decibels over the first baseline."""
+        """Return the gain in decibels over the first measured baseline, and that baseline."""
         for baseline in self.baselines:
             if baseline.psnr_tissue_db is not None and self.score.psnr_tissue_db is not None:
                 return self.score.psnr_tissue_db - baseline.psnr_tissue_db, baseline
@@ -29,7 +29,7 @@ class Measured:
 
 
 def measured(report: EvaluationReport) -> list[Measured]:
-    """The protocols that were measured, in the order of the page."""
+    """Return the measured protocols, in page order."""
 
     def named(frames_of: str, *names: str) -> tuple[BaselineFacts, ...]:
         by_name = {each.name: each for each in report.baselines if each.frames_of == frames_of}
@@ -68,18 +68,22 @@ def measured(report: EvaluationReport) -> list[Measured]:
 
 
 def future(baseline: BaselineFacts) -> str:
-    """The baseline's label, saying where it sees the future."""
+    """Return the baseline's label, marked if it uses future frames."""
     return f"{baseline.label} (sees the future)" if baseline.sees_future else baseline.label
 
 
 def decibels(value: float | None) -> str:
-    """Two digits after the point; a dash for what was not measured."""
+    """Format with two decimals; a dash for None."""
     return "–" if value is None else f"{value:.2f}"
 
 
 def at_age(report: EvaluationReport, age_frames: float) -> float | None:
-    """The frame-hold curve at an age, on a straight line between the measured ones; None outside of them. Below one frame it is that of
-    one: a picture that stands until the next frame comes is as good as a copy of the frame before for the next one."""
+    """Interpolate the frame-hold curve linearly at an age in frames; None outside the measured
+    ages.
+
+    Ages below one frame count as one: a picture that stays until the next frame equals a copy of
+    the previous frame.
+    """
     copies = sorted(
         (each.age_frames, each.psnr_tissue_db)
         for each in report.baselines

@@ -1,6 +1,7 @@
-"""The shape of `evaluation.json`: one model that writes it, reads it back and gives its JSON schema.
+"""Schema of `evaluation.json`: one model for writing, reading and the JSON schema.
 
-Fields are added, never renamed or removed, as long as `format_version` stays. A measure that does not exist is null, never NaN.
+While `format_version` is unchanged, fields are only added. A missing measurement is null, never
+NaN.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from services.reports.schema import MOST_REPORT_BYTES, NOTICE, Count, ModelFacts
 
 Decibels = float | None
 Seconds = tuple[float, float]
-"""First and last time of a range."""
+"""First and last time of a range in seconds."""
 
 
 class ScoreFacts(Part):
@@ -30,26 +31,26 @@ class ScoreFacts(Part):
     worst_db: Decibels
     worst_seq: int | None
     left_out: dict[str, Count]
-    """Frames that were not scored, by reason."""
+    """Number of frames without a score, by reason."""
 
 
 class BaselineFacts(Part):
-    """What one trivial baseline scores on the same recording."""
+    """Scores of one trivial baseline on the same recording."""
 
     name: str
     label: str
     frames_of: Literal["every", "heldout", "last", "live", "settled", "second_eye"]
-    """Which frames it is scored on: every one that has it, the held-out ones, the last seconds, those that the live figures are of,
-    those whose right view is scored."""
+    """Frames with a score: every available frame, held-out frames, the last seconds, the frames of
+    the live or settled scores, or the frames with a scored right view."""
     psnr_tissue_db: Decibels
     psnr_frame_db: Decibels
     frames: Count
     age_frames: int | None = None
-    """Of copies: how many frames old they are."""
+    """Age of copies in frames."""
     psnr_both_db: Decibels = None
-    """Of copies: over pixels that are tissue in the frame and in the copy."""
+    """Score of copies over pixels that are tissue in both frames."""
     sees_future: bool = False
-    """It needs the frame after the one that is shown, which a live system does not have."""
+    """True if the baseline uses the next frame, which a live system does not have."""
 
 
 class DepthFacts(Part):
@@ -64,7 +65,7 @@ class DepthFacts(Part):
 class HeldOutFacts(Part):
     score: ScoreFacts
     unrounded_db: Decibels
-    """Mean tissue PSNR of the pictures before they are rounded to 8 bits."""
+    """Mean tissue PSNR before rounding to 8 bits."""
     depth: DepthFacts | None
 
 
@@ -87,7 +88,7 @@ class AgeFacts(Part):
 class OnScreenFacts(Part):
     score: ScoreFacts
     settled: ScoreFacts
-    """Without the first second."""
+    """Scores without the first second."""
     age_when_shown: AgeFacts | None
     age_on_screen: AgeFacts | None
     in_time: Count
@@ -109,18 +110,18 @@ class RetentionFacts(Part):
 
 
 class DepthShareFacts(Part):
-    """Over all compared frames; shares are of the median true depth."""
+    """Depth errors over all compared frames, as shares of the median true depth."""
 
     rmse_share: float
     scaled_rmse_share: float
-    """After the model's depth was multiplied by `scale`: of its shape alone, relative."""
+    """Error after scaling the model's depth by `scale`: relative, assesses shape only."""
     plane_rmse_share: float
-    """Of each frame's best-fit plane."""
+    """Baseline: each frame's best-fit plane."""
     level_rmse_share: float
-    """Of each frame's level plane, at the median true depth."""
+    """Baseline: a level plane at each frame's median true depth."""
     median_share: float
     rmse: float
-    """In the unit of the recording's depth, mm where it has a scale."""
+    """Error in the unit of the recording's depth, mm if calibrated."""
     scale: float
     median_depth: float
     covered: float
@@ -132,19 +133,20 @@ class NormalFacts(Part):
     median_deg: float
     plane_mean_deg: float
     level_mean_deg: float | None = None
-    """None in reports that were written before it was measured."""
+    """None in older reports without this measurement."""
     frames: Count
 
 
 class ViewFacts(Part):
-    """A view from where training did not look; over the pixels of tissue that training saw from its own camera."""
+    """View from a position without training, over tissue pixels that training saw from its own
+    camera."""
 
     name: str
     model: ScoreFacts
     left: ScoreFacts
-    """The left picture, shown as it is."""
+    """Baseline: unchanged left picture."""
     shifted: ScoreFacts
-    """The left picture, shifted by the median disparity."""
+    """Baseline: left picture shifted by the median disparity."""
     seen: float
 
 
@@ -158,13 +160,14 @@ class TrackFacts(Part):
 
 
 class TrackingFacts(Part):
-    """Points of the tissue, followed: errors in the left camera's coordinates, and in pixels of the evaluated pictures."""
+    """Tracking errors of tissue points, in left camera coordinates and in pixels of the evaluated
+    pictures."""
 
     model: TrackFacts
     scaled: TrackFacts
-    """After the one factor of the sequence's depth: relative."""
+    """Errors after the sequence's depth scale factor: relative."""
     still: TrackFacts
-    """No motion."""
+    """Baseline: no motion."""
     points: Count
     compared: Count
 
@@ -173,27 +176,27 @@ class EndPointFacts(Part):
     median_px: float
     mean_px: float
     median_mm: float | None
-    """Null where the recording knows no scene flow."""
+    """Null if the recording has no scene flow."""
     mean_mm: float | None
 
 
 class FlowFacts(Part):
-    """Where what a pixel shows goes until the next frame: distances from where it truly goes, in the picture and in space."""
+    """End-point errors of the flow to the next frame, in the picture and in space."""
 
     model: EndPointFacts
     scaled: EndPointFacts
-    """After the one factor of the sequence's depth: relative."""
+    """Errors after the sequence's depth scale factor: relative."""
     still: EndPointFacts
-    """No motion."""
+    """Baseline: no motion."""
     frames: Count
 
 
 class TrajectoryFacts(Part):
-    """Absolute trajectory error, as a share of the true path."""
+    """Absolute trajectory error as a share of the true path length."""
 
     rigid_share: float
     similarity_share: float
-    """After the best scale: relative."""
+    """Error after the best scale: relative."""
     still_share: float
     rigid_rmse: float
     rotation_deg: float
@@ -203,7 +206,7 @@ class TrajectoryFacts(Part):
 
 
 class PartFacts(Part):
-    """Shares of the squared change of the pictures that each part of the deformation explains."""
+    """Shares of the squared picture change explained by each part of the deformation."""
 
     motion: float
     colour: float
@@ -214,14 +217,14 @@ class PartFacts(Part):
 
 
 class GeometryFacts(Part):
-    """How true the model is in three dimensions; null or empty where the recording does not know the truth."""
+    """3D accuracy of the model; null or empty without ground truth."""
 
     frames: Count
     depth: DepthShareFacts | None
     normals: NormalFacts | None
     views: list[ViewFacts]
     scaled_views: list[ViewFacts]
-    """After the one factor of the sequence's depth: relative."""
+    """Views after the sequence's depth scale factor: relative."""
     tracking: TrackingFacts | None
     flow: FlowFacts | None = None
     trajectory: TrajectoryFacts | None
@@ -230,13 +233,13 @@ class GeometryFacts(Part):
 
 class SecondEyeFacts(Part):
     score: ScoreFacts
-    """`psnr_tissue_db` after a straight line for each channel, over what both eyes see."""
+    """`psnr_tissue_db` after a linear fit per channel, over pixels visible to both eyes."""
     left_out_px: Count
-    """Columns at the right edge that were left out: only the right eye sees them."""
+    """Columns excluded at the right edge, visible to the right eye only."""
 
 
 class ReturnFacts(Part):
-    """How soon a place was found again."""
+    """Time until a revisited place was recognised."""
 
     again_s: Seconds
     first_db: list[Decibels]
@@ -244,12 +247,12 @@ class ReturnFacts(Part):
 
 
 class EvaluatedFacts(Part):
-    """What was evaluated, and how."""
+    """Evaluated model and evaluation settings."""
 
     path: str
-    """As it was given."""
+    """Path as given by the user."""
     command: str | None
-    """What made the model; null where nothing says so."""
+    """Command that created the model; null if unknown."""
     model: ModelFacts
     time_window_s: Seconds
     scale: float
@@ -263,7 +266,7 @@ class EvaluatedFacts(Part):
 
 
 class EvaluationReport(Part):
-    """Everything `evaluation.json` holds; null for a protocol that was not measured."""
+    """Content of `evaluation.json`; null for protocols without measurement."""
 
     format_version: Literal[1] = 1
     notice: str = NOTICE
@@ -276,23 +279,29 @@ class EvaluationReport(Part):
     geometry: GeometryFacts | None = None
     second_eye: SecondEyeFacts | None = None
     returns: dict[str, list[ReturnFacts]]
-    """By protocol."""
+    """Returns to known places, by protocol."""
     baselines: list[BaselineFacts]
     left_out: dict[str, Count]
-    """Frames that no baseline was scored on, by reason."""
+    """Frames without a baseline score, by reason."""
     notes: list[str]
     outputs: dict[str, str]
-    """What was written, as paths relative to this file."""
+    """Written files, as paths relative to this file."""
     series: dict[str, list[dict[str, float | int | bool | str | None]]]
-    """By protocol, one entry for each scored frame; of more than 4096 frames, one for each `series_frames_per_entry` of them."""
+    """Entries per scored frame, by protocol. Above 4096 frames, one entry per
+    `series_frames_per_entry` frames."""
     series_frames_per_entry: dict[str, Annotated[int, Field(ge=1)]]
 
     def write(self, path: Path) -> None:
-        """Write JSON; the file is whole or not there."""
+        """Write JSON atomically."""
         text = json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False)
         write_whole(path, (text + "\n").encode())
 
     @classmethod
     def read(cls, path: Path) -> EvaluationReport:
-        """Read a report back. Raises pydantic.ValidationError where it does not fit, OSError for anything but a plain file of at most MOST_REPORT_BYTES."""
+        """Read a report.
+
+        Raises:
+            pydantic.ValidationError: if the content does not match the schema.
+            OSError: if the path is no regular file of at most MOST_REPORT_BYTES.
+        """
         return cls.model_validate_json(read_regular(path, MOST_REPORT_BYTES))

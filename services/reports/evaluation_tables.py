@@ -1,4 +1,4 @@
-"""Tiles and tables of `evaluation.html`, each a function from the report to a piece of the page."""
+"""Tiles and tables of `evaluation.html`; each function renders one section."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, 
 
 
 def tiles_section(report: EvaluationReport) -> str:
-    """The protocols' figures that come first."""
+    """Return the tiles with the main scores of each protocol."""
     tiles = []
     for each in measured(report):
         more = each.what
@@ -32,7 +32,7 @@ def _tile(name: str, value: str, unit: str, more: str) -> str:
 
 
 def table_section(report: EvaluationReport) -> str:
-    """Every protocol beside its baselines."""
+    """Return the table of protocols and baselines."""
     found = measured(report)
     known = [value for each in report.baselines if (value := each.psnr_tissue_db) is not None]
     known += [value for each in found if (value := each.score.psnr_tissue_db) is not None]
@@ -101,7 +101,7 @@ def _left_out(report: EvaluationReport) -> str:
 
 
 def ages_section(report: EvaluationReport) -> str:
-    """How old what a viewer saw was."""
+    """Return the table of picture ages at display."""
     live = report.live
     if live is None:
         return ""
@@ -134,7 +134,7 @@ def ages_section(report: EvaluationReport) -> str:
 
 
 def depth_section(report: EvaluationReport) -> str:
-    """Errors of depth on the held-out frames."""
+    """Return the depth errors on the held-out frames."""
     depth = None if report.heldout is None else report.heldout.depth
     if depth is None:
         return ""
@@ -152,7 +152,7 @@ def depth_section(report: EvaluationReport) -> str:
 
 
 def places_section(report: EvaluationReport) -> str:
-    """Places that were seen twice."""
+    """Return the table of revisited places."""
     if report.retention is None or not report.retention.places:
         return ""
     heads = "".join(
@@ -185,7 +185,7 @@ def places_section(report: EvaluationReport) -> str:
 
 
 def facts_section(report: EvaluationReport) -> str:
-    """What was evaluated, on what."""
+    """Return the facts about model, recording and machine."""
     recording, evaluated, model = report.recording, report.evaluated, report.evaluated.model
     start_s, end_s = evaluated.time_window_s
     facts = {
@@ -211,7 +211,7 @@ def facts_section(report: EvaluationReport) -> str:
 
 
 def notes_section(report: EvaluationReport) -> str:
-    """What a reader of the figures must know."""
+    """Return the notes."""
     if not report.notes:
         return ""
     items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)

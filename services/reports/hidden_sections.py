@@ -1,4 +1,5 @@
-"""The part of `report.html` on what the camera does not show: tissue behind tools, depth, the scene from the side."""
+"""Section of `report.html` on content hidden from the camera: tissue behind tools, depth, side
+view."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from services.reports.schema import DepthErrors, RunReport, TruthFacts
 
 
 def hidden_section(report: RunReport, pictures: HiddenPictures | None) -> str:
-    """Pictures of the last frame, and what they score where the recording knows the truth."""
+    """Return pictures of the last frame, and scores if the recording has ground truth."""
     truth = report.quality.truth
     if pictures is None and truth is None:
         return ""
@@ -58,7 +59,7 @@ def _depth(name: str, errors: DepthErrors) -> str:
 
 
 def _table(name: str, own: tuple[str, str], *baselines: tuple[str, str]) -> str:
-    """A table of the reconstruction's figure and its baselines."""
+    """Return a table of the reconstruction's score and its baselines."""
     rows = "".join(
         f'<tr{" class=ours" if row is own else ""}><th scope="row">{row[0]}</th><td class="n">{row[1]}</td></tr>'
         for row in (own, *baselines)

@@ -1,4 +1,4 @@
-"""`report.html`: one page that needs nothing but itself, and the video beside it for those who want to see it move."""
+"""Self-contained page `report.html`; only the video is a separate file next to it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from services.reports.sections import (
 )
 from services.reports.video import video_section
 
-# Nothing may be fetched but the video beside the page, whatever a later edit writes into it.
+# Content security policy: only the video next to the page may be loaded.
 POLICY = "default-src 'none'; img-src data:; media-src 'self'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
@@ -36,7 +36,7 @@ def write_html(
     worst_seq: int | None = None,
     hidden: HiddenPictures | None = None,
 ) -> None:
-    """Write the page; the file is whole or not there."""
+    """Write the page atomically."""
     write_whole(path, render_html(report, keyframes, worst_seq, hidden).encode())
 
 
@@ -46,7 +46,8 @@ def render_html(
     worst_seq: int | None = None,
     hidden: HiddenPictures | None = None,
 ) -> str:
-    """The page as text: inline style, inline SVG, pictures as `data:`, no script, no foreign origin."""
+    """Render the page: inline style and SVG, pictures as `data:` URIs, no script, no external
+    resources."""
     recording, run = report.recording, report.run
     sections = [
         tiles_section(report),
@@ -91,5 +92,5 @@ def render_html(
 
 @cache
 def style() -> str:
-    """The style sheet of all pages."""
+    """Return the style sheet of all pages."""
     return files("services.reports").joinpath("style.css").read_text(encoding="utf-8")

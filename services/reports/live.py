@@ -1,4 +1,4 @@
-"""A live run's part of the report."""
+"""Live section of the report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.reports.schema import LiveFacts
 
 
 def live_facts(outcome: RunOutcome) -> LiveFacts | None:
-    """From what the operators of a live run contribute; None for another run."""
+    """Collect the results of a live run's operators; None for other runs."""
     screen, scores = outcome.find(LiveDisplayResult), outcome.find(OnScreenResult)
     training = outcome.find(TrainingCounts)
     if screen is None or scores is None or training is None:

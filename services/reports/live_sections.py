@@ -1,4 +1,4 @@
-"""The parts of `report.html` that only a live run has: how old its pictures were, how good they were at that age, what it passed over."""
+"""Sections of `report.html` for live runs: picture ages, quality over age, skipped frames."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from services.reports.schema import FrameEntry, LiveFacts, RunReport
 from services.reports.sections import against
 
 AGE_GROUPS = 12
-"""Points of the curve of quality over age: groups of equally many frames."""
+"""Points of the quality-over-age curve; each groups equally many frames."""
 
 
 def live_section(report: RunReport) -> str:
-    """Ages, quality over age, states and counts; nothing for a run that follows no clock."""
+    """Return ages, quality over age, states and counts; empty for runs without a clock."""
     live = report.live
     if live is None:
         return ""
@@ -104,7 +104,7 @@ def _quality_over_age(report: RunReport) -> Chart | None:
 
 
 def _by_age(entries: list[FrameEntry]) -> list[list[FrameEntry]]:
-    """Groups of about equally many frames, youngest first."""
+    """Split frames by age into groups of about equal size, youngest first."""
     ordered = sorted(entries, key=lambda entry: entry.age_ms or 0.0)
     count = min(AGE_GROUPS, len(ordered))
     edges = [round(k * len(ordered) / count) for k in range(count + 1)]

@@ -1,4 +1,4 @@
-"""What the figures were measured on."""
+"""Facts about the machine of the measurement."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from operators.side_thread import usable_cores
 
 
 def machine_facts() -> dict[str, str]:
-    """Name and value of each fact, for people."""
+    """Return names and values of the facts, formatted for people."""
     return {
         "Processor": f"{processor_name()}, {usable_cores()} cores",
         "Instruction set": instruction_set(),
@@ -22,7 +22,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def processor_name() -> str:
-    """The processor's marketing name where the system tells it."""
+    """Return the processor's marketing name if the system reports it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
             for line in lines:

@@ -1,4 +1,4 @@
-"""Why a run showed nothing, and what changes that."""
+"""Error for a run without displayed frames, with reasons and remedies."""
 
 from __future__ import annotations
 
@@ -21,13 +21,17 @@ REMEDIES = {
     **dict.fromkeys(("black", "one colour", "noise", "duplicate", "frozen", "torn", "out of order"), CHECK_PICTURE),
     **dict.fromkeys(("blur", "smoke", "cut in doubt"), "a longer run shows such a stream after a second or two"),
 }
-"""What a user can do about each reason for which frames are withheld."""
+"""Remedy for each reason of withheld frames."""
 
 
 def require_shown(outcome: RunOutcome) -> None:
-    """Raise NothingShown where a run has shown no frame, with the frames that came, why they were withheld, and what changes that.
+    """Check that a run displayed a frame.
 
-    An interrupted run is excused while no frame was withheld: it may have been ended before its first picture.
+    An interrupted run without withheld frames is accepted, because it may have ended before its
+    first picture.
+
+    Raises:
+        NothingShown: if not; the message has the frame counts, the reasons and the remedy.
     """
     if displayed(outcome):
         return
@@ -58,7 +62,7 @@ def require_shown(outcome: RunOutcome) -> None:
 
 
 def withheld_frames(outcome: RunOutcome) -> Counter[str]:
-    """Count a run's withheld frames by reason: those of a live run's gates, or those that a recording says were withheld."""
+    """Count a run's withheld frames by reason, from the gates of a live run or from the recording."""
     training, source = outcome.find(TrainingCounts), outcome.find(SourceResult)
     if training is not None:
         return Counter(training.withheld)
@@ -69,7 +73,7 @@ def withheld_frames(outcome: RunOutcome) -> Counter[str]:
 
 
 def _named(outcome: RunOutcome, reason: str) -> str:
-    """A reason; that of the out-of-body gate with its evidence."""
+    """Return a reason, extended by the main evidence for the out-of-body gate."""
     gate = outcome.find(OutOfBodyFrames)
     if reason != OUT_OF_BODY or gate is None or not gate.withheld:
         return reason

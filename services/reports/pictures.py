@@ -1,4 +1,4 @@
-"""Keyframes as pictures inside a page: `data:` URIs, small enough to mail."""
+"""Keyframe pictures embedded in a page as `data:` URIs, small enough for mail."""
 
 from __future__ import annotations
 
@@ -17,31 +17,32 @@ from operators.remembered import marked
 from operators.sinks.pictures import depth_map, depth_range, error_map
 
 WIDTH_PX = 420
-"""Pictures are shrunk to this width, never enlarged by more than whole factors."""
+"""Target width in pixels. Larger pictures are shrunk, smaller ones enlarged by whole factors only.
+"""
 _JPEG_QUALITY = 88
 ASIDE = Orbit(16.0, 8.0)
-"""From where the model is shown besides, in degrees about what the camera looks at."""
+"""Side view: orbit angles in degrees about the camera's centre of view."""
 COVERED = 0.5
-"""Opacity from which on a pixel shows something of the model."""
+"""Opacity from which a pixel counts as covered by the model."""
 NOTHING_THERE = (70, 74, 80)
 
 
 @dataclass(frozen=True)
 class KeyframePictures:
-    """One row of the report's picture table."""
+    """Pictures of one row of the report's picture table, as `data:` URIs."""
 
     scored: ScoredFrame
     raw: str
     reconstruction: str
     error: str
     depth: str
-    """`data:` URIs."""
+    """Depth map, like the other pictures a `data:` URI."""
     depth_range: tuple[float, float] | None
     """Depths drawn brightest and darkest."""
 
 
 def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
-    """The four pictures of one frame."""
+    """Return the four pictures of one frame."""
     rendered = scored.rendered
     return KeyframePictures(
         scored,
@@ -55,20 +56,24 @@ def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
 
 @dataclass(frozen=True)
 class HiddenPictures:
-    """What a reconstruction shows and the camera does not, of the last frame; `data:` URIs."""
+    """Pictures of the last frame with content hidden from the camera, as `data:` URIs."""
 
     seq: int
     time_s: float
     raw: str
     behind: str
-    """The reconstruction in its own colours, tissue behind tools within a light line."""
+    """Reconstruction in its own colours, with tissue behind tools outlined."""
     depth: str
     aside: str
-    """The model as it is seen from the side; grey where it has nothing."""
+    """Side view of the model; grey where the model has no content."""
 
 
 def hidden_pictures(scored: ScoredFrame, model: Model) -> HiddenPictures | None:
-    """Return the pictures of a frame with the model of its time; None where the model shows nothing in front of the camera."""
+    """Render the hidden-content pictures of a frame.
+
+    Returns:
+        None if the model shows nothing in front of the camera, or the sizes differ.
+    """
     rendered = scored.rendered
     frame = rendered.frame
     known = rendered.depth[(rendered.alpha > COVERED) & (rendered.depth > 0)]
@@ -89,7 +94,7 @@ def hidden_pictures(scored: ScoredFrame, model: Model) -> HiddenPictures | None:
 
 
 def _outlined(picture: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-    """The picture with a light line around what is hidden by tools."""
+    """Outline the area hidden by tools."""
     if mask is None:
         return picture
     drawn = np.ascontiguousarray(picture.copy())
@@ -99,7 +104,7 @@ def _outlined(picture: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDA
 
 
 def data_uri(image: NDArray[np.uint8]) -> str:
-    """An RGB image as a JPEG `data:` URI."""
+    """Encode an RGB image as a JPEG `data:` URI."""
     height, width = image.shape[:2]
     if width > WIDTH_PX:
         size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))

@@ -1,6 +1,7 @@
-"""The shape of `report.json`: one model that writes it, reads it back and gives its JSON schema.
+"""Schema of `report.json`: one model for writing, reading and the JSON schema.
 
-Fields are added, never renamed or removed, as long as `format_version` stays. A measure that does not exist is null, never NaN.
+While `format_version` is unchanged, fields are only added. A missing measurement is null, never
+NaN.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class Part(BaseModel):
-    """A part of a report."""
+    """Base class of the report's parts."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class RecordingFacts(Part):
-    """The recording as it was read: after `--scale` and `--max-frames`."""
+    """Recording as read, after `--scale` and `--max-frames`."""
 
     name: str
     frames: Count | None
-    """Null for a stream without an end."""
+    """Null for an endless stream."""
     width_px: Annotated[int, Field(ge=1)]
     height_px: Annotated[int, Field(ge=1)]
     fps: Annotated[float, Field(gt=0)]
@@ -41,7 +42,7 @@ class RecordingFacts(Part):
 
 
 class RunFacts(Part):
-    """How the run was made, and how it ended."""
+    """Settings and outcome of the run."""
 
     device: str
     engine: str
@@ -50,18 +51,18 @@ class RunFacts(Part):
     threads: Annotated[int, Field(ge=1)]
     wall_s: Annotated[float, Field(ge=0)]
     command: str = "replay"
-    """`replay` or `reconstruct`, or another application that writes such a report."""
+    """`replay` or `reconstruct`, or another application that writes this report."""
     field: str
     """Deformation field in use: `basis` or `hexplane`, never `auto`."""
     renderer: str = "alpha"
     steps_per_frame: int | None = None
     eyes: Literal["left", "both"] = "left"
-    """Which pictures of a stereo scope the model was trained on."""
+    """Pictures of a stereo endoscope used for training."""
     scale: float = 1.0
     started_at: str
-    """UTC, ISO 8601."""
+    """Start time, UTC, ISO 8601."""
     stop_reason: str
-    """Why the run ended: `end of recording`, `interrupted`, or what failed."""
+    """Reason for the end: `end of recording`, `interrupted`, or the failure."""
     interrupted: bool = False
     peak_memory_bytes: Count | None = None
     machine: dict[str, str] = {}
@@ -73,7 +74,8 @@ class FrameCounts(Part):
     displayed: Count
     dropped: Count
     damaged: Count = 0
-    """Of the ingested ones: repaired, guessed or skipped by the decoder; shown, neither trained on nor scored."""
+    """Ingested frames repaired, concealed or skipped by the decoder; displayed, but neither trained
+    on nor scored."""
 
 
 class Latency(Part):
@@ -86,7 +88,7 @@ class Latency(Part):
 
 
 class OperatorTimes(Part):
-    """How often an operator ran and how long a run of it took."""
+    """Number and durations of an operator's runs."""
 
     calls: Count
     p50_ms: float
@@ -103,67 +105,73 @@ class Quality(Part):
 
 
 class NextFrameQuality(Part):
-    """Each frame predicted by the model that had not been trained on it: rendered at the frame's time and pose, and scored before training."""
+    """Prediction scores: each frame is rendered at its time and pose and scored before the model is
+    trained on it."""
 
     psnr_tissue_db: float | None
-    """Mean tissue PSNR of the predictions. Of a live run: after the first second, of every fourth (GPU) or eighth (CPU) picture."""
+    """Mean tissue PSNR of the predictions. In a live run: after the first second, of every fourth
+    (GPU) or eighth (CPU) picture."""
     previous_frame_db: float | None
-    """Mean tissue PSNR of the previous raw frame over the same frames: the trivial prediction."""
+    """Trivial baseline: mean tissue PSNR of the previous raw frame over the same frames."""
     frames: Count
 
 
 class BaselineQuality(Part):
-    """Tissue PSNR of doing nothing, on the same recording."""
+    """Tissue PSNR of trivial baselines on the same recording."""
 
     previous_frame_db: float | None
-    """The raw frame before, shown for every frame from the second on."""
+    """Previous raw frame, from the second frame on."""
     train_mean_db: float | None
-    """The mean of all training frames, shown for every held-out frame."""
+    """Mean of all training frames, for every held-out frame."""
     heldout_previous_frame_db: float | None = None
     heldout_neighbour_mean_db: float | None = None
-    """Mean of the frames before and after; it sees the future."""
+    """Mean of the previous and next frame; uses the future."""
 
 
 class DepthErrors(Part):
-    """Root mean squared error of depth over the median true depth, of all compared pixels."""
+    """Root mean squared depth error over the median true depth, of all compared pixels."""
 
     reconstruction: float
     level_plane: float
-    """Each frame's median true depth, shown everywhere: a trivial baseline that knows the truth."""
+    """Baseline with ground truth: each frame's median true depth everywhere."""
     best_plane: float
-    """Each frame's best tilted plane: a trivial baseline that knows the truth."""
+    """Baseline with ground truth: each frame's best tilted plane."""
     frames: Count
 
 
 class TruthFacts(Part):
-    """What the camera does not show, against the truth of a synthetic recording."""
+    """Scores of content hidden from the camera, against the ground truth of a synthetic recording."""
 
     behind_tools_psnr_db: float | None
-    """Over pixels behind a tool whose place was seen before, against the picture through the tool."""
+    """Score over pixels behind a tool whose place was seen earlier, against the picture without the
+    tool."""
     last_seen_psnr_db: float | None
-    """Trivial baseline: each of these pixels as it was seen last."""
+    """Trivial baseline: each of these pixels as last seen."""
     inpainted_psnr_db: float | None
-    """Trivial baseline: the frame's own picture, filled in from around the tool."""
+    """Trivial baseline: the frame's own picture, inpainted from the tool's surroundings."""
     frames: Count
-    """Frames that were scored behind their tools."""
+    """Number of frames scored behind their tools."""
     depth: DepthErrors | None
-    """Of tissue that the camera shows."""
+    """Errors over tissue visible to the camera."""
     depth_behind_tools: DepthErrors | None
-    """Of tissue behind tools that was seen before."""
+    """Errors over tissue behind tools that was seen earlier."""
 
 
 class QualityReport(Part):
     live: Quality | None
-    """Training error: each displayed frame right after the model was trained on it. Null for an offline reconstruction."""
+    """Training error: each displayed frame right after training on it. Null for an offline
+    reconstruction."""
     next_frame: NextFrameQuality | None = None
-    """The figure that is no training error. Null for an offline reconstruction, and in reports of earlier versions."""
+    """Prediction score, which is no training error. Null for an offline reconstruction and in older
+    reports."""
     heldout: Quality | None
-    """Frames that were never trained on; null without `--heldout`."""
+    """Scores of frames without training; null without `--heldout`."""
     baselines: BaselineQuality
     truth: TruthFacts | None = None
-    """Null where the recording does not know what is behind its tools."""
+    """Null if the recording has no ground truth behind its tools."""
     training: Quality | None = None
-    """Training error of an offline reconstruction: training frames after all of the training. Null for a replay."""
+    """Training error of an offline reconstruction: training frames after all training. Null for a
+    replay."""
 
 
 class ModelFacts(Part):
@@ -174,74 +182,77 @@ class ModelFacts(Part):
 
 
 class LiveFacts(Part):
-    """What a live run kept up with, and how old its pictures were."""
+    """Throughput and picture ages of a live run."""
 
     settled_psnr_tissue_db: float | None
-    """Training error: mean after the first second, of what was on the screen when the next frame arrived."""
+    """Training error: mean after the first second, of the displayed picture when the next frame
+    arrived."""
     worst_psnr_tissue_db: float | None
-    """The lowest of these."""
+    """Lowest of these values."""
     previous_frame_db: float | None
-    """Mean after the first second of the raw frame before, shown instead."""
+    """Baseline: mean after the first second of the previous raw frame."""
     pictures: Count
-    """New pictures that were shown."""
+    """Number of new pictures displayed."""
     age_p50_ms: float
-    """From a frame's arrival to its picture."""
+    """Time from a frame's arrival to its picture."""
     age_p95_ms: float
     age_p99_ms: float
     age_max_ms: float
     first_picture_ms: float | None
     states: dict[str, Count]
-    """How often what was shown went over into each state."""
+    """Number of transitions into each display state."""
     dropped: dict[str, Count]
-    """Frames, pictures and figures that gave way to newer ones, by the edge of the graph, or the operator, where they did."""
+    """Frames, pictures and figures replaced by newer ones, by edge of the graph or operator."""
     withheld: dict[str, Count]
-    """Frames that were shown and not trained on, by reason."""
+    """Frames displayed without training, by reason."""
     scenes: dict[str, Count]
-    """How often a new scene began, by reason."""
+    """Number of scene changes, by reason."""
     analysis: dict[str, dict[str, Count]] = {}
-    """What was found on frames before they were learned from: by stage and reason."""
+    """Findings of the frame analysis before training, by stage and reason."""
     frames_trained: Count
     steps: Count
-    """Optimiser steps on the newest frame, before it was shown."""
+    """Optimiser steps on the newest frame, before its display."""
     rehearsed_steps: Count
     """Optimiser steps on earlier frames."""
     unscored: Count
     not_on_screen: Count
-    """Frames whose own picture was not on the screen when the next frame arrived."""
+    """Frames whose own picture was not displayed when the next frame arrived."""
 
 
 class FrameEntry(Part):
-    """One displayed frame."""
+    """Scores of one displayed frame."""
 
     seq: Count
     time_s: float
     trained: bool
     model_version: Count
     psnr_tissue_db: float | None
-    """Of the displayed picture; a training error where the frame was `trained` on."""
+    """Score of the displayed picture; a training error if the frame was `trained` on."""
     psnr_frame_db: float | None
     ssim: float | None
     previous_frame_db: float | None
-    """Of the previous raw frame, shown instead."""
+    """Baseline: previous raw frame."""
     next_frame_db: float | None = None
-    """Of the picture that the model gave of this frame before it was trained on it; null where there is none."""
+    """Score of the model's prediction of this frame before training on it; null without a
+    prediction."""
     age_ms: float | None = None
-    """Live: age of what was on the screen, when it came there."""
+    """Live runs: age of the displayed picture at display."""
     steps: Count | None = None
-    """Live: optimiser steps before the picture was shown."""
+    """Live runs: optimiser steps before the display."""
 
 
 class BinEntry(FrameEntry):
-    """Several displayed frames of a long run, summed up: `seq`, `time_s` and `model_version` of the first of them, means of the measures."""
+    """Summary of several displayed frames of a long run: `seq`, `time_s` and `model_version` of the
+    first, means of the measures."""
 
     frames: Count
-    """How many frames are summed up."""
+    """Number of summarised frames."""
     psnr_tissue_min_db: float | None
-    """The worst of them."""
+    """Lowest of their values."""
 
 
 class RunReport(Part):
-    """Everything `report.json` holds."""
+    """Content of `report.json`."""
 
     format_version: Literal[1] = 1
     notice: str = NOTICE
@@ -252,27 +263,32 @@ class RunReport(Part):
     operators: dict[str, OperatorTimes]
     quality: QualityReport
     model: ModelFacts | None
-    """Null when the run ended before the first snapshot."""
+    """Null if the run ended before the first snapshot."""
     live: LiveFacts | None = None
-    """Null for a run that follows no clock."""
+    """Null for runs without a clock."""
     frames_sha256: Sha256
     notes: list[str] = []
-    """Stated fallbacks and what went wrong, in sentences."""
+    """Sentences about fallbacks and problems."""
     outputs: dict[str, str] = {}
-    """What was written, as paths relative to the report."""
+    """Written files, as paths relative to the report."""
     latency_quantiles_ms: dict[str, list[float]] = {}
-    """Per path, the latency distribution at 101 equally spaced quantiles, 0 to 1."""
+    """Latency distribution per path at 101 equally spaced quantiles, 0 to 1."""
     series: list[FrameEntry | BinEntry] = []
-    """One entry for each displayed frame; of a run of more than 4096 frames, one for each `series_frames_per_entry` of them. All frames are
-    in `frames.jsonl`."""
+    """One entry per displayed frame. Above 4096 frames, one per `series_frames_per_entry` frames.
+    `frames.jsonl` has all frames."""
     series_frames_per_entry: Annotated[int, Field(ge=1)] = 1
 
     def write(self, path: Path) -> None:
-        """Write JSON; the file is whole or not there."""
+        """Write JSON atomically."""
         text = json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False)
         write_whole(path, (text + "\n").encode())
 
     @classmethod
     def read(cls, path: Path) -> RunReport:
-        """Read a report back. Raises pydantic.ValidationError where it does not fit, OSError for anything but a plain file of at most MOST_REPORT_BYTES."""
+        """Read a report.
+
+        Raises:
+            pydantic.ValidationError: if the content does not match the schema.
+            OSError: if the path is no regular file of at most MOST_REPORT_BYTES.
+        """
         return cls.model_validate_json(read_regular(path, MOST_REPORT_BYTES))

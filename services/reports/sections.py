@@ -1,4 +1,4 @@
-"""The parts of `report.html`, each a function from the report to a piece of the page."""
+"""Sections of `report.html`; each function renders one section."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _tile(name: str, value: str, unit: str, more: str) -> str:
 
 
 def against(psnr_db: float | None, baseline_db: float | None) -> str:
-    """Return HTML that states the gain over the previous frame, and what that frame scores."""
+    """Return HTML with the gain over the previous frame, and the previous frame's score."""
     if psnr_db is None or baseline_db is None:
         return "no baseline"
     gain = psnr_db - baseline_db
@@ -28,7 +28,7 @@ def against(psnr_db: float | None, baseline_db: float | None) -> str:
 
 
 def _quality_tiles(report: RunReport) -> list[str]:
-    """Return the tiles of the quality that this run is about. A training error never stands alone."""
+    """Return the tiles of the run's main quality scores. A training error is never the only score."""
     quality, baselines = report.quality, report.quality.baselines
     tiles = []
     if (next_frame := quality.next_frame) is not None:
@@ -38,14 +38,15 @@ def _quality_tiles(report: RunReport) -> list[str]:
     if (heldout := quality.heldout) is not None:
         more = against(heldout.psnr_tissue_db, baselines.heldout_previous_frame_db)
         tiles.append(_tile("Held-out frames", _decibels(heldout.psnr_tissue_db), "dB", more))
-    if (live := quality.live) is not None and report.live is None:  # a live run has a tile without the first second
+    # a live run has its own tile, without the first second
+    if (live := quality.live) is not None and report.live is None:
         more = f"training error; {against(live.psnr_tissue_db, baselines.previous_frame_db)}"
         tiles.append(_tile("Displayed frame", _decibels(live.psnr_tissue_db), "dB", more))
     return tiles
 
 
 def tiles_section(report: RunReport) -> str:
-    """Return the figures that come first."""
+    """Return the tiles with the main figures."""
     frames, wall = report.frames, report.run.wall_s
     rate = frames.displayed / wall if wall else 0.0
     damaged = f", {frames.damaged:,} damaged" if frames.damaged else ""
@@ -58,7 +59,7 @@ def tiles_section(report: RunReport) -> str:
             f"{frames.dropped:,} dropped{damaged}",
         ),
     ]
-    if report.latency_ms and report.live is None:  # of a live run the age of what is shown says it
+    if report.latency_ms and report.live is None:  # a live run states the age of its pictures in place of the latency
         path = _display_path(report)
         latency = report.latency_ms[path]
         tiles.append(
@@ -83,12 +84,12 @@ def tiles_section(report: RunReport) -> str:
 
 
 def _display_path(report: RunReport) -> str:
-    """The path that ends where frames are shown."""
+    """Return the path that ends at the display."""
     return next((path for path in report.latency_ms if path.endswith("video")), next(iter(report.latency_ms)))
 
 
 def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | None, report: RunReport) -> str:
-    """Raw, reconstruction, error and depth of a few frames."""
+    """Return raw picture, reconstruction, error and depth of the keyframes."""
     if not keyframes:
         return ""
     cells = ["".join(f'<div class="head">{name}</div>' for name in ("Raw", "Reconstruction", "Error", "Depth"))]
@@ -99,7 +100,8 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
         if seq == worst_seq:
             tags += '<span class="tag worst">lowest PSNR</span>'
         near_far = pictures.depth_range
-        # A recording without depth gives no scale: what the model has then is shape, not millimetres.
+        # Without recorded depth the scale is unknown: the model's depth is relative, not in
+        # millimetres.
         unit = " mm" if rendered.frame.depth_is_metric else ", scale not known"
         depth = f"depth {near_far[0]:.1f} to {near_far[1]:.1f}{unit}" if near_far else "no depth"
         cells.append(
@@ -133,7 +135,7 @@ def _finite(value: float, digits: int = 2) -> str:
 
 
 def quality_over_time_section(report: RunReport) -> str:
-    """Tissue PSNR of each frame, with the previous-frame baseline drawn in."""
+    """Return the chart of tissue PSNR per frame, with the previous-frame baseline."""
     trained = [entry for entry in report.series if entry.trained]
     held_out = [entry for entry in report.series if not entry.trained]
     if not report.series:
@@ -192,12 +194,13 @@ def quality_over_time_section(report: RunReport) -> str:
 
 
 def _is_sampled(report: RunReport) -> bool:
-    """Return True where only some of the frames are predicted: points are drawn for them, and no line between."""
+    """Return True if only some frames are predicted; their scores are drawn as points without a
+    line."""
     return report.live is not None
 
 
 def baselines_section(report: RunReport) -> str:
-    """The reconstruction beside what doing nothing scores."""
+    """Return the table of the reconstruction's scores and the trivial baselines."""
     quality, baselines = report.quality, report.quality.baselines
     rows: list[tuple[str, float | None, bool]] = []
     if quality.live is not None:
@@ -258,7 +261,7 @@ def baselines_section(report: RunReport) -> str:
 
 
 def _longest_paths(report: RunReport) -> dict[str, str]:
-    """For each operator at which frames end, the longest of the paths from the source to it; `report.json` has the others."""
+    """Return the longest path from the source to each leaf operator; `report.json` has all paths."""
     longest: dict[str, str] = {}
     for path in report.latency_ms:
         end = path.rsplit(",", 1)[-1]
@@ -268,7 +271,7 @@ def _longest_paths(report: RunReport) -> dict[str, str]:
 
 
 def latency_section(report: RunReport) -> str:
-    """How long frames take from the source to where they end."""
+    """Return the latency distribution from the source to each leaf operator."""
     paths = _longest_paths(report)
     if not paths:
         return ""
@@ -302,7 +305,7 @@ def latency_section(report: RunReport) -> str:
 
 
 def operators_section(report: RunReport) -> str:
-    """How long each operator takes."""
+    """Return the table of operator run times."""
     if not report.operators:
         return ""
     rows = "".join(
@@ -316,7 +319,7 @@ def operators_section(report: RunReport) -> str:
 
 
 def facts_section(report: RunReport) -> str:
-    """What was run, on what."""
+    """Return the facts about recording, settings, model and machine."""
     recording, run, model = report.recording, report.run, report.model
     length = "a stream without an end" if recording.frames is None else f"{recording.frames} frames"
     facts = {
@@ -340,7 +343,7 @@ def facts_section(report: RunReport) -> str:
 
 
 def notes_section(report: RunReport) -> str:
-    """Stated fallbacks."""
+    """Return the notes, which state fallbacks."""
     if not report.notes:
         return ""
     items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)

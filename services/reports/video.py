@@ -1,4 +1,4 @@
-"""The part of `report.html` that plays the run's video, which lies beside the page."""
+"""Section of `report.html` that plays the run's video from a file next to the page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from services.reports.schema import RunReport
 
 
 def video_section(report: RunReport) -> str:
-    """A player for the video; nothing where the run has written none."""
+    """Return a video player; empty if the run wrote no video."""
     name = report.outputs.get("video")
     if name is None:
         return ""
