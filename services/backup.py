@@ -1,8 +1,9 @@
-"""Backups of all that the service keeps: made beside the running service, checked as a whole, restored into empty folders only.
+"""Backup of the service's data: made while the service runs, checked completely, restored only into
+empty folders.
 
 BACKUP/
-  backup.json                          what is in it: size and SHA-256 of each file, and what is not in it
-  data/registry/registry.sqlite        by SQLite's own backup, so that it is of one moment
+  backup.json                          manifest: size and SHA-256 of each file, and data not included
+  data/registry/registry.sqlite        copied by SQLite's backup API, so it is consistent
   data/registry/blobs/  data/recordings/  data/replays/  data/snapshots/
   data/audit.*  data/keys.json  data/keys.used.json  data/admin.key
 """

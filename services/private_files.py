@@ -63,7 +63,11 @@ def _is_ours(name: str) -> bool:
 
 
 def _close(folder: Path, is_ours: Callable[[], bool]) -> bool:
-    """Close a folder of the service to other users. Returns whether it was open."""
+    """Remove the access of other users to a service folder.
+
+    Returns:
+        True if other users had access.
+    """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.stat()
@@ -96,7 +100,11 @@ def _close(folder: Path, is_ours: Callable[[], bool]) -> bool:
 
 
 def _tighten(path: Path) -> bool:
-    """Take the rights of others from a file that is ours. Returns whether there were any."""
+    """Remove the permissions of group and others from a file of this user.
+
+    Returns:
+        True if there were any.
+    """
     try:
         found = path.lstat()
         if found.st_uid != os.geteuid() or stat.S_ISLNK(found.st_mode) or not found.st_mode & OTHERS:

@@ -1,4 +1,4 @@
-"""Which version of the product this is."""
+"""Version of the product."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def product_version() -> str:
-    """The installed version; `0+source` when run from a tree that was not installed."""
+    """Return the installed version, or `0+source` in a source tree without installation."""
     try:
         return version("intrasplat")
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""The audit log: who did what, in lines that each hold the digest of the one before.
+"""Audit log of the service's changes. Each line contains the digest of the previous line.
 
 AuditError
 ├── AuditInUse (UserError)        another process writes this log

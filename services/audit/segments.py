@@ -1,11 +1,12 @@
-"""The log's older lines: closed segments, files beside it that are named for the number of their first entry and never written again.
+"""Closed segments of the log. Each is named after the number of its first entry and never written
+again.
 
-    audit.jsonl                  what is written now
+    audit.jsonl                  current file
     audit.000000000000.jsonl     entries 0 to 41,999, closed
-    audit.000000042000.jsonl     entries 42,000 to …
-    audit.anchor                 where old segments were removed: the last entry of the last of them
+    audit.000000042000.jsonl     entries 42,000 to …, closed
+    audit.anchor                 last entry of the last deleted segment
 
-The chain of digests goes on from one file to the next, and from the anchor to the first entry that is kept.
+The chain of digests continues from file to file, and from the anchor to the first kept entry.
 """
 
 from __future__ import annotations

@@ -129,7 +129,11 @@ def _refusal(why: str) -> bytes:
 
 
 def text_of(arguments: Mapping[str, Any], name: str) -> str:
-    """An argument that is a text. Raises BadMessage."""
+    """Return a text argument.
+
+    Raises:
+        BadMessage: if the argument is missing, empty or no text.
+    """
     value = arguments.get(name)
     if not isinstance(value, str) or not value:
         raise BadMessage(f"{name} is {value!r:.60}; it must be a text")

@@ -1,4 +1,4 @@
-"""Durations counted in buckets that are multiples of the time between frames, small enough to be told with a heartbeat."""
+"""Duration histograms with buckets at multiples of the frame interval, small enough for heartbeats."""
 
 from __future__ import annotations
 
@@ -7,28 +7,32 @@ from collections.abc import Mapping
 from typing import Any
 
 BOUNDS_S = (0.001, 0.0025, 0.005, 0.0083, 0.0167, 0.025, 0.0333, 0.05, 0.0667, 0.1, 0.15, 0.25, 0.5, 1.0, 5.0)
-"""Upper bounds: 8.3, 16.7, 33.3, 50 and 66.7 ms are one and two frames at 120, 60 and 30 frames/s. What takes longer is counted, too."""
+"""Upper bounds in seconds: 8.3, 16.7, 33.3, 50 and 66.7 ms are one and two frames at 120, 60 and 30
+frames/s. Longer durations have their own bucket."""
 
 
 class Durations:
-    """Counts of one kind of duration. One thread adds; another one may read what is at most one behind."""
+    """Histogram of one kind of duration. One thread adds; another thread may read counts that lag
+    by at most one."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
         self._sum_s = 0.0
 
     def add(self, duration_s: float) -> None:
-        """Count one."""
+        """Count one duration."""
         self._counts[bisect_left(BOUNDS_S, duration_s)] += 1
         self._sum_s += duration_s
 
     def told(self) -> dict[str, Any]:
-        """As JSON: the count of each bucket, the last one without a bound, and the sum."""
+        """Return the JSON form: the count of each bucket, the last without an upper bound, and the
+        sum."""
         return {"counts": list(self._counts), "sum_s": round(self._sum_s, 6)}
 
 
 def cumulative(told: Any) -> tuple[list[tuple[str, float]], float] | None:
-    """What a heartbeat tells of durations as Prometheus' buckets and their sum; None for what is none."""
+    """Convert the durations of a heartbeat to Prometheus buckets and their sum; None for malformed
+    values."""
     counts = told.get("counts") if isinstance(told, Mapping) else None
     sum_s = told.get("sum_s") if isinstance(told, Mapping) else None
     whole = (

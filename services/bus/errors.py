@@ -1,11 +1,11 @@
-"""Errors of the bus. Each says what happened, the value that was seen, and what to do.
+"""Errors of the bus. Each message states what happened, the value, and the remedy.
 
 BusError
-├── RuntimeFolderUnusable (UserError)   the folder of sockets is somebody else's, open to others, or its path is too long
-├── AlreadyRunning (UserError)          another process serves this part of the stream
-├── BadMessage                          what came over a socket is not what it should be
+├── RuntimeFolderUnusable (UserError)   the folder has another owner, is accessible to others, or its path is too long
+├── AlreadyRunning (UserError)          another process serves this role of the stream
+├── BadMessage                          a message on a socket is malformed
 ├── NoAnswer                            a process did not answer a command in time
-└── CommandRefused                      a process answered that it will not
+└── CommandRefused                      a process refused a command
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from gsplat_core.errors import UserError
 
 
 class BusError(Exception):
-    """Base of everything the bus raises on purpose."""
+    """Base class of the bus errors."""
 
 
 class RuntimeFolderUnusable(BusError, UserError):
-    """The folder of sockets is somebody else's, open to others, or its path is too long."""
+    """The runtime folder has another owner, is accessible to other users, or its path is too long."""
 
 
 class AlreadyRunning(BusError, UserError):
-    """Another process serves this part of the stream."""
+    """Another process serves this role of the stream."""
 
 
 class BadMessage(BusError):
-    """What came over a socket is not what it should be."""
+    """A message on a socket is malformed."""
 
 
 class NoAnswer(BusError):
@@ -34,4 +34,4 @@ class NoAnswer(BusError):
 
 
 class CommandRefused(BusError):
-    """A process answered that it will not do it; the text is its reason."""
+    """A process refused a command. The message is its reason."""

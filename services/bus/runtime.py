@@ -1,15 +1,17 @@
-"""The runtime folder: sockets, and who serves them. Only its owner may look into it.
+"""Runtime folder: sockets of the stream processes, and records of the processes. Only its owner has
+access.
 
     RUNTIME/                     0700
       launcher, launcher.json    (`services.supervisor.launcher`)
       STREAM/                    0700
-        capture.json  capture.spec  capture.log  capture.lock    engine.…  the same
-        engine.show                                 the model that is shown in place of the live reconstruction
+        capture.json  capture.spec  capture.log  capture.lock    and the same for the engine
+        engine.show                                 finished model displayed in place of the live reconstruction
+        engine.size                                 measured working size of the engine
         raw   capture.status   capture.ctl          sockets of the capture process
         shown engine.status    engine.ctl           sockets of the engine process
-        depth confidence orbit                      further pictures of the engine process
+        depth confidence orbit                      additional pictures of the engine process
 
-A file of a process that has ended is recognised by the process's number *and* its start, and removed.
+Files of ended processes are recognised by process id *and* start time, and deleted.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Errors of the client.
 
 ClientError (UserError)
-├── Unreachable   no server answers there, or it broke off
-└── Refused       the server said no; `status` and its own sentence
+├── Unreachable   no server answers at the address, or the connection broke
+└── Refused       the server refused the request; `status` and the server's message
 """
 
 from __future__ import annotations

@@ -1,22 +1,23 @@
-"""Errors of the API, each with its HTTP status; every answer that is no success is one of them (RFC 9457, application/problem+json).
+"""Errors of the API with their HTTP status. Every answer without success is a problem document (RFC
+9457, application/problem+json).
 
 Problem
-├── BadRequest            400  the request makes no sense
-├── Unauthenticated       401  no key, or none that is known
-├── Forbidden             403  the key's role does not allow it
-├── Missing               404  there is no such thing
-├── WrongMethod           405  not with this method
-├── TooSlow               408  the body does not come
-├── Conflicting           409  it is not in the state that this needs
-├── TooLarge              413  the body is longer than it may be
-├── WrongContent          415  the body is of another type
-├── Misdirected           421  for another server than this one
-├── Unprocessable         422  understood, and refused for what it says
-├── TooManyRequests       429  later
-├── HeadTooLarge          431  the head of the request is longer than it may be
-├── Internal              500  a bug of ours: the log has it, the answer has not
-├── Unavailable           503  not now
-│   └── NotBuiltIn        503  this server was put together without that part
+├── BadRequest            400  the request is malformed
+├── Unauthenticated       401  the key is missing or unknown
+├── Forbidden             403  the key's role does not permit the operation
+├── Missing               404  the resource does not exist
+├── WrongMethod           405  the path does not support the method
+├── TooSlow               408  the body arrives too slowly
+├── Conflicting           409  the resource is not in the required state
+├── TooLarge              413  the body exceeds the size limit
+├── WrongContent          415  the body has an unsupported content type
+├── Misdirected           421  the Host header names another server
+├── Unprocessable         422  the content was refused
+├── TooManyRequests       429  a rate or concurrency limit is exceeded
+├── HeadTooLarge          431  the request head exceeds the size limit
+├── Internal              500  a bug; the log has the details
+├── Unavailable           503  temporarily unavailable
+│   └── NotBuiltIn        503  the server runs without the required part
 └── NoSpace               507  the disk is full
 """
 

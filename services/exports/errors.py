@@ -1,10 +1,10 @@
 """Errors of exports.
 
 ExportsError (UserError)
-├── ExportRefused   the model cannot be had like that, in one sentence
-├── ExportBusy      as many exports wait as may
-├── ExportFailed    the program that makes it has failed, or the disk
-└── NoSnapshot      there is no such snapshot
+├── ExportRefused   the model cannot be exported to the format
+├── ExportBusy      too many exports are waiting
+├── ExportFailed    the export program or the disk failed
+└── NoSnapshot      the snapshot does not exist
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Results of jobs on the disk: made aside, and put in their place whole, once.
+"""Result folders of jobs: created in a working folder and published by one rename.
 
-RESULTS/FOLDER/            the result of a job
-RESULTS/.running/POOL/     what one pool is making; `lock` is held while it lives
+RESULTS/FOLDER/            result of a job
+RESULTS/.running/POOL/     working folder of a pool; `lock` is held while the pool runs
   ID-ATTEMPT/              one attempt: `out/`, `progress.json`, `outcome.json`, `log`
 """
 

@@ -1,14 +1,15 @@
-"""Errors of the registry, and of the recordings and jobs that are kept beside it. Each says what happened, the value that was seen, and what to do.
+"""Errors of the registry, also used by recordings and jobs. Each message states what happened, the
+value, and the remedy.
 
 RegistryError (UserError)
-├── NotFound                    there is no such model, version, recording or job
-├── Conflict                    somebody else was first, or the version is not in a state that allows this
-│   └── StillActive             the active version is never deleted
-├── Rejected                    an upload is not what it has to be; nothing was kept
-└── StoreUnavailable            database or files cannot be used now; nothing was changed
-    ├── SchemaTooNew            the database belongs to a later version of this program
-    ├── BlobDamaged             the stored file of a version is gone or changed
-    └── CheckFailed             the check of a version could not be run, whatever the version is like
+├── NotFound                    the model, version, recording or job does not exist
+├── Conflict                    a concurrent change was first, or the state does not permit the operation
+│   └── StillActive             the active version cannot be deleted
+├── Rejected                    an upload is invalid; nothing was stored
+└── StoreUnavailable            database or file storage is unavailable; nothing was changed
+    ├── SchemaTooNew            a later version of this program wrote the database
+    ├── BlobDamaged             the stored file of a version is missing or altered
+    └── CheckFailed             the check of a version could not run; the version itself may be valid
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The history of the jobs' schema (Alembic)."""
+"""Schema history of the jobs (Alembic)."""

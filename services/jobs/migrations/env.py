@@ -1,4 +1,5 @@
-"""What Alembic runs for every migration: on the connection, and in the transaction, that `Database.migrate` gives it."""
+"""Alembic environment. Runs migrations on the connection and in the transaction of
+`Database.migrate`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The history of the registry's schema (Alembic)."""
+"""Schema history of the registry (Alembic)."""

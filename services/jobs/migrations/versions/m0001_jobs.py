@@ -1,4 +1,4 @@
-"""Jobs, and the idempotency keys that they were submitted under."""
+"""Initial tables of jobs and of submissions with their idempotency keys."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make the two tables."""
+    """Create the two tables."""
     op.create_table(
         "jobs",
         sa.Column("number", sa.Integer, nullable=False, autoincrement=True),
@@ -52,6 +52,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Remove them, with everything that is known of the jobs."""
+    """Drop the tables with all records of jobs."""
     for table in ("submissions", "jobs"):
         op.drop_table(table)

@@ -1,4 +1,4 @@
-"""PSNR of the previous frame and of the next-frame prediction, next to the training error of a job's newest displayed frame."""
+"""Columns for the PSNR of the previous frame and of the next-frame prediction."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""One file for each change of the schema, the oldest number first."""
+"""Migrations, one file per schema change, in ascending order."""

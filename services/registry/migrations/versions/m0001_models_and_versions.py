@@ -1,4 +1,4 @@
-"""Models, their versions, and which of them were active."""
+"""Initial tables of models, versions and activations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make the three tables."""
+    """Create the three tables."""
     op.create_table(
         "models",
         sa.Column("name", sa.String(64), nullable=False),
@@ -51,6 +51,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Remove them, with everything that the registry knows."""
+    """Drop the tables with all records of the registry."""
     for table in ("activations", "versions", "models"):
         op.drop_table(table)
