@@ -74,7 +74,7 @@ def _close(folder: Path, is_ours: Callable[[], bool]) -> bool:
         mode = f"{stat.S_IMODE(found.st_mode):04o}"
         if found.st_uid == 0 != os.geteuid() and os.access(
             folder, os.W_OK
-        ):  # a volume of Kubernetes: its group is the service's
+        ):  # Kubernetes volume: its group is the service's group
             if found.st_mode & 0o007:
                 log.warning("%s belongs to root and is open to every user of this machine (mode %s)", folder, mode)
             return False
@@ -110,7 +110,7 @@ def _tighten(path: Path) -> bool:
         if found.st_uid != os.geteuid() or stat.S_ISLNK(found.st_mode) or not found.st_mode & OTHERS:
             return False
         path.chmod(stat.S_IMODE(found.st_mode) & ~OTHERS)
-    except FileNotFoundError:  # removed meanwhile
+    except FileNotFoundError:  # deleted by another process
         return False
     except OSError as error:
         log.warning("%s can be read by other users, and its rights cannot be changed: %s", path, error.strerror)

@@ -202,7 +202,7 @@ class AuditLog:
                 write_anchor(self.path, Head(last.seq, digest))
             anchor = read_anchor(self.path)
             gone = [each for each in all_segments(self.path) if anchor is not None and each.first_seq <= anchor.seq]
-            for each in gone:  # those of a service too that was killed here
+            for each in gone:  # includes segments whose removal was interrupted by a kill
                 each.path.unlink()
             if gone:
                 sync_folder(self.path.parent)

@@ -89,7 +89,7 @@ def search(log: Path, wanted: Wanted, count: int, before: int | None = None) -> 
         older = [each.path for each in reversed(closed) if before is None or each.first_seq < before]
         try:
             found = _search([*([log] if log.exists() else []), *older], wanted, count, before)
-        except FileNotFoundError:  # closed or removed just now
+        except FileNotFoundError:  # closed or removed a moment ago
             continue
         # otherwise a segment was closed or removed meanwhile, and entries may be missing
         if closed == closed_segments(log):
@@ -129,7 +129,7 @@ def exported(log: Path, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
         for file in _opened(log, opened):
             for line in file:
                 if not line.endswith(b"\n"):
-                    break  # being written
+                    break  # this line is still being written
                 values = json.loads(line)
                 if wanted.fits(values):
                     piece += line if form == "jsonl" else _csv_line(values)

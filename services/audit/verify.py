@@ -98,7 +98,8 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
     """
     for _ in range(MOST_READINGS):
         try:
-            kept, anchor = read_head(path), read_anchor(path)  # first: the service may be writing
+            # read before the lines, because the service may be writing
+            kept, anchor = read_head(path), read_anchor(path)
             closed = closed_segments(path)
         except ValueError as error:
             said = f"the head or the anchor beside the log cannot be read: {error}"

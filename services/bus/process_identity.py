@@ -71,7 +71,7 @@ class ProcessIdentity:
         except ProcessLookupError:
             return True
         loop, over = asyncio.get_running_loop(), asyncio.Event()
-        loop.add_reader(handle, over.set)  # readable from the end of the process on
+        loop.add_reader(handle, over.set)  # the pidfd becomes readable when the process ends
         try:
             if self.is_alive:
                 await asyncio.wait_for(over.wait(), timeout_s)

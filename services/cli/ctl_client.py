@@ -41,7 +41,7 @@ def with_client(url: str, key_file: Path | None, ca: Path | None, act: Callable[
     with Client(url, _key(key_file), verify=str(ca) if ca else True) as client:
         try:
             return act(client)
-        except (ValidationError, KeyError) as error:  # JSON, and not what the API answers
+        except (ValidationError, KeyError) as error:  # valid JSON, but no answer of the API
             raise not_from_us(url, "is not what this command asked for") from error
 
 

@@ -60,7 +60,7 @@ class InterruptRequest:
         self._wakeup_before = signal.set_wakeup_fd(self._sender, warn_on_full_buffer=False)
         for number in ASKING:
             if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
-                continue  # nohup: the run is to outlive its terminal
+                continue  # nohup: the run must outlive its terminal
             self._before[number] = signal.signal(number, self._handle)
         threading.Thread(target=_acknowledge, args=(receiver,), name="signals", daemon=True).start()
         return self
@@ -107,5 +107,5 @@ def _end_after(ended: threading.Event) -> None:
 
 def _say(text: str) -> None:
     """Write a line to stderr from any thread, bypassing buffers."""
-    with contextlib.suppress(OSError):  # the terminal is gone
+    with contextlib.suppress(OSError):  # the terminal is closed
         os.write(2, f"{text}\n".encode())

@@ -60,7 +60,7 @@ class LiveStatus:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._terminal and self._written:
-            print(file=sys.stderr)  # noqa: T201 - leaves the renewed line
+            print(file=sys.stderr)  # noqa: T201 - ends the refreshed line
 
     def __call__(self, graph: LiveApplication, scored: ScoredFrame) -> None:
         """Process one scored frame."""
@@ -138,7 +138,7 @@ def recording_kept(texts: Sequence[str]) -> WriterOptions:
         options,
         keep_bytes=None if size is None else int(size),
         keep_s=age_s,
-        # What goes at once is a whole segment.
+        # Recordings are deleted by whole segments.
         segment_bytes=options.segment_bytes if size is None else min(options.segment_bytes, int(size / 8)),
         segment_s=options.segment_s if age_s is None else min(options.segment_s, age_s / 8),
         with_earlier=bool(bounds),

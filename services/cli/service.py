@@ -28,7 +28,7 @@ def add_to(app: typer.Typer) -> None:
     app.command()(view)
     app.add_typer(keys, name="keys")
     app.add_typer(audit, name="audit")
-    assert ctl_models.ctl is ctl  # it has added its commands
+    assert ctl_models.ctl is ctl  # importing ctl_models has added its commands to ctl
     app.add_typer(ctl, name="ctl")
 
 

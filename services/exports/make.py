@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--times", type=int)
     given = parser.parse_args(arguments)
     os.nice(NICENESS)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file with a patient's model in it
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a core file would contain patient data
     try:
         if given.format == ISPLAT.name:
             pack(given.folder, given.file)

@@ -91,7 +91,7 @@ class SnapshotStore:
         folder = self._folder / stream
         found = []
         for name in os.listdir(folder) if folder.is_dir() else ():
-            with suppress(NoSnapshot):  # deleted meanwhile
+            with suppress(NoSnapshot):  # deleted by a concurrent request
                 found.append(self.get(stream, name))
         return sorted(found, key=lambda each: (each.taken_at, each.id), reverse=True)
 

@@ -73,7 +73,8 @@ def assembled(settings: ServiceSettings) -> Parts:
 
     async def streams_are_well() -> CheckResult:
         unwell = [stream for stream in streams.now() if stream.state in ("failed", "source lost")]
-        said = "; ".join(f"{stream.name}: {stream.state}" for stream in unwell)  # asked without a key: no reasons
+        # without reasons, because /readyz needs no key
+        said = "; ".join(f"{stream.name}: {stream.state}" for stream in unwell)
         return CheckResult(not unwell, said or "no stream has failed or lost its source", needed=False)
 
     async def clock_is_right() -> CheckResult:

@@ -186,7 +186,7 @@ class KeyStore:
         if role is Role.PUBLIC:
             raise KeyConflict("no key has the role public; give viewer, operator or admin")
         if expires_at is not None:
-            expires_at = expires_at.replace(microsecond=0)  # as it is kept
+            expires_at = expires_at.replace(microsecond=0)  # stored with whole seconds
             if expires_at.tzinfo is None or expires_at <= datetime.now(UTC):
                 raise KeyConflict(
                     f"a key cannot expire at {expires_at.isoformat()}; give a time to come, with its zone"
@@ -290,7 +290,7 @@ class KeyStore:
             keys = dict(self._current())
             yield keys
             _write(self._path, keys)
-            with self._lock:  # what this process changes itself it knows
+            with self._lock:  # changes by this process itself are not reported
                 self._keys, self._read = keys, self._stamp()
 
 
