@@ -19,12 +19,10 @@ def main() -> None:
     end_on_interrupt()
     streams = StandardStreams()
     # Waiting threads of the C++ core must sleep, because spinning can slow down a render many times
-    # on a busy machine.
-    # The variable is read once, when torch is imported.
+    # on a busy machine. The variable is read once, when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # numpy's BLAS rounds differently with another number of threads. One thread makes results
-    # independent of the
-    # number of cores. The variable is read once, when numpy is imported.
+    # independent of the number of cores. The variable is read once, when numpy is imported.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     from services.cli.app import run
 

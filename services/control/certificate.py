@@ -143,7 +143,7 @@ def _loaded(certfile: Path, keyfile: Path) -> tuple[ssl.SSLContext, float]:
     """Load a chain and its key.
 
     Returns:
-        A TLS context, and the Unix time at which the first certificate of the chain expires.
+        A TLS context, and the earliest expiry in the chain as Unix time.
 
     Raises:
         OSError: if a file is missing or cannot be used.

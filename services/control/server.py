@@ -237,9 +237,8 @@ def bind(settings: ServiceSettings) -> socket.socket:
             f"cannot listen on {server.host} port {server.port}: {error.strerror}; give another server.host or server.port"
         ) from error
     # Accepted connections inherit these options. asyncio disables Nagle's algorithm only for
-    # sockets with an explicit
-    # protocol, which this one lacks: an answer's body would wait 40 ms for the acknowledgement of
-    # its head.
+    # sockets with an explicit protocol, which this one lacks. An answer's body would otherwise wait
+    # 40 ms for the acknowledgement of its head.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     # The kernel would buffer up to 4 MB per slow viewer, which is seconds of outdated pictures.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MOST_UNSENT_BYTES)
