@@ -1,4 +1,4 @@
-"""Whether replayed pictures are those that were shown, byte by byte."""
+"""Byte-wise comparison of replayed pictures with the pictures that a recorded session displayed."""
 
 from __future__ import annotations
 
@@ -17,25 +17,27 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class ShownComparison:
-    """Replayed pictures beside those that a session showed."""
+    """Counts of replayed pictures that match or differ from the recorded ones."""
 
     same: int
     """Pictures with the same SHA-256."""
     different: int
     first_different: int | None
-    """The frame of the first one that differs."""
+    """Sequence number of the first frame whose picture differs; None if all match."""
     not_shown: int
-    """Pictures of frames that the session passed over before it showed them."""
+    """Replayed pictures without a recorded counterpart: the session dropped their frames before
+    display.
+    """
 
 
 class CompareShownOp(Operator):
-    """Compares each picture's SHA-256 with the recorded one.
+    """Compares the SHA-256 of each replayed picture with the recorded one.
 
     Inputs:
-        rendered: `RenderedFrame`, in order.
+        rendered: `RenderedFrame`, in order of the sequence number.
 
     Params:
-        shown: the recorded pictures in order; called in `start()`.
+        shown: factory called in `start()`; yields the recorded pictures in order.
     """
 
     def __init__(self, fragment: Any, *args: Any, shown: Callable[[], Iterator[ShownLine]], **kwargs: Any) -> None:

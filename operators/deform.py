@@ -1,4 +1,4 @@
-"""The model at a moment: finds the time and the camera of a frame, and deforms the model to it."""
+"""Deformation of the model to a frame's timestamp, with the camera of that frame."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from operators.messages import DeformedScene, Reconstruction
 
 
 class DeformOp(Operator):
-    """Deforms the model to its frame's time and finds the camera that saw the frame.
+    """Deforms the model to its frame's timestamp and sets the camera to the frame's pose.
 
-    On a GPU the deformation is part of the renderer's captured graph, and nothing is computed here.
+    On a GPU the renderer's captured graph performs the deformation, so this operator only selects
+    the camera.
 
     Inputs:
         reconstruction: `Reconstruction`.
@@ -32,5 +33,5 @@ class DeformOp(Operator):
         camera = model.camera if frame.pose is None else model.camera.with_pose(frame.pose)
         if model.device.type == "cpu":
             with torch.inference_mode():
-                model.at(frame.time_s)  # a model remembers its last state, so the renderer finds it there
+                model.at(frame.time_s)  # caches the state inside the model; the renderer reuses it
         op_output.emit(DeformedScene(frame, model, camera, message.trained, message), "scene")

@@ -1,4 +1,4 @@
-"""How far away each pixel is: the depth that came with the frames, that which is found in them, or none."""
+"""Depth maps of frames: recorded with the stream, estimated from the frames, or absent."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class FoundDepth:
-    """Where the depth of a run's frames came from."""
+    """Origins and coverage of the depth maps of one run."""
 
     frames: Mapping[str, int]
-    """How many had depth of which origin (a value of `DepthOrigin`)."""
+    """Frames with depth, by origin (a value of `DepthOrigin`)."""
     known_share: float
-    """Share of the pixels whose depth is known, the mean over those frames."""
+    """Share of pixels with trusted depth, 0..1; mean over the frames that have depth."""
     metric: bool
-    """Whether its unit is known, in all of them."""
+    """True if the depth of every frame is in millimetres rather than relative."""
     doubts: Mapping[str, int]
-    """Why so many frames were given none though there was something to find it from, in sentences."""
+    """Number of frames for which depth estimation was attempted and rejected, by reason (a
+    sentence).
+    """
     passed_over: int = 0
-    """Frames in which none was looked for, because a newer one was there: live, where nothing waits for depth."""
+    """Frames dropped by live depth estimation because a newer frame arrived first."""
 
 
 class DepthCounts:
-    """Counts where the depth of a stream's frames comes from, and says so."""
+    """Running totals of the depth origins in a stream; the source of `FoundDepth`."""
 
     def __init__(self) -> None:
         self.passed_over = 0
-        """See `FoundDepth`."""
         self._frames: Counter[str] = Counter()
         self._known, self._relative, self._dropped = 0.0, 0, 0
 
@@ -52,7 +53,12 @@ class DepthCounts:
         return both
 
     def take(self, frame: Frame, given: Frame) -> None:
-        """A frame as it came, and with the depth that it goes on with."""
+        """Count one frame.
+
+        Args:
+            frame: the frame as it arrived, with its recorded depth if any.
+            given: the same frame with the depth that is passed on downstream.
+        """
         if given.depth is not None:
             origin = given.depth_origin or DepthOrigin.MEASURED
             self._frames[origin.value] += 1
@@ -62,7 +68,14 @@ class DepthCounts:
         self._dropped += given.depth is None and frame.depth is not None
 
     def contribute(self, outcome: OutcomeBuilder, choice: str, finder: DepthFinder | None) -> None:
-        """Add `FoundDepth`, and what is to be said. choice: the setting `depth`. finder: what found it."""
+        """Add `FoundDepth` and the notes on depth to the outcome.
+
+        Args:
+            outcome: the outcome of the run.
+            choice: the setting `depth`, quoted in the notes.
+            finder: the estimator, for its remarks and rejections; None if the run never started
+                one.
+        """
         total = sum(self._frames.values())
         doubts = finder.doubts.counted() if finder else {}
         share, metric = self._known / total if total else 0.0, self._relative == 0
@@ -82,20 +95,22 @@ class DepthCounts:
 
 
 class DepthOp(Operator):
-    """Gives each frame the depth that `choice` asks for; one that has none of it goes on without depth.
+    """Attaches to each frame the depth that `choice` selects. Frames without a result pass without
+    depth.
 
     Inputs:
         frame: `Frame`.
 
     Outputs:
-        frame: `Frame` with `depth`, `depth_confidence` and `depth_origin`, or with none of them.
+        frame: `Frame` with `depth`, `depth_confidence` and `depth_origin` set, or all three None.
 
     Params:
-        choice: `auto`, or what `check_depth` takes. Raises InvalidSetting for another one.
-        camera: that of the frames.
-        has_time: whether `auto` may ask what takes longer than a frame of a camera.
-        device: where an estimator works that need not work on the CPU.
-        held_out: frames of which nothing may be learned, not even about the depth of others.
+        choice: `auto` or another value accepted by `check_depth`. Raises InvalidSetting otherwise.
+        camera: camera of the frames.
+        has_time: allow `auto` to use estimators slower than the camera's frame rate.
+        device: device of estimators that are not limited to the CPU.
+        held_out: returns True for evaluation frames, which the estimator must not use to refine the
+            depth of other frames.
     """
 
     def __init__(
@@ -130,9 +145,13 @@ class DepthOp(Operator):
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
-    """Return a note for frames with these fields that are given no recorded depth, where there is time to find it; None where they keep it.
+    """Return a note for a run whose frames carry no usable recorded depth; None if the recorded
+    depth is used.
 
-    choice: the setting `depth`.
+    Args:
+        choice: the setting `depth`.
+        fields: names of the fields that the recording's frames have.
+        config: reconstruction settings; its `default_depth_mm` is quoted in the note.
     """
     if "depth" in fields and choice in ("auto", "recorded"):
         return None

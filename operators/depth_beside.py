@@ -1,4 +1,4 @@
-"""Depth beside a live stream: found for the newest frame whenever that is possible, and never waited for."""
+"""Depth estimation in a background thread during a live stream. The stream never waits for it."""
 
 from __future__ import annotations
 
@@ -17,24 +17,34 @@ from operators.outcome import OutcomeBuilder
 from operators.side_thread import step_back, usable_cores
 
 FEW_CORES = 4
-"""With so many cores or fewer training needs all of them ..."""
+"""Largest number of cores at which depth estimation is throttled, because training uses all of
+them.
+"""
 SHARE_OF_FEW = 0.25
-"""... and depth gets so much of the time of one."""
+"""Share of one core's time for depth estimation on a throttled machine."""
 KEEPS = ("auto", "recorded")
-"""Values of the setting `depth` with which a frame keeps the depth that it came with."""
+"""Values of the setting `depth` with which a frame keeps its recorded depth."""
 
 
 class DepthBeside:
-    """Finds depth in a thread of its own, which steps back behind the others. Whoever hands over a frame, or asks for what was found, never waits.
+    """Estimates depth in a background thread of lower priority. `offer` and `take` never block.
 
-    Of the frames that are handed over while it is at work the newest is next; the others are passed over and counted.
+    The thread has room for one pending frame. A newer frame replaces the pending one, which is
+    counted in `DepthCounts.passed_over`.
     """
 
     def __init__(self, choice: str, camera: Camera, *, share: float | None = None, device: str = "cpu") -> None:
-        """choice: the setting `depth`. camera: that of the frames. share: of one core's time, which it takes at most; None: as suits the machine. device:
-        where an estimator works that need not work on the CPU.
+        """Check the settings. The thread begins with `start`.
 
-        Raises InvalidSetting as `check_depth`.
+        Args:
+            choice: the setting `depth`.
+            camera: camera of the frames.
+            share: largest share of one core's time, in (0, 1]; None selects it by the number of
+                cores.
+            device: device of estimators that are not limited to the CPU.
+
+        Raises:
+            InvalidSetting: `choice` is rejected by `check_depth`.
         """
         check_depth(choice)
         self.choice, self._camera, self._device = choice, camera, device
@@ -50,7 +60,7 @@ class DepthBeside:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin with another stream."""
+        """Reset the counts and start the thread for a new stream."""
         self.counts = DepthCounts()
         self.finder = DepthFinder(self.choice, self._camera, device=self._device)
         self._offered = self._found = self._failure = None
@@ -58,10 +68,10 @@ class DepthBeside:
         self._begun.clear()
         self._thread = threading.Thread(target=self._run, args=(self.finder,), name="depth", daemon=True)
         self._thread.start()
-        self._begun.wait()  # before others compute: see `use_one_thread`
+        self._begun.wait()  # `use_one_thread` must take effect before other threads compute
 
     def stop(self) -> None:
-        """Wait until the frame under work is done, and look for nothing more. Raises what went wrong in the thread."""
+        """Stop the thread after its current frame. Raises the exception of the thread, if any."""
         thread, self._thread = self._thread, None
         with self._changed:
             self._over = True
@@ -71,7 +81,7 @@ class DepthBeside:
         self.raise_failure()
 
     def offer(self, frame: Frame) -> None:
-        """A frame that is trained on now."""
+        """Queue a frame for depth estimation if it has no depth and the estimator accepts it."""
         if frame.depth is not None or self.finder is None or not self.finder.seeks_in(frame):
             return
         with self._changed:
@@ -80,13 +90,17 @@ class DepthBeside:
             self._changed.notify_all()
 
     def take(self) -> tuple[Frame, LateDepth] | None:
-        """The newest frame whose depth was found since the last call, with it, and what of it is learned."""
+        """Return and clear the newest result: the frame with its depth, and the training data made
+        from it.
+        """
         with self._changed:
             found, self._found = self._found, None
         return found
 
     def _run(self, finder: DepthFinder) -> None:
-        """The life of the thread."""
+        """Estimate depth of pending frames until `stop`, sleeping between frames to keep the time
+        share.
+        """
         step_back()
         if self._share < 1:
             use_one_thread()
@@ -95,7 +109,7 @@ class DepthBeside:
         try:
             while (frame := self._next()) is not None:
                 began_s = time.thread_time()
-                # The frame that began the scene may have been passed over.
+                # The first frame of the scene may have been dropped.
                 is_new = frame.scene != scene and frame.new_scene is None
                 scene = frame.scene
                 found = finder.find(frame.with_fields(new_scene="passed over") if is_new else frame)
@@ -108,7 +122,7 @@ class DepthBeside:
             self._failure = error
 
     def _next(self) -> Frame | None:
-        """The newest frame, when there is one; None: it is over."""
+        """Wait for the next pending frame. Return None once `stop` was called."""
         with self._changed:
             self._changed.wait_for(lambda: self._over or self._offered is not None)
             frame, self._offered = self._offered, None
@@ -116,7 +130,7 @@ class DepthBeside:
 
     def _put(self, found: Frame, places: bool) -> None:
         self.counts.take(found, found)
-        # Made ready here: between two pictures there is no time for it.
+        # Prepared in this thread, because the training thread has no spare time between two frames.
         late = LateDepth.of(found, self._device, places=places)
         with self._changed:
             self._found = found, late
@@ -126,29 +140,33 @@ class DepthBeside:
             self._changed.wait_for(lambda: self._over, seconds)
 
     def raise_failure(self) -> None:
-        """Raise what went wrong in the thread, once."""
+        """Raise the exception that ended the thread, once."""
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
 
 
 def share_of(cores: int) -> float:
-    """How much of one core's time looking for depth takes at most, where the process has so many cores."""
+    """Return the largest share of one core's time for depth estimation in a process with `cores`
+    cores.
+    """
     return SHARE_OF_FEW if cores <= FEW_CORES else 1.0
 
 
 class DepthBesideOp(Operator):
-    """Lets each frame keep the depth that it came with, or drops that, as the setting `depth` says; a frame without goes on at once. Starts and stops the
-    thread that looks for it, which is told by `LiveReconstructOp` what is trained on.
+    """Passes frames on with or without their recorded depth, and owns the depth estimation thread.
+
+    Frames are passed on immediately. `LiveReconstructOp` offers the frames that it trains on to the
+    thread and takes the results.
 
     Inputs:
         frame: `Frame`.
 
     Outputs:
-        frame: the same, or without depth.
+        frame: `Frame`; its depth is removed unless `beside.choice` is in `KEEPS`.
 
     Params:
-        beside: what finds depth.
+        beside: the background depth estimator; started and stopped with this operator.
     """
 
     def __init__(self, fragment: Any, *args: Any, beside: DepthBeside, **kwargs: Any) -> None:

@@ -1,4 +1,4 @@
-"""What is on the screen: the newest picture, how old it is, and what that means."""
+"""Display of the newest picture with its age and state."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from operators.remembered import RememberedTissue
 from operators.sources.source import SourceState
 
 LOOK_NS = 50_000_000
-"""How often the state is looked at while no picture comes."""
+"""Period of the state check while no picture arrives, in nanoseconds."""
 REPEAT_NS = 200_000_000
-"""How often a picture that is not live is sent again, with its age."""
+"""Period after which a picture that is not live is emitted again with its current age, in
+nanoseconds.
+"""
 WAITING = 4
-"""Pictures that may wait to be shown after a delay."""
+"""Capacity of the input queue, in pictures."""
 COLOURS = {
     PictureState.LIVE: (40, 200, 80),
     PictureState.STALE: (255, 190, 0),
@@ -36,16 +38,20 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class DisplaySettings:
-    """From which age on a picture is no longer live, and what is drawn into it. Raises InvalidSetting for a value out of its range."""
+    """Age limits of the picture states and the overlays. Raises InvalidSetting for values out of
+    range.
+    """
 
     stale_after_ms: float = 150.0
     stale_after_intervals: float = 3.0
-    """The larger of the two counts: a slow camera's pictures are older without anything being wrong."""
+    """Stale limit as a multiple of the frame interval. The larger of both stale limits applies,
+    because pictures of a slow camera are older.
+    """
     frozen_after_ms: float = 1000.0
     label: bool = True
     """Draw state and age into every picture. A picture that is not live is always labelled."""
     mark_remembered: bool = True
-    """Draw tissue that nobody sees at this moment without colour (`RememberedTissue`)."""
+    """Draw tissue that is not visible in the current frame in grey (see `RememberedTissue`)."""
 
     def __post_init__(self) -> None:
         if not 0 < self.stale_after_ms < self.frozen_after_ms <= 60_000:
@@ -57,7 +63,13 @@ class DisplaySettings:
             raise InvalidSetting(f"stale_after_intervals is {self.stale_after_intervals}; it must be between 1 and 100")
 
     def state(self, age_ns: float, interval_ns: float, source: SourceState) -> PictureState:
-        """The state of a picture of that age, where frames come `interval_ns` apart from a source in that state."""
+        """Return the state of the displayed picture.
+
+        Args:
+            age_ns: time since the picture's content arrived, in nanoseconds.
+            interval_ns: usual time between frames, in nanoseconds.
+            source: current state of the source; any state but `LIVE` gives `SOURCE_LOST`.
+        """
         if source is not SourceState.LIVE:
             return PictureState.SOURCE_LOST
         stale_ns = max(self.stale_after_ms * 1e6, self.stale_after_intervals * interval_ns)
@@ -68,31 +80,32 @@ class DisplaySettings:
 
 @dataclass(frozen=True)
 class LiveDisplayResult:
-    """What was on the screen."""
+    """Statistics of the pictures displayed during a run."""
 
     pictures: int
-    """New pictures that were shown."""
+    """Number of new pictures; repetitions are not counted."""
     age: DurationSummary
-    """Of each new picture when it came on the screen."""
+    """Distribution of the age of each new picture at the time of display."""
     states: dict[str, int]
-    """How often a picture went over into each state."""
+    """Number of transitions into each state, by name."""
     first_picture_ms: float | None
-    """From the arrival of the first frame to the first picture."""
+    """Time from the arrival of the first frame to the first picture, in milliseconds."""
 
 
 class DisplayOp(Operator):
-    """Shows each picture as soon as it comes, and says what has become of the last one when none comes.
+    """Emits each picture as soon as it arrives, and repeats the last one with its state and age if
+    none arrives.
 
     Inputs:
-        rendered: `RenderedFrame`; the newest one wins.
+        rendered: `RenderedFrame`; the oldest are dropped if the queue is full.
 
     Outputs:
         shown: `ShownPicture`.
 
     Params:
-        clock: the run's; it learns how long showing takes.
-        source_state: what the source is doing, from any thread.
-        settings: from which age on a picture is not live, and what is drawn into it.
+        clock: clock of the run; receives the measured display latency.
+        source_state: returns the state of the source; thread-safe.
+        settings: age limits and overlays.
     """
 
     def __init__(
@@ -120,13 +133,15 @@ class DisplayOp(Operator):
         self._reset()
 
     def prepare_thread(self) -> None:
-        """OpenCV reads its font once in every thread, which takes longer than a frame."""
+        """Load OpenCV's font in this thread. The first use in a thread takes longer than a frame
+        interval.
+        """
         cv2.getTextSize("LIVE", cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
 
     def _reset(self) -> None:
         self.pictures = 0
         self.state: PictureState | None = None
-        """Of what is on the screen; None before the first picture."""
+        """State of the displayed picture; None before the first one."""
         self.states: dict[str, int] = {}
         self._ages = Histogram()
         self._first_ms: float | None = None
@@ -135,7 +150,7 @@ class DisplayOp(Operator):
 
     @property
     def age_p50_ms(self) -> float:
-        """The usual age of a new picture, in milliseconds."""
+        """Median age of new pictures at display, in milliseconds."""
         return self._ages.quantiles_ms((0.5,))[0]
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
@@ -164,7 +179,10 @@ class DisplayOp(Operator):
     def _drawn(
         self, rendered: RenderedFrame, state: PictureState, age_ns: float
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-        """The picture with what is drawn into it, a copy where that is anything, and where it shows remembered tissue."""
+        """Return the picture with its overlays, and the mask of remembered tissue.
+
+        The picture is copied only if something is drawn. The mask is None if nothing is marked.
+        """
         image, whole = rendered.image, _nobody_sees(rendered, state)
         remembered = self._tissue.layer(rendered, whole) if self.settings.mark_remembered else None
         label = self.settings.label or state is not PictureState.LIVE
@@ -191,20 +209,33 @@ class DisplayOp(Operator):
 
 
 def _content_ns(rendered: RenderedFrame, now_ns: int) -> int:
-    """When the newest frame that a picture shows arrived."""
+    """Return the arrival time of the newest frame whose content the picture shows; `now_ns` if
+    unknown.
+    """
     content = rendered.content or rendered.frame
     return now_ns if content.arrived_ns is None else content.arrived_ns
 
 
 def _nobody_sees(rendered: RenderedFrame, state: PictureState) -> bool:
-    """Whether all that a picture shows is remembered: no frame has come for long, or those that came showed nothing of it. A picture that
-    is merely late is not: a slow machine shows what was seen a moment ago."""
+    """Return True if no part of the picture is currently visible to the endoscope.
+
+    This holds for frozen pictures and a lost source. It also holds for a stale picture whose frame
+    was withheld or damaged. A picture that is only late shows tissue seen a moment ago.
+    """
     unused = rendered.frame.withheld is not None or rendered.frame.status is FrameStatus.DAMAGED
     return state in (PictureState.FROZEN, PictureState.SOURCE_LOST) or (state is PictureState.STALE and unused)
 
 
 def draw_label(picture: NDArray[np.uint8], state: PictureState, age_ns: float) -> None:
-    """Draw state and age into the upper left corner, in place; a picture that is not live gets a frame of the state's colour."""
+    """Draw state and age into the upper left corner, in place.
+
+    A picture that is not live also gets a border in the colour of its state.
+
+    Args:
+        picture: uint8 RGB [H, W, 3], modified.
+        state: state that selects text and colour.
+        age_ns: age in nanoseconds.
+    """
     height, width = picture.shape[:2]
     colour = COLOURS[state]
     scale = max(0.35, height / 1000)

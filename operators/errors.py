@@ -1,29 +1,29 @@
-"""Errors of the operators. Each says what happened, the value that was seen, and what to do.
+"""Exceptions of the operators. Each message states the problem, the offending value and the remedy.
 
 OperatorsError
 ├── GraphError
-│   ├── GraphInvalid (also ValueError)     the graph cannot be built: names, ports, types, connections
-│   ├── PortError (also ValueError)        compute used a port that is not there, or emitted a value of another type
-│   ├── QueueFull                          more was emitted into a blocking edge than it holds
-│   ├── MetadataConflict                   two messages of one compute disagree under MetadataPolicy.RAISE
-│   ├── OperatorFailed                     an operator raised; names the operator and the frame
-│   ├── OperatorStuck                      an operator did not return from compute when the graph stopped
-│   ├── GraphDeadlock                      nothing can go on although not everything is done; says who waits on what
-│   └── GraphBusy                          run() while the application already runs
+│   ├── GraphInvalid (also ValueError)   invalid names, ports, types or connections
+│   ├── PortError (also ValueError)      compute used an unknown port or emitted a wrong type
+│   ├── QueueFull                        compute emitted more into a blocking edge than its capacity
+│   ├── MetadataConflict                 two messages of one compute disagree (MetadataPolicy.RAISE)
+│   ├── OperatorFailed                   an operator raised; names the operator and the frame
+│   ├── OperatorStuck                    an operator did not return from compute after the stop
+│   ├── GraphDeadlock                    no operator can run although the graph is not finished
+│   └── GraphBusy                        run() while the application already runs
 ├── EngineError (UserError)
-│   ├── EngineMissing                      the engine's package is not installed or cannot be loaded
-│   └── EngineUnsupported                  the engine cannot run this graph faithfully
-├── SourceError (UserError)                a source of frames cannot be used
-│   ├── SourceUnavailable                  it cannot be opened
-│   └── SourceLost                         it gave frames and is gone for good
-├── OutputError (UserError)                what a run writes cannot be written
-│   ├── OutputFolderInUse                  the folder holds something that is not ours, or another run writes into it
-│   └── StorageFull                        the disk has no room left
+│   ├── EngineMissing                    the engine's package is not installed or cannot be loaded
+│   └── EngineUnsupported                the engine cannot run this graph faithfully
+├── SourceError (UserError)              a frame source is unusable
+│   ├── SourceUnavailable                the source cannot be opened
+│   └── SourceLost                       the source delivered frames and then failed permanently
+├── OutputError (UserError)              results cannot be written
+│   ├── OutputFolderInUse                foreign files in the folder, or another run writes into it
+│   └── StorageFull                      the disk is full
 └── RunError
-    ├── DeviceMissing (UserError)          the device asked for is not there or not supported
-    ├── MemoryTooSmall (UserError)         what a run needs does not fit into this machine's memory
-    ├── NothingShown (UserError)           a run ended as it should, and no frame was shown
-    └── RunFailed                          a run ended early; carries what it had reached
+    ├── DeviceMissing (UserError)        the requested device is missing or not supported
+    ├── MemoryTooSmall (UserError)       the run does not fit into memory
+    ├── NothingShown (UserError)         the run ended normally without displaying a frame
+    └── RunFailed                        the run ended early; carries the results so far
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from gsplat_core.errors import UserError
 
 
 class OperatorsError(Exception):
-    """Base of everything the operators raise on purpose."""
+    """Base class of all exceptions that the operators raise deliberately."""
 
 
 class GraphError(OperatorsError):
-    """Building or running an operator graph went wrong."""
+    """An operator graph failed while it was built or run."""
 
 
 class GraphInvalid(GraphError, ValueError):
@@ -46,21 +46,26 @@ class GraphInvalid(GraphError, ValueError):
 
 
 class PortError(GraphError, ValueError):
-    """compute used a port that is not there, or emitted a value of another type than the port declares."""
+    """`compute` used a port that does not exist, or emitted a value of the wrong type."""
 
 
 class QueueFull(GraphError):
-    """More was emitted into a blocking edge than it holds."""
+    """`compute` emitted more messages into a blocking edge than the edge's capacity."""
 
 
 class MetadataConflict(GraphError):
-    """Two messages of one compute disagree on a key under MetadataPolicy.RAISE."""
+    """Two messages of one `compute` call carry different values of a metadata key
+    (`MetadataPolicy.RAISE`).
+    """
 
 
 class OperatorFailed(GraphError):
-    """An operator raised. The original exception is the `__cause__`.
+    """An operator raised an exception, which is kept as `__cause__`.
 
-    `operator` is its name, `phase` the method that raised, `seq` the frame it worked on (None when unknown).
+    Attributes:
+        operator: name of the operator.
+        phase: name of the method that raised.
+        seq: sequence number of the frame in work; None if unknown.
     """
 
     def __init__(self, operator: str, phase: str, cause: BaseException, seq: int | None = None) -> None:
@@ -71,7 +76,9 @@ class OperatorFailed(GraphError):
 
 
 class OperatorStuck(GraphError):
-    """Operators, named in `operators`, did not return from compute in time; they are not stopped."""
+    """Operators that did not return from `compute` in time; their threads keep running. Names in
+    `operators`.
+    """
 
     def __init__(self, operators: Iterable[str], timeout_s: float) -> None:
         self.operators = tuple(operators)
@@ -79,7 +86,9 @@ class OperatorStuck(GraphError):
 
 
 class GraphDeadlock(GraphError):
-    """Nothing can go on although not everything is done. `waiting` maps each operator to what it waits for."""
+    """No operator can run although the graph is not finished. `waiting` maps each operator to its
+    unmet condition.
+    """
 
     def __init__(self, waiting: Mapping[str, str]) -> None:
         lines = "; ".join(f"{name} waits for {what}" for name, what in waiting.items())
@@ -88,7 +97,7 @@ class GraphDeadlock(GraphError):
 
 
 class GraphBusy(GraphError):
-    """The application already runs."""
+    """`run()` was called while the application was already running."""
 
 
 class EngineError(OperatorsError, UserError):
@@ -104,27 +113,27 @@ class EngineUnsupported(EngineError):
 
 
 class SourceError(OperatorsError, UserError):
-    """A source of frames cannot be used."""
+    """A frame source is unusable."""
 
 
 class SourceUnavailable(SourceError):
-    """A source cannot be opened: nothing answers there, or what answers gives no pictures."""
+    """A source cannot be opened: no answer, or an answer without frames."""
 
 
 class SourceLost(SourceError):
-    """A source that gave frames is gone for good."""
+    """A source delivered frames and then failed permanently."""
 
 
 class OutputError(OperatorsError, UserError):
-    """What a run writes cannot be written."""
+    """Results of a run cannot be written."""
 
 
 class OutputFolderInUse(OutputError):
-    """The folder holds something that is not ours, or another run writes into it."""
+    """The output folder contains foreign files, or another run writes into it."""
 
 
 class StorageFull(OutputError):
-    """The disk has no room left."""
+    """The disk has too little free space."""
 
 
 class RunError(OperatorsError):
@@ -132,19 +141,21 @@ class RunError(OperatorsError):
 
 
 class DeviceMissing(RunError, UserError):
-    """The device asked for is not there, or this version cannot use it."""
+    """The requested device does not exist, or this version does not support it."""
 
 
 class MemoryTooSmall(RunError, UserError):
-    """What a run needs does not fit into this machine's memory, or into what this process may take."""
+    """The run needs more memory than the machine or the process limit allows."""
 
 
 class NothingShown(RunError, UserError):
-    """A run ended as it should, and no frame was shown: none came, or all were withheld."""
+    """A run ended normally without displaying a frame: the source was empty or every frame was
+    withheld.
+    """
 
 
 class RunFailed(RunError):
-    """A run ended early; the `__cause__` says why. `result` is what it had reached, already saved."""
+    """A run ended early; the cause is `__cause__`. `result` is the outcome so far, already saved."""
 
     def __init__(self, what: str, result: object) -> None:
         super().__init__(what)

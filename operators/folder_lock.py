@@ -1,4 +1,4 @@
-"""One run at a time in an output folder."""
+"""Exclusive use of an output folder by one run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ _CANNOT_LOCK = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 class FolderLock:
-    """An exclusive lock on a folder while entered. The system frees it when its process ends, however that ends.
+    """Context manager that holds an exclusive lock on a folder.
 
-    It is a `flock` on a file in the folder. Linux carries it to the server of an NFS folder, so that it holds between machines too, where the
-    server supports locks. Raises OutputFolderInUse when another run holds it, naming that run's process; OutputError where files cannot
-    be locked.
+    The lock is a `flock` on a file in the folder. The operating system releases the lock when the
+    process ends, even after a crash. On NFS, Linux forwards the lock to the server, so the lock
+    also excludes runs on other machines if the server supports locks.
+
+    Raises:
+        OutputFolderInUse: another run holds the lock; the message names its process.
+        OutputError: the file system does not support locks.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -29,13 +33,13 @@ class FolderLock:
 
     def __enter__(self) -> FolderLock:
         while not self._taken():
-            pass  # the run before removed its lock file between our two looks: there is a new one to take
+            pass  # the previous run deleted its lock file between open and flock: retry with a new file
         os.ftruncate(self._descriptor, 0)
         os.write(self._descriptor, f"{os.getpid()}\n".encode())
         return self
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(FileNotFoundError):  # the folder was deleted meanwhile
+        with contextlib.suppress(FileNotFoundError):  # the folder was deleted during the run
             self._path.unlink()
         os.close(self._descriptor)
 

@@ -1,4 +1,4 @@
-"""When a live frame has to be shown, and how much training that leaves room for."""
+"""Display deadlines of live frames and the training budget that they leave."""
 
 from __future__ import annotations
 
@@ -13,48 +13,60 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 
 INTERVAL_DECAY = 0.1
-"""How fast the usual interval between frames follows the newest ones."""
+"""Weight of the newest frame in the moving average of the frame interval."""
 DISPLAY_DECAY = 0.2
-"""How fast the usual time from a published model to its shown picture follows the newest ones."""
+"""Weight of the newest picture in the moving averages of training time and display latency."""
 
 REHEARSAL_MARGIN_NS = 300_000
-"""Rehearsal ends so long before the next frame is due."""
+"""Time before the next expected frame at which rehearsal ends, in nanoseconds."""
 SHOWN_WITHIN_S = 0.005
-"""Rehearsal waits so long for a picture to be shown."""
+"""Longest wait for a picture to be displayed before rehearsal, in seconds."""
 AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
-"""Used where `ClockSettings` says nothing."""
+"""Defaults for `ClockSettings.auto_share`, `auto_most_ms` and `least_share`."""
 CATCH_UP_SHARE = 0.8
-"""Frames that take a larger share of the time between them, with the fewest steps, cannot be caught up with."""
+"""Largest share of the frame interval that minimal processing may take for queued frames to be
+caught up with.
+"""
 CATCH_UP_INTERVALS = 4.0
-"""Used where `ClockSettings.catch_up_intervals` says nothing."""
+"""Default for `ClockSettings.catch_up_intervals`."""
 
 
 @dataclass(frozen=True)
 class ClockSettings:
-    """When frames are shown. Raises InvalidSetting for a value out of its range."""
+    """Display deadline and step limits. Raises InvalidSetting for a value out of range."""
 
     budget_ms: float | None = None
-    """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
+    """Display deadline after a frame's arrival, in milliseconds. None: `auto_share` of the frame
+    interval, at most `auto_most_ms`.
+    """
     auto_share: float | None = None
     auto_most_ms: float | None = None
-    """Both None: as suits the device."""
+    """Automatic deadline as a share of the frame interval, and its upper limit in milliseconds.
+    None: device default.
+    """
     least_share: float | None = None
-    """Training gets so much of the time between frames, though a frame that had to wait is shown later for it; None: as suits the device."""
+    """Share of the frame interval guaranteed for training with an automatic deadline, even past the
+    deadline. None: device default.
+    """
     at_least_steps: int | None = None
-    """Steps that a frame gets, though it is shown late; None: as suits the device."""
+    """Minimum number of optimiser steps per frame, even past the deadline. None: device default."""
     fewest_steps: int | None = None
-    """The same of a frame that others wait behind: so that all of them can be shown; None: as any other."""
+    """Minimum number of steps for a frame with further frames queued behind it. None:
+    `at_least_steps`.
+    """
     catch_up_intervals: float | None = None
-    """A frame that has waited for longer than so many times the time between frames is passed over for newer ones; None: as suits the device."""
+    """Longest wait of a frame before it is dropped for newer ones, in frame intervals. None: device
+    default.
+    """
     at_most_steps: int = 80
-    """Steps before a frame is shown, though there is time left."""
+    """Maximum number of optimiser steps before a frame is displayed."""
     first_ms: float = 20.0
-    """A scene's first frame may take so long, at least `first_at_least_steps`."""
+    """Training time for the first frame of a scene, in milliseconds."""
     first_at_least_steps: int | None = None
-    """None: as suits the device."""
+    """Minimum number of steps for the first frame of a scene. None: device default."""
     first_at_most_steps: int = 60
     rehearse_at_most: int = 120
-    """Steps on the window between two frames, though no frame comes."""
+    """Maximum number of rehearsal steps between two frames, also while no frame arrives."""
 
     def __post_init__(self) -> None:
         if self.budget_ms is not None and not 0 < self.budget_ms <= 10_000:
@@ -83,26 +95,45 @@ class ClockSettings:
 
 
 class FrameClock:
-    """The time of each frame. `arrived`, `budget` and `may_rehearse` are called by the thread that trains, `shown` by the one that shows."""
+    """Deadlines and training budgets of live frames, from measured intervals and latencies.
+
+    The training thread calls `budget`, `may_rehearse`, `too_late` and `published`. The display
+    thread calls `shown`.
+    """
 
     def __init__(self, settings: ClockSettings, fps: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """fps: the source's nominal rate, until the frames themselves say more."""
+        """Start with nominal values.
+
+        Args:
+            settings: deadline and step limits.
+            fps: nominal frame rate of the source; replaced gradually by the measured rate.
+            now_ns: monotonic clock in nanoseconds, the clock of `Frame.arrived_ns`.
+        """
         self.settings = settings
         self.now_ns = now_ns
         self.interval_ns = 1e9 / fps
-        """Usual time between frames."""
+        """Moving average of the time between frames, in nanoseconds."""
         self.display_ns = 2e6
-        """Usual time from a published model to its shown picture."""
+        """Moving average of the latency from a published model to its displayed picture, in
+        nanoseconds.
+        """
         self.training_ns = 0.0
-        """Usual time from taking a frame to its published model, had it had the fewest steps."""
+        """Moving average of the time from dequeuing a frame to its published model with the minimum
+        number of steps, in nanoseconds.
+        """
         self._last_arrival: tuple[int, int] | None = None
-        """When the newest frame came, and its number."""
+        """Arrival time in nanoseconds and sequence number of the newest frame."""
         self._shown = threading.Event()
 
     def budget(self, frame: Frame, *, first: bool = False, behind: bool = False) -> Budget:
-        """The training that a frame may take before it is shown; the `first` one of a scene takes longer.
+        """Return the training budget of a frame before its display.
 
-        A frame that others wait `behind` gets no more than its time holds: after a delay that is how it is caught up with.
+        Args:
+            frame: the frame to be trained on; its arrival updates the frame interval.
+            first: the frame is the first of a scene and gets a larger budget.
+            behind: further frames are queued. The frame then gets no time past its deadline and
+                fewer
+                minimum steps, so that the queue is worked off.
         """
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
@@ -118,13 +149,13 @@ class FrameClock:
         )
 
     def least_steps(self, behind: bool) -> int:
-        """Steps that a frame gets at least, with others waiting `behind` it or not."""
+        """Return the minimum number of steps of a frame; `behind`: further frames are queued."""
         at_least = self.settings.at_least_steps or 1
         return self.settings.fewest_steps or at_least if behind else at_least
 
     @property
     def show_after_ns(self) -> float:
-        """How long after its arrival a frame is to be shown."""
+        """Display deadline after a frame's arrival, in nanoseconds."""
         settings = self.settings
         if settings.budget_ms is not None:
             return settings.budget_ms * 1e6
@@ -133,15 +164,23 @@ class FrameClock:
         )
 
     def may_rehearse(self, made: int, ahead_ns: float) -> bool:
-        """Whether there is room for more rehearsal: `made` steps were made since the last frame, and those that would be under way take
-        `ahead_ns`. It ends just before the next frame is due here, so that the frame finds the device free."""
+        """Return True if another rehearsal step ends before the next frame is expected.
+
+        Args:
+            made: rehearsal steps since the last frame.
+            ahead_ns: duration of the steps that would be in flight, in nanoseconds.
+        """
         if made >= self.settings.rehearse_at_most or self._last_arrival is None:
             return False
         return self.now_ns() + ahead_ns < self._last_arrival[0] + self.interval_ns - REHEARSAL_MARGIN_NS
 
     def too_late(self, frame: Frame, waiting: int) -> bool:
-        """Whether a frame is passed over for one of the `waiting` newer ones. After a delay frames are caught up with one by one, as long
-        as that takes less time than there is between them, and none is shown very late. One is trained on while the last is being shown."""
+        """Return True if a frame is to be dropped for one of the `waiting` newer frames.
+
+        Queued frames are processed one by one as long as training and display each take less than
+        `CATCH_UP_SHARE` of the frame interval and the frame has not waited too long. Training of a
+        frame overlaps with the display of the previous one.
+        """
         if not waiting or frame.arrived_ns is None:
             return False
         keeps_up = max(self.training_ns, self.display_ns) < CATCH_UP_SHARE * self.interval_ns
@@ -149,28 +188,39 @@ class FrameClock:
         return not keeps_up or waited_ns > (self.settings.catch_up_intervals or CATCH_UP_INTERVALS) * self.interval_ns
 
     def published(self, taken_ns: int, published_ns: int, steps: int = 0, step_ns: float = 0.0) -> None:
-        """The model of a frame that was taken then, and got so many steps of that length, is published now."""
+        """Record a published model, to update the training time.
+
+        Args:
+            taken_ns: time at which training dequeued the frame.
+            published_ns: time of publication.
+            steps: optimiser steps on the frame.
+            step_ns: duration of one step; steps above the minimum are subtracted.
+        """
         self._shown.clear()
         spared_ns = max(0, steps - self.least_steps(behind=True)) * step_ns
         needed_ns = max(0.0, published_ns - taken_ns - spared_ns)
         self.training_ns += DISPLAY_DECAY * (needed_ns - self.training_ns)
 
     def shown(self, published_ns: int, shown_ns: int) -> None:
-        """A picture of the model that was published then is shown now."""
-        # One that took very long, as a first one may, says little about the next.
+        """Record a displayed picture of the model published at `published_ns`, to update the
+        display latency.
+        """
+        # Limit outliers such as the first picture, which includes one-time initialisation.
         seen = min(max(0, shown_ns - published_ns), 4 * self.display_ns + 1e6)
         self.display_ns += DISPLAY_DECAY * (seen - self.display_ns)
         self._shown.set()
 
     def wait_until_shown(self) -> None:
-        """Wait until the newest published model is shown, but not for long: its picture has the device for itself meanwhile."""
+        """Wait up to `SHOWN_WITHIN_S` for the newest model to be displayed, so that its rendering
+        has the device alone.
+        """
         self._shown.wait(SHOWN_WITHIN_S)
 
     def _learn_interval(self, arrived_ns: int, seq: int) -> None:
         last, self._last_arrival = self._last_arrival, (arrived_ns, seq)
         if last is None:
             return
-        # Frames that were passed over have come, too. A pause is no interval, and neither is a burst after one.
+        # Dropped frames count as intervals. Pauses and the bursts after them are clipped.
         each_ns = (arrived_ns - last[0]) / max(1, seq - last[1])
         seen = min(max(each_ns, 0.2 * self.interval_ns), 5 * self.interval_ns)
         self.interval_ns += INTERVAL_DECAY * (seen - self.interval_ns)

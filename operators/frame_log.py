@@ -1,4 +1,6 @@
-"""One line of JSON for each displayed frame, on disk: the run in full detail, without memory that grows with it."""
+"""On-disk log with one line of JSON per displayed frame, so that memory use does not grow with the
+run.
+"""
 
 from __future__ import annotations
 
@@ -14,28 +16,36 @@ from operators.storage import StorageReserve, storage_errors
 
 FRAMES_FILE = "frames.jsonl"
 MAX_SERIES = 4096
-"""Entries of a report's series; a longer run is summed up in bins of equally many frames."""
+"""Maximum number of entries of a report's series. Longer runs are averaged in bins of equal size.
+"""
 
 Value = float | int | bool | str | None
 Entry = dict[str, Value]
 
 
 class FrameLog:
-    """Appends entries to a file, each as one line and with one call of the system: whenever the program is killed, every line but
-    possibly the last is whole. A power failure may take lines that the system had not written yet.
+    """Appends entries to a file, each as one line in a single write call.
+
+    If the process is killed, all lines but possibly the last are complete. A power failure may lose
+    lines that the operating system had not written to disk.
     """
 
     def __init__(self, path: Path, reserve: StorageReserve | None = None) -> None:
-        """reserve: room that must stay free on the disk."""
+        """Set the path without opening the file.
+
+        Args:
+            path: the log file.
+            reserve: free disk space to be kept; None for no check.
+        """
         self.path = path
         self.reserve = reserve
         self._file: BinaryIO | None = None
 
     def open(self) -> None:
-        """Begin an empty file. Raises StorageFull, OutputError."""
+        """Create an empty file, replacing an existing one. Raises StorageFull, OutputError."""
         self.close()
         with storage_errors(self.path.parent):
-            # Whatever has the name, a link among it, is replaced and not written through.
+            # Replace an existing file or link rather than write through it.
             self.path.unlink(missing_ok=True)
             self._file = self.path.open("xb", buffering=0)
 
@@ -50,19 +60,21 @@ class FrameLog:
             self._file.write(line)
 
     def series(self, frames: int) -> tuple[tuple[Entry, ...], int]:
-        """The report's series of a run of so many frames, and how many of them one entry sums up."""
+        """Return the report's series for a run of `frames` frames, and the number of frames per
+        entry.
+        """
         per_entry = frames_per_entry(frames, MAX_SERIES)
         return (tuple(series(read_frames(self.path), per_entry)) if frames else ()), per_entry
 
     def close(self) -> None:
-        """Finish the file. Closing twice is allowed."""
+        """Close the file. Idempotent."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
 
 def read_frames(path: Path) -> Iterator[Entry]:
-    """The entries of a log, one at a time. A last line that was cut off is left out. A file that is not there has none."""
+    """Yield the entries of a log. A truncated last line is skipped. A missing file yields nothing."""
     try:
         lines = open_regular(path)
     except FileNotFoundError:
@@ -74,15 +86,16 @@ def read_frames(path: Path) -> Iterator[Entry]:
 
 
 def frames_per_entry(frames: int, most: int) -> int:
-    """How many of `frames` frames one entry of a series sums up, so that there are at most `most` bins."""
+    """Return the bin size that reduces `frames` frames to at most `most` bins."""
     return max(1, -(-frames // most))
 
 
 def series(entries: Iterable[Entry], per_entry: int) -> Iterator[Entry]:
-    """The entries themselves, or one for each `per_entry` of them: the means of their measures.
+    """Yield the entries unchanged, or the mean measures of each bin of `per_entry` entries.
 
-    A bin has the `seq`, `time_s` and `model_version` of its first frame, how many `frames` it sums up, and `psnr_tissue_min_db`, the worst
-    of them. Frames that were trained on and frames that were held out are never summed up together: a bin with both gives two entries.
+    A bin has the `seq`, `time_s` and `model_version` of its first frame, the number of `frames` and
+    their lowest PSNR, `psnr_tissue_min_db`. Trained and held-out frames are averaged separately, so
+    a bin with both kinds yields two entries.
     """
     if per_entry == 1:
         yield from entries

@@ -1,4 +1,4 @@
-"""How frames enter the graph."""
+"""Operator that reads frames from a source into the graph."""
 
 from __future__ import annotations
 
@@ -20,44 +20,49 @@ from operators.sources.source import FrameSource, ReportingSource, SourceDescrip
 log = logging.getLogger(__name__)
 
 LOOK_S = 0.1
-"""How often a source that waits for its next frame asks whether it is to stop."""
+"""Timeout of one read from the source, in seconds. A stop request is checked between reads."""
 PATIENCE_S = 1.0
-"""After so long without a frame, `compute` returns, so that a stop of the graph is noticed."""
+"""Longest time without a frame, in seconds, after which `compute` returns so that the graph can
+stop.
+"""
 
 
 @dataclass(frozen=True)
 class SourceResult:
-    """What a run has read."""
+    """Summary of the frames that a run read from its source."""
 
     description: SourceDescription
     frames: int
-    """How many frames entered the graph."""
+    """Number of frames that entered the graph."""
     reached_end: bool
-    """Whether the source gave all that it had; False when the run ended before."""
+    """True if the source was read to its end; False if the run ended earlier."""
     damaged: int = 0
-    """How many of the frames were damaged: shown, but neither trained on nor scored."""
+    """Number of damaged frames. They are displayed, but neither trained on nor scored."""
     withheld: Mapping[str, int] = field(default_factory=dict)
-    """Frames that came from the source withheld, by reason, as those of a recorded session may be."""
+    """Frames that the source delivered as withheld, by reason; recorded sessions contain such
+    frames.
+    """
     counts: Mapping[str, int] = field(default_factory=dict)
-    """What the source dropped or repaired, by reason (`docs/sources.md`)."""
+    """Dropped or repaired items of the source, by reason (see `docs/sources.md`)."""
     state_s: Mapping[str, float] = field(default_factory=dict)
-    """Seconds of the run that the source spent in each state but `live`."""
+    """Seconds that the source spent in each state other than `live`."""
     state_sentence: str = ""
-    """What the source said of its state last."""
+    """Latest state message of the source."""
     out_of_time: bool = False
-    """Whether it was ended because the time asked for was over."""
+    """True if the run ended because the requested duration elapsed."""
 
 
 class SourceOp(Operator):
-    """Emits each frame of a source once, in order, and ends when the source does.
+    """Emits each frame of a source once, in order, and ends with the source.
 
     Outputs:
         frame: `Frame`; the message's metadata carries `seq` and `pts_ns`.
 
     Params:
         source: opened by `start()` and closed by `stop()`.
-        stop_requested: asked before each frame; when it answers True the stream ends there and the frames in flight are finished.
-        seconds: end the stream so long after `start()`, whether or not frames come; None: when the source ends.
+        stop_requested: polled before each frame; True ends the stream. Frames in flight are
+            finished.
+        seconds: maximum duration after `start()`; None for no limit.
     """
 
     def __init__(
@@ -77,7 +82,7 @@ class SourceOp(Operator):
         self.emitted = 0
         self.reached_end = False
         self.damaged = DamagedFrames()
-        """Those of the emitted frames that are damaged."""
+        """Damaged frames among the emitted ones."""
         self.withheld: Counter[str] = Counter()
         self._last_seq: int | None = None
         self._states = _TimeInStates()
@@ -116,7 +121,8 @@ class SourceOp(Operator):
         op_output.emit(frame, "frame")
         self.emitted += 1
         if self.emitted == self.source.description.frame_count:
-            # Ending here rather than on an empty compute keeps "calls" in the report equal to the number of frames.
+            # Ending here, not on an empty compute, keeps "calls" in the report equal to the number
+            # of frames.
             self._end()
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
@@ -142,7 +148,7 @@ class SourceOp(Operator):
             outcome.note(self.damaged.sentence(self.emitted))
 
     def _next(self) -> Frame | None:
-        """The next frame; None when there is none yet, or none any more."""
+        """Read the next frame. None if no frame arrived in time or the stream has ended."""
         for _ in range(round(PATIENCE_S / LOOK_S)):
             if self.stop_requested() or time.monotonic() > self._until_s:
                 self._out_of_time = time.monotonic() > self._until_s
@@ -163,7 +169,7 @@ class SourceOp(Operator):
 
 
 class _TimeInStates:
-    """How long a source was in each state but `live`, as seen by whoever reads it, and what it said last."""
+    """Time that a source spent in each state other than `live`, and its latest state message."""
 
     def __init__(self) -> None:
         self.sentence = ""
@@ -172,7 +178,7 @@ class _TimeInStates:
         self._since_s = 0.0
 
     def saw(self, source: FrameSource, frame_came: bool) -> None:
-        """Look at the source, after it was read."""
+        """Update the times after a read; `frame_came` is True if the read returned a frame."""
         state = SourceState.LIVE if frame_came else source.state
         if state is self._state is SourceState.LIVE:
             return
@@ -185,5 +191,5 @@ class _TimeInStates:
         self._state, self._since_s = state, now_s
 
     def seconds(self) -> dict[str, float]:
-        """By the states' names."""
+        """Return the seconds per state, by name of the state."""
         return {state.value: seconds for state, seconds in self._seconds.items()}

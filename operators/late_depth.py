@@ -1,4 +1,4 @@
-"""Depth that was found beside a live stream reaches the model, after the frames that it is of."""
+"""Transfer of late depth estimates to a live model, after training on their frames."""
 
 from __future__ import annotations
 
@@ -15,46 +15,56 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class TakenDepth:
-    """Depth that a live model was given after the frames themselves."""
+    """Statistics of depth that a live model received after the frames."""
 
     frames: int
-    """Of how many."""
+    """Number of frames whose depth was used."""
     age_p50_ms: float
-    """How long after they had come; the median."""
+    """Median delay from the frame's arrival to the use of its depth, in milliseconds."""
     dropped: int
-    """Depths that were not taken: of another scene by then, or of frames too long ago."""
+    """Rejected estimates, for example of an earlier scene or of a frame too old."""
 
 
 class DepthFound(Protocol):
-    """Where depth is found for frames that are trained on, while that goes on."""
+    """Asynchronous depth estimator for frames that are being trained on."""
 
     def offer(self, frame: Frame) -> None:
-        """A frame that is trained on now; it may be passed over."""
+        """Submit a frame for estimation; the estimator may drop it."""
 
     def take(self) -> tuple[Frame, LateDepth] | None:
-        """A frame that was offered, with the depth that was found of it, and what of that is learned; each once. None: there is none."""
+        """Return a finished frame with its depth and the training data made from it, once each.
+        None if there is no new result.
+        """
 
 
 class LateDepths:
-    """Hands a model what was found beside it, and counts that."""
+    """Passes late depth estimates to a model and records their delay."""
 
     def __init__(self, found: DepthFound | None) -> None:
-        """found: where; None: nowhere."""
+        """found: the asynchronous estimator; None disables late depth."""
         self._found = found
         self.begin()
 
     def begin(self) -> None:
-        """Another stream begins."""
+        """Reset the statistics for a new stream."""
         self._ages = Histogram()
         self._taken = self._dropped = 0
 
     def offer(self, frame: Frame) -> None:
-        """A frame that is trained on now."""
+        """Submit a frame that is being trained on to the estimator."""
         if self._found is not None:
             self._found.offer(frame)
 
     def give(self, reconstructor: LiveReconstructor, now_ns: Callable[[], int]) -> Frame | None:
-        """Let the model learn what was found since the last call; returns the frame whose depth it took. now_ns: the clock of `Frame.arrived_ns`."""
+        """Pass a new estimate, if any, to the model.
+
+        Args:
+            reconstructor: the live model.
+            now_ns: monotonic clock in nanoseconds, the clock of `Frame.arrived_ns`.
+
+        Returns:
+            The frame with the depth that the model accepted; None if there was none.
+        """
         found = None if self._found is None else self._found.take()
         if found is None:
             return None

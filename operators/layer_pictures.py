@@ -1,4 +1,4 @@
-"""Depth and confidence as pictures in false colours, each with its legend, and the marks of what was never observed."""
+"""False-colour pictures of depth and confidence with legends, and marks for unobserved areas."""
 
 from __future__ import annotations
 
@@ -12,47 +12,56 @@ from numpy.typing import NDArray
 from operators.remembered import COVERED
 
 STOPS = 9
-"""Colours that a legend names, evenly spaced."""
+"""Number of evenly spaced colours in a legend."""
 QUANTILES = (0.02, 0.5, 0.98)
-"""Of the depths of a picture: the ends of the range, and the median."""
+"""Quantiles of a picture's depths: lower end of the colour range, median, upper end."""
 RANGE_FOLLOWS = 0.3
-"""How fast the range of depths follows the pictures: colours must not flicker."""
+"""Weight of the newest picture in the moving average of the depth range, to avoid flicker."""
 HATCH_PX = 12
 UNOBSERVED, UNOBSERVED_LINE = (24, 18, 32), (150, 60, 170)
-"""Colours of what was never observed: no colour map has them."""
+"""RGB colours of unobserved pixels and of their hatch lines; neither occurs in the colour maps."""
 VIRTUAL = (190, 110, 255)
-"""The frame around a picture that no camera has taken."""
+"""RGB colour of the border around a picture from a virtual camera."""
 
 Unit = Literal["mm", "relative", "confidence"]
 
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colours of a picture mean."""
+    """Value range and colours of a false-colour picture."""
 
     unit: Unit
-    """`mm`; `relative`: a depth over the picture's median depth, where the recording has no scale; `confidence`: 0 to 1."""
+    """`mm`; `relative` (depth divided by the median depth, for recordings without scale); or
+    `confidence` (0..1).
+    """
     low: float
     high: float
     stops: tuple[str, ...]
     """Colours from `low` to `high`, evenly spaced."""
 
     def said(self) -> dict[str, Any]:
-        """For a picture's header."""
+        """Return the legend as JSON for the header of a picture."""
         low, high = (float(f"{value:.4g}") for value in (self.low, self.high))
         return {"unit": self.unit, "low": low, "high": high, "stops": list(self.stops), "unobserved": _hex(UNOBSERVED)}
 
 
 class DepthColours:
-    """Depth in false colours, near ones warm. Its range follows the pictures slowly. For one thread at a time."""
+    """False colours of depth with a slowly adapting range; near is warm. Not thread-safe."""
 
     def __init__(self) -> None:
         self._range: tuple[float, float] | None = None
         self.median: float | None = None
-        """Median depth of what is covered, in the scene's unit; None before anything was."""
+        """Median depth of covered pixels, in the scene's unit; None before the first covered
+        picture.
+        """
 
     def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
-        """Learn the range of depths from a picture's planes [H, W]."""
+        """Update the depth range.
+
+        Args:
+            depth: float32 [H, W], in the scene's unit.
+            alpha: opacity, float32 [H, W]; only pixels of at least 0.5 count.
+        """
         values = depth[(alpha >= 0.5) & np.isfinite(depth) & (depth > 0)]
         if values.size == 0:
             return
@@ -67,10 +76,19 @@ class DepthColours:
     def picture(
         self, depth: NDArray[np.float32], alpha: NDArray[np.float32], metric: bool
     ) -> tuple[NDArray[np.uint8], Legend]:
-        """RGB uint8 [H, W, 3] with what was never observed marked, and its legend. metric: the scene's unit is the millimetre."""
+        """Render depth in false colours with unobserved pixels hatched.
+
+        Args:
+            depth: float32 [H, W], in the scene's unit.
+            alpha: opacity, float32 [H, W].
+            metric: True if the scene's unit is the millimetre.
+
+        Returns:
+            The picture, uint8 RGB [H, W, 3], and its legend.
+        """
         self.look_at(depth, alpha)
         low, high = self._range or (0.0, 1.0)
-        # Nearly flat tissue must not look like mountains.
+        # A minimum range keeps nearly flat tissue from looking rugged.
         spread = max(high - low, 0.05 * (self.median or 1.0))
         middle = (low + high) / 2
         low, high = middle - spread / 2, middle + spread / 2
@@ -83,14 +101,30 @@ class DepthColours:
 
 
 def confidence_picture(confidence: NDArray[np.float32], alpha: NDArray[np.float32]) -> tuple[NDArray[np.uint8], Legend]:
-    """Confidence [H, W], 0 to 1, as RGB uint8 [H, W, 3] with what was never observed marked, and its legend."""
+    """Render confidence in false colours with unobserved pixels hatched.
+
+    Args:
+        confidence: float32 [H, W], 0..1.
+        alpha: opacity, float32 [H, W].
+
+    Returns:
+        The picture, uint8 RGB [H, W, 3], and its legend.
+    """
     image = _coloured(np.clip(np.nan_to_num(confidence), 0, 1), cv2.COLORMAP_VIRIDIS)
     mark_unobserved(image, alpha)
     return image, Legend("confidence", 0.0, 1.0, _stops(cv2.COLORMAP_VIRIDIS))
 
 
 def mark_unobserved(image: NDArray[np.uint8], alpha: NDArray[np.float32]) -> float:
-    """Hatch, in place, where a model shows nothing: no camera has seen anything there. Returns the share of such pixels."""
+    """Hatch pixels that the model does not cover, in place.
+
+    Args:
+        image: uint8 RGB [H, W, 3], modified.
+        alpha: opacity, float32 [H, W]; below `COVERED` or NaN counts as unobserved.
+
+    Returns:
+        Share of unobserved pixels, 0..1.
+    """
     empty = ~(alpha >= COVERED)
     share = float(empty.mean())
     if share:
@@ -103,7 +137,7 @@ def mark_unobserved(image: NDArray[np.uint8], alpha: NDArray[np.float32]) -> flo
 
 
 def mark_virtual(image: NDArray[np.uint8], text: str) -> None:
-    """Frame a picture that no camera has taken, in place, and say so at its lower edge."""
+    """Draw a border and `text` at the lower edge into a picture from a virtual camera, in place."""
     height, width = image.shape[:2]
     edge = max(2, height // 80)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), VIRTUAL, edge)
