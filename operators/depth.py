@@ -27,7 +27,7 @@ class FoundDepth:
     known_share: float
     """Share of pixels with trusted depth, 0..1; mean over the frames that have depth."""
     metric: bool
-    """True if the depth of every frame is in millimetres rather than relative."""
+    """True if the depth of every frame has the calibration's unit rather than an unknown scale."""
     doubts: Mapping[str, int]
     """Number of frames for which depth estimation was attempted and rejected, by reason (a
     sentence).

@@ -1,4 +1,7 @@
-"""Online reconstruction beside a clock: each frame is trained on until it has to be shown, and the past until the next frame comes."""
+"""Operator for online reconstruction of a live stream against display deadlines.
+
+Each frame is trained on until its deadline. Spare time until the next frame is spent on rehearsal.
+"""
 
 from __future__ import annotations
 
@@ -27,50 +30,54 @@ from operators.schedule import ScheduleEvent, ScheduleListener
 
 log = logging.getLogger(__name__)
 REHEARSED_AT_ONCE = 3
-"""Rehearsal steps between two looks for a new frame, on a GPU; on the CPU, where a step takes long, it is one."""
+"""Rehearsal steps on a GPU between two checks for a new frame. On the slower CPU it is one step."""
 GROWN_AT_LATEST = 10
-"""After so many frames without time to spare, tissue that the scene does not cover is looked for all the same."""
+"""Maximum number of trained frames between two growth steps; beyond it growth runs even without
+spare time.
+"""
 WAITING = 5
-"""Frames that may wait to be trained on, where a delay can be caught up with; beyond them the oldest is dropped."""
+"""Capacity of the input queue, in frames; if it is full, the oldest frame is dropped."""
 
 
 @dataclass
 class TrainingCounts:
-    """What live training did."""
+    """Statistics of live training."""
 
     frames: int = 0
-    """Frames that were trained on."""
+    """Number of frames that were trained on."""
     steps: int = 0
-    """Steps on the newest frame, before it was shown."""
+    """Optimiser steps on the newest frame before its display."""
     passed_over: int = 0
-    """Frames that were given up for newer ones."""
+    """Frames dropped for newer ones."""
     rehearsed: int = 0
-    """Steps on the window."""
+    """Rehearsal steps, on frames of the training window."""
     withheld: dict[str, int] = field(default_factory=dict)
-    """Frames that were not trained on, by reason."""
+    """Frames excluded from training (withheld or damaged), by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
-    """How often the scene began anew, by reason."""
+    """Number of scene restarts, by reason."""
     places_found: int = 0
-    """New scenes that were a place which the stream had left before."""
+    """New scenes recognised as a place that the stream had shown before."""
 
 
 class LiveReconstructOp(Operator):
-    """Trains on each frame until it has to be shown, publishes the model, and rehearses the past until the next frame comes.
+    """Trains on each frame until its display deadline, publishes the model, and rehearses until the
+    next frame.
 
-    Frames that are withheld or damaged are shown with the model as it stands. A new scene (`Frame.new_scene`, or another size) begins a new
-    model.
+    Withheld and damaged frames are shown with the current model and not trained on. A new scene
+    (`Frame.new_scene`, a changed scene number or picture size) starts a new model.
 
     Inputs:
-        frame: `Frame`; the newest one wins.
+        frame: `Frame`; frames that are too late are dropped.
 
     Outputs:
         reconstruction: `Reconstruction`.
 
     Params:
-        make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
-        clock: when a frame has to be shown.
-        listener: is told every call that changes the model, in order: with these a run can be repeated.
-        depth: where depth is found for the frames that are trained on, while training goes on; None: nowhere.
+        make_reconstructor: factory called in `start()`; the operator owns the result exclusively.
+        clock: display deadlines and training budgets.
+        listener: called with every call that changes the model, in order, so that a run can be
+            replayed.
+        depth: asynchronous depth estimator for the trained frames; None disables late depth.
     """
 
     def __init__(
@@ -88,30 +95,30 @@ class LiveReconstructOp(Operator):
         self.listener = listener
         self._late_depths = LateDepths(depth)
         self.newest: Model | Snapshot | None = None
-        """What was published last, for showing it."""
+        """Last published model, for display."""
         self.model: Model | None = None
-        """The newest model with its past; there once the run is over."""
+        """Newest model including archived parts; set when the run has ended."""
         self.counts = TrainingCounts()
         self._reconstructor: LiveReconstructor | None = None
         self._learned: Frame | None = None
-        """The newest frame that the model has seen."""
+        """Newest frame that the model was trained on."""
         self._scene = 0
-        """Number of the scene that the model shows."""
+        """Number of the scene that the model represents."""
         self._requests: deque[ModelRequest] = deque()
         self._eyes: Eyes = "left"
         self._since_grown = 0
-        """Frames that were trained on since the scene was last looked at for tissue that it does not cover."""
+        """Frames trained on since the last growth step."""
         super().__init__(fragment, *args, **kwargs)
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in the tensors of the whole model that is kept when the run ends."""
+        """Number of values in all tensors of the whole model, which is saved at the end of the run."""
         kept = self._reconstructor or self.model
         return 0 if kept is None else kept.parameter_count
 
     @property
     def newest_gaussians(self) -> int:
-        """How many Gaussians the newest model has."""
+        """Number of Gaussians in the last published model."""
         newest = self.newest
         if newest is None:
             return 0
@@ -129,7 +136,9 @@ class LiveReconstructOp(Operator):
         self._reconstructor = self.make_reconstructor()
 
     def prepare_thread(self) -> None:
-        """cuBLAS makes what it needs at the first matrix product of a thread, which takes longer than a frame."""
+        """Initialise cuBLAS in this thread. The first matrix product in a thread takes longer than
+        a frame interval.
+        """
         assert self._reconstructor is not None
         one = torch.ones(1, 1, device=self._reconstructor.device)
         torch.mm(one, one)
@@ -166,11 +175,11 @@ class LiveReconstructOp(Operator):
             self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
         camera = self._reconstructor.camera
         resized = (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px)
-        # The frame that began a scene may have been passed over, or withheld: its number tells.
+        # The scene number changes even if the first frame of the scene was dropped or withheld.
         other_scene = frame.new_scene is not None or frame.scene != self._scene
         if self.newest is None or resized or other_scene:
             if reason is not None:
-                return None  # nothing can be shown of it, and no scene begins with it
+                return None  # an unusable frame cannot start a scene, and no model exists to show it
             if self.newest is not None:
                 self._begin_scene(
                     frame, "resized" if resized else frame.new_scene or "begun by a frame that was not used"
@@ -186,7 +195,7 @@ class LiveReconstructOp(Operator):
             self._learned = frame
             self.counts.frames += 1
             self.counts.steps += report.steps
-            # What a scene starts from covers its first frame.
+            # The initialisation of a scene already covers its first frame.
             self._since_grown = 0 if first else self._since_grown + 1
         self._tell(ScheduleEvent("observe", seq=frame.seq, steps=report.steps, train=reason is None))
         self.newest = self._reconstructor.publish()
@@ -212,14 +221,16 @@ class LiveReconstructOp(Operator):
         self.newest = None
 
     def _take_depth(self) -> None:
-        """Let the model learn depth that was found meanwhile, of a frame that was trained on before."""
+        """Pass depth estimated in the meantime to the model, for a frame trained on earlier."""
         assert self._reconstructor is not None
         taken = self._late_depths.give(self._reconstructor, self.clock.now_ns)
         if taken is not None:
             self._tell(ScheduleEvent("take_depth", seq=taken.seq, frame=taken))
 
     def _rehearse(self, frame: Frame, frame_waits: Callable[[], bool]) -> None:
-        """Train on the window until the next frame waits or is due."""
+        """Grow the scene if due, then train on the window until the next frame waits or is
+        expected.
+        """
         assert self._reconstructor is not None
         at_once = REHEARSED_AT_ONCE if self._reconstructor.device.type == "cuda" else 1
         made = 0
@@ -249,21 +260,24 @@ class LiveReconstructOp(Operator):
             self.listener(event)
 
     def request_model(self) -> ModelRequest:
-        """Ask for the whole model, as it stands after the next frame; from any thread."""
+        """Request the whole model as of the next frame. Thread-safe."""
         request = ModelRequest()
         self._requests.append(request)
         return request
 
     def _answer_requests(self, frame: Frame) -> None:
-        """The picture is on its way by now, and what is left is the time for rehearsal."""
+        """Answer pending model requests after the picture was emitted, so that the work only delays
+        rehearsal.
+        """
         while self._requests:
             assert self._reconstructor is not None and self.newest is not None
             began_ns = time.perf_counter_ns()
-            # A snapshot on a GPU is whole, and stays as it is while it is held: whoever asked copies it, in a thread of its own.
+            # A GPU snapshot is complete and immutable while held. The requester copies it in its
+            # own thread.
             request, newest = self._requests.popleft(), self.newest
             try:
                 model = newest if isinstance(newest, Snapshot) else self._reconstructor.whole_model(newest)
-            except Exception as error:  # who asked learns of it, and the stream goes on
+            except Exception as error:  # reported to the requester; the stream continues
                 log.exception("the whole model was not copied")
                 request.refuse(f"{type(error).__name__}: {error}")
                 continue

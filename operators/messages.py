@@ -1,4 +1,4 @@
-"""What travels on the edges of the graph besides `Frame`: each step keeps the frame it belongs to and adds its own result."""
+"""Messages on the edges of the graph besides `Frame`. Each one carries its frame and adds a result."""
 
 from __future__ import annotations
 
@@ -19,23 +19,27 @@ from gsplat_core.transfers import HostCopy
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A frame and the model as it stands right after that frame's own training steps."""
+    """A frame and the model published right after training on that frame."""
 
     frame: Frame
     model: Model | Snapshot
-    """Later steps publish later versions and do not change this one, a snapshot in a slot for as long as somebody holds it."""
+    """Immutable: later training publishes new versions. A snapshot's slot is reused once it is no
+    longer referenced.
+    """
     trained: bool
-    """False for a held-out frame: it is shown and scored, and no step has seen it."""
+    """False for a frame that is displayed and scored but was not trained on."""
     steps: int = 0
-    """Optimiser steps that the frame was given."""
+    """Number of optimiser steps on this frame."""
     arriving_loss: HostCopy | None = None
-    """Loss of the last of these steps, which a GPU may not have finished; None when there was none."""
+    """Loss of the last step, possibly still in flight from the GPU; None without steps."""
     content: Frame | None = None
-    """Live: the newest frame that the model has seen, which is what its picture shows; None where the frame itself is meant."""
+    """Live runs: newest frame the model was trained on, which determines the picture's age. None
+    means `frame` itself.
+    """
     taken_ns: int | None = None
-    """Live: when training took the frame, by `time.monotonic_ns`."""
+    """Live runs: time at which training dequeued the frame, by `time.monotonic_ns`."""
     published_ns: int | None = None
-    """Live: when the model was published."""
+    """Live runs: time at which the model was published, by `time.monotonic_ns`."""
 
     def __post_init__(self) -> None:
         if self.steps < 0:
@@ -47,24 +51,25 @@ class Reconstruction:
 
     @property
     def loss(self) -> float | None:
-        """Loss of the last step; waits for it."""
+        """Loss of the last step; blocks until the GPU has finished. None without steps."""
         return None if self.arriving_loss is None else self.arriving_loss.item()
 
 
 @dataclass(frozen=True)
 class DeformedScene:
-    """A model at a frame's time, and the camera that saw the frame.
+    """A model with the timestamp to deform it to and the camera of the frame.
 
-    A renderer that deforms by itself, as the captured one on a GPU does, takes model and time; any other reader takes `gaussians`.
+    A renderer that deforms by itself, such as the captured GPU renderer, uses model and time. Other
+    consumers use `gaussians`.
     """
 
     frame: Frame
     model: Model | Snapshot
-    """Held for as long as this message is: a snapshot's slot is not overwritten meanwhile."""
+    """Referenced for the lifetime of this message, so that a snapshot's slot is not overwritten."""
     camera: Camera
     trained: bool
     reconstruction: Reconstruction | None = None
-    """What the scene was made from, where that is known."""
+    """Source message of the scene; None if unknown."""
 
     def __post_init__(self) -> None:
         if (self.camera.width_px, self.camera.height_px) != (self.frame.width_px, self.frame.height_px):
@@ -75,30 +80,32 @@ class DeformedScene:
 
     @property
     def time_s(self) -> float:
-        """The time that the scene is deformed to."""
+        """Timestamp of the deformation, in seconds."""
         return self.frame.time_s
 
     @property
     def gaussians(self) -> Gaussians:
-        """The Gaussians at that time; computed when asked for, and by a `Model` only once."""
+        """Gaussians deformed to `time_s`. Computed on access; a `Model` caches the result."""
         return self.model.at(self.time_s)
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A frame beside its reconstruction, ready to be shown."""
+    """A frame and its rendered reconstruction."""
 
     frame: Frame
     image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3], as displayed."""
+    """Reconstruction for display, uint8 RGB [H, W, 3]."""
     depth: NDArray[np.float32]
-    """z in millimetres (or the recording's unit) [H, W]; 0 = nothing there."""
+    """Depth along z, float32 [H, W], in millimetres or the recording's unit; 0 where nothing was
+    rendered.
+    """
     alpha: NDArray[np.float32]
-    """Opacity 0..1 [H, W]."""
+    """Opacity, float32 [H, W], 0..1."""
     model_version: int
     trained: bool
     steps: int = 0
-    """Optimiser steps that the frame was given."""
+    """Number of optimiser steps on this frame."""
     content: Frame | None = None
     """See `Reconstruction.content`."""
     taken_ns: int | None = None
@@ -120,39 +127,42 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A frame with the picture that the model gave of it before it was trained on it."""
+    """A frame and the picture that the model predicted before it was trained on the frame."""
 
     frame: Frame
     image: NDArray[np.uint8] | None
-    """RGB uint8 [H, W, 3], rendered at the frame's time and pose; None where no prediction was made."""
+    """uint8 RGB [H, W, 3], rendered at the frame's time and pose; None if no prediction was made.
+    """
 
 
 class PictureState(Enum):
-    """How a shown picture stands to the present."""
+    """Freshness of a displayed picture."""
 
     LIVE = "live"
-    """It shows a frame that came just now."""
+    """The picture shows a frame that has just arrived."""
     STALE = "stale"
-    """What it shows is older than a live picture may be; newer ones are on their way."""
+    """The content is older than the limit for a live picture; newer frames may be in flight."""
     FROZEN = "frozen"
-    """No newer picture has come for long."""
+    """No new content for longer than the frozen limit."""
     SOURCE_LOST = "source lost"
-    """The source gives no frames."""
+    """The source delivers no frames."""
 
 
 @dataclass(frozen=True)
 class ShownPicture:
-    """What is on the screen from a moment on."""
+    """A picture as it appears on the display."""
 
     rendered: RenderedFrame
     image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3]: the rendered picture with its state and age drawn into it, and remembered tissue marked."""
+    """Rendered picture with state, age and remembered tissue drawn in, uint8 RGB [H, W, 3]."""
     state: PictureState
     age_ns: int
-    """Time since the arrival of the newest frame that the picture shows, when it came on the screen."""
+    """Age at display: time since the newest frame in the picture arrived, in nanoseconds."""
     shown_ns: int
-    """When it came on the screen, by `time.monotonic_ns`."""
+    """Time of display, by `time.monotonic_ns`."""
     new: bool
-    """False when the picture was there before, and only its state or its age has changed."""
+    """False if the picture was displayed before and only its state or age changed."""
     remembered: NDArray[np.uint8] | None = None
-    """uint8 [H, W], 255 where the picture shows tissue that nobody saw when its content came; None: nowhere, or it was not looked for."""
+    """Mask of remembered tissue that was not visible in the content's frame, uint8 [H, W], 255 =
+    remembered. None if absent or not computed.
+    """

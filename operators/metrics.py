@@ -1,4 +1,4 @@
-"""Scores of displayed frames, trivial baselines beside them, and the digest of the displayed bytes."""
+"""Quality scores of displayed frames with trivial baselines, and a digest of the displayed bytes."""
 
 from __future__ import annotations
 
@@ -24,14 +24,19 @@ class ScoredFrame:
 
     rendered: RenderedFrame
     quality: FrameQuality
-    """Where the frame was trained on before it was shown, this is the training error of its picture."""
+    """Scores of the picture. For a frame trained on before display they measure the training error.
+    """
     previous_frame_db: float
-    """Tissue PSNR of the previous raw frame, shown instead: the trivial baseline. NaN for the first frame."""
+    """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline). NaN for the
+    first frame.
+    """
     next_frame_db: float = math.nan
-    """Tissue PSNR of the picture that the model gave of this frame before it was trained on it; NaN where there is none."""
+    """Tissue PSNR in dB of the prediction made before training on this frame; NaN without a
+    prediction.
+    """
 
     def as_json(self) -> Entry:
-        """One entry of the report's series; null where a measure does not exist."""
+        """Return one entry of the report's series, with None for missing measures."""
         frame = self.rendered.frame
         measures = {
             "psnr_tissue_db": self.quality.psnr_tissue_db,
@@ -51,36 +56,36 @@ class ScoredFrame:
 
 @dataclass(frozen=True)
 class NextFrameResult:
-    """How well the model predicts a frame before it is trained on it: the figure of a run that is no training error."""
+    """Accuracy of predictions of frames before training on them, as opposed to the training error."""
 
     psnr_tissue_db: float | None
-    """Mean tissue PSNR of the predictions."""
+    """Mean tissue PSNR of the predictions, in dB."""
     previous_frame_db: float | None
-    """Mean tissue PSNR of the previous raw frame over the same frames: the trivial prediction."""
+    """Mean tissue PSNR in dB of the previous raw frame over the same frames (trivial baseline)."""
     frames: int
-    """Frames that have both figures."""
+    """Number of frames with both values."""
 
 
 class NextFrameScores:
-    """Means of predicted frames and of their trivial baseline, over the frames that have both."""
+    """Running means of predictions and of their trivial baseline, over frames that have both."""
 
     def __init__(self) -> None:
         self._predicted, self._previous = ScoredMean(), ScoredMean()
 
     def add(self, predicted_db: float, previous_db: float) -> None:
-        """Take one frame's two figures; without effect where either is not finite."""
+        """Add the PSNR values of one frame, in dB. Ignored if either is not finite."""
         if math.isfinite(predicted_db) and math.isfinite(previous_db):
             self._predicted.add(predicted_db)
             self._previous.add(previous_db)
 
     @property
     def result(self) -> NextFrameResult:
-        """The means so far."""
+        """Means over the frames so far."""
         return NextFrameResult(self._predicted.mean, self._previous.mean, self._predicted.count)
 
 
 def prediction_db(prediction: Prediction | None) -> float:
-    """Return the tissue PSNR of a prediction against its frame; NaN where none was made."""
+    """Return the tissue PSNR of a prediction against its frame, in dB; NaN without a prediction."""
     if prediction is None or prediction.image is None:
         return math.nan
     return psnr_tissue_db(prediction.image, prediction.frame.image, prediction.frame.mask)
@@ -88,46 +93,49 @@ def prediction_db(prediction: Prediction | None) -> float:
 
 @dataclass(frozen=True)
 class QualityResult:
-    """Scores of a run's displayed frames."""
+    """Scores of all displayed frames of a run."""
 
     trained: QualityTracker
-    """Frames that were trained on before they were shown: training errors."""
+    """Frames trained on before display; their scores are training errors."""
     held_out: QualityTracker
-    """Frames that were shown and never trained on."""
+    """Frames displayed and never trained on."""
     series: tuple[Entry, ...]
-    """One entry per displayed frame, in order; of a long run, one per bin of frames (see `frame_log.series`)."""
+    """One entry per displayed frame in order, or per bin of frames in a long run (see
+    `frame_log.series`).
+    """
     frames_per_entry: int
     frames_sha256: str
     frames: int
-    """How many frames were displayed; damaged ones are among them, and are not scored."""
+    """Number of displayed frames, including damaged ones, which are not scored."""
 
 
 class MetricsOp(Operator):
-    """Scores each displayed frame against its raw frame, over tissue, and takes a digest of the bytes that were displayed.
+    """Scores each displayed frame against its raw frame on tissue, and hashes the displayed bytes.
 
-    The digest is SHA-256 over, for each frame in order, the line `seq width height\\n` and the RGB bytes of the reconstruction.
-    In memory only means are kept; each frame's own figures go to the log. A damaged frame is part of the digest and of the log, without
-    figures: a reconstruction is not measured against what the decoder guessed.
+    The digest is SHA-256 over the line `seq width height\\n` and the RGB bytes of each
+    reconstruction, in order. Only running means are kept in memory; the log holds the scores of
+    each frame. A damaged frame enters digest and log without scores, because its pixels are the
+    decoder's concealment.
 
     Inputs:
         rendered: `RenderedFrame`.
-        predicted: the `Prediction` of the same frame; may stay unconnected.
+        predicted: `Prediction` of the same frame; optional.
 
     Outputs:
         scored: `ScoredFrame`.
 
     Params:
-        log: where each frame's figures are written; without one there is no series.
+        log: per-frame log; without it the result has no series.
     """
 
     def __init__(self, fragment: Any, *args: Any, log: FrameLog | None = None, **kwargs: Any) -> None:
         self.log = log
         self.live = QualityTracker()
-        """Frames that were trained on before they were shown."""
+        """Frames trained on before display."""
         self.held_out = QualityTracker()
-        """Frames that were shown and never trained on."""
+        """Frames displayed and never trained on."""
         self.frames = 0
-        """How many frames arrived so far."""
+        """Number of frames so far."""
         self.next_frame = NextFrameScores()
         self._digest = hashlib.sha256()
         self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
@@ -158,7 +166,7 @@ class MetricsOp(Operator):
         rendered: RenderedFrame = op_input.receive("rendered")
         frame, previous = rendered.frame, self._previous
         self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
-        # Beside the scoring: neither keeps the interpreter's lock for long.
+        # Hashing runs in parallel to scoring; neither holds the GIL for long.
         hashed = self._hashing.submit(self._digest.update, np.ascontiguousarray(rendered.image).data)
         self.frames += 1
         quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
@@ -186,5 +194,5 @@ class MetricsOp(Operator):
 
     @property
     def frames_sha256(self) -> str:
-        """The digest so far, in hex."""
+        """SHA-256 of the frames so far, in hex."""
         return self._digest.hexdigest()

@@ -1,4 +1,4 @@
-"""Asking a reconstruction that runs for its whole model."""
+"""Request for the whole model of a running reconstruction, between two threads."""
 
 from __future__ import annotations
 
@@ -12,34 +12,42 @@ from gsplat_core.scene.snapshots import Snapshot
 
 @dataclass(frozen=True)
 class ModelAnswer:
-    """The model as it stood after a frame."""
+    """The whole model as of a given frame."""
 
     model: Model | Snapshot
     frame: Frame
     pause_ns: int
-    """How long the reconstruction stood still for it."""
+    """Time for which training paused to copy the model, in nanoseconds."""
 
 
 class ModelRequest:
-    """One question and its answer, between two threads."""
+    """Future of a model: the training thread answers or refuses, the requesting thread waits."""
 
     def __init__(self) -> None:
         self._answered = threading.Event()
         self._answer: ModelAnswer | None = None
         self.refused = ""
-        """Why there is no answer."""
+        """Reason for the refusal; empty unless refused."""
 
     def answer(self, model: Model | Snapshot, frame: Frame, pause_ns: int) -> None:
-        """Give the model."""
+        """Complete the request with a model.
+
+        Args:
+            model: the whole model.
+            frame: newest frame that the model includes.
+            pause_ns: time for which training paused, in nanoseconds.
+        """
         self._answer = ModelAnswer(model, frame, pause_ns)
         self._answered.set()
 
     def refuse(self, why: str) -> None:
-        """Say that there will be none."""
+        """Complete the request without a model; `why` is the reason for the user."""
         self.refused = why
         self._answered.set()
 
     def wait(self, timeout_s: float) -> ModelAnswer | None:
-        """The answer; None when it was refused, or has not come in time."""
+        """Wait for the answer. Return None if the request was refused or `timeout_s` seconds
+        elapsed.
+        """
         self._answered.wait(timeout_s)
         return self._answer

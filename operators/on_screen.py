@@ -1,4 +1,4 @@
-"""Scores of a live stream: the picture on the screen when the next frame arrived, against the frame before it."""
+"""Scores of a live stream: each frame against the picture on display when the next frame arrived."""
 
 from __future__ import annotations
 
@@ -23,57 +23,66 @@ from operators.outcome import OutcomeBuilder
 
 LOOK_NS = 500_000_000
 WAITING = 8
-"""Frames and pictures that may wait to be scored; beyond them the oldest go unscored and are counted."""
+"""Capacity of each input queue, in messages. If it is full the oldest is dropped and later counted
+as unscored.
+"""
 PREDICTIONS_KEPT = 64
-"""Frames whose figures are kept until their prediction arrives, or whose prediction is kept until they are scored."""
+"""Maximum number of stored scores whose counterpart (prediction or baseline) has not arrived."""
 TRIM_EVERY_S = 30.0
-"""How often memory that is free is given back to the system."""
+"""Period for returning free heap memory to the operating system, in seconds."""
 SIMILARITY_EVERY = 8
-"""SSIM takes several times as long as PSNR: it is measured on every so many frames."""
+"""SSIM is several times slower than PSNR, so it is computed for one in this many frames."""
 SETTLING_S = 1.0
-"""Figures of a stream that has settled leave out its first second, in which the model begins."""
+"""Start-up time in seconds that is excluded from settled scores, because the model is being
+initialised.
+"""
 
 
 @dataclass(frozen=True)
 class OnScreenResult:
-    """Figures of a live stream, besides the means of `QualityResult`."""
+    """Scores of a live stream that complement `QualityResult`."""
 
     settled_db: float | None
-    """Mean tissue PSNR after the first second: the training error of what was shown, at the age that it had."""
+    """Mean tissue PSNR after the first second, in dB: training error of the displayed pictures,
+    including their latency.
+    """
     worst_db: float | None
-    """Lowest tissue PSNR of a frame after the first second."""
+    """Lowest tissue PSNR of a frame after the first second, in dB."""
     worst_seq: int | None
-    """Number of that frame."""
+    """Sequence number of the frame with the lowest PSNR."""
     previous_frame_db: float | None
-    """Mean tissue PSNR of the previous raw frame, shown instead, after the first second."""
+    """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial baseline).
+    """
     previous_frame_throughout_db: float | None
-    """Mean tissue PSNR of the previous raw frame, over all frames that were scored."""
+    """Mean tissue PSNR in dB of the previous raw frame over all scored frames (trivial baseline).
+    """
     frames: int
-    """Frames that were scored."""
+    """Number of scored frames."""
     not_on_screen: int
-    """Frames that were never on the screen themselves: when the next frame arrived, an older picture was still there."""
+    """Scored frames whose own picture was not on display when the next frame arrived."""
     unscored: int
-    """Frames that arrived faster than they could be scored."""
+    """Frames that arrived too fast to be scored."""
 
 
 class OnScreenMetricsOp(Operator):
-    """Scores each frame by what was on the screen when the next frame arrived: the picture of this frame, or, where that came too late, the
-    older one that was still there. State and age are drawn into what is shown, and not into what is scored.
+    """Scores each frame against the picture on display when the next frame arrived.
 
-    The model has been trained on most of these frames before their picture was shown, so these figures are training errors. Predictions
-    are scored beside them (`NextFrameResult`), after the first second.
+    This is the frame's own picture or, if that was late, an older one. Overlays are not scored.
+    Most frames were trained on before display, so the scores are training errors. Predictions are
+    scored separately after the first second (`NextFrameResult`).
 
     Inputs:
-        frame: `Frame`, each one as it goes into reconstruction.
+        frame: `Frame`, as it enters reconstruction.
         shown: `ShownPicture`.
-        predicted: `Prediction` of some of the frames; may stay unconnected.
+        predicted: `Prediction` of some of the frames; optional.
 
     Outputs:
         scored: `ScoredFrame`.
 
     Params:
-        log: where each frame's figures are written; without one there is no series.
-        report: also measure SSIM and the digest of all pictures, which only a report shows, and contribute `QualityResult`.
+        log: per-frame log; without it the result has no series.
+        report: also compute SSIM and the digest, and contribute `QualityResult`; needed for reports
+            only.
     """
 
     def __init__(
@@ -97,7 +106,7 @@ class OnScreenMetricsOp(Operator):
 
     def stop(self) -> None:
         if self._frames:
-            # The last frame has no next one: what is on the screen at the end counts.
+            # The last frame has no successor and is scored against the final picture.
             self._frames.append(None)
             self._score_waiting(waiting=0)
         self._frames.clear()
@@ -108,7 +117,7 @@ class OnScreenMetricsOp(Operator):
 
     def _reset(self) -> None:
         self.quality = QualityTracker()
-        """Every frame that was scored."""
+        """Scores of all frames."""
         self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
         self.worst: tuple[float, int] | None = None
         self.next_frame = NextFrameScores()
@@ -117,9 +126,10 @@ class OnScreenMetricsOp(Operator):
         self._frames: deque[Frame | None] = deque()
         self._shown: deque[ShownPicture] = deque()
         self._predicted: OrderedDict[int, float] = OrderedDict()
-        """Tissue PSNR of predictions whose frame is not scored yet, by number."""
+        """Tissue PSNR in dB of predictions whose frame is not scored yet, by sequence number."""
         self._waiting_db: OrderedDict[int, float] = OrderedDict()
-        """Tissue PSNR of the previous raw frame, of frames whose prediction has not arrived."""
+        """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not arrived.
+        """
         self._on_screen: ShownPicture | None = None
         self._previous: Frame | None = None
         self._first_s: float | None = None
@@ -138,19 +148,22 @@ class OnScreenMetricsOp(Operator):
         prediction: Prediction | None
         while (prediction := op_input.receive("predicted")) is not None:
             self._take(prediction)
-        # Pictures come by another way than frames: a frame is scored when the one after the next is there.
+        # Pictures lag behind frames, so a frame is scored once the two following frames have
+        # arrived.
         for scored in self._score_waiting(waiting=2):
             op_output.emit(scored, "scored")
         while len(self._shown) > 4 * WAITING:
             self._show(self._shown.popleft())
         now_s = time.monotonic()
         if now_s - self._trimmed_s > TRIM_EVERY_S:
-            # Pictures come and go by the thousand: without this the process seems to grow for hours.
+            # Freed pictures fragment the heap; without trimming, resident memory grows for hours.
             self._trimmed_s = now_s
             return_freed_memory()
 
     def _score_waiting(self, waiting: int) -> list[ScoredFrame]:
-        """Score frames until so many are left besides the oldest, and return the scores."""
+        """Score the oldest frames until `waiting` frames remain in the queue, and return the
+        scores.
+        """
         scores = []
         while len(self._frames) > max(1, waiting):
             frame, following = self._frames[0], self._frames[1]
@@ -160,7 +173,7 @@ class OnScreenMetricsOp(Operator):
         return scores
 
     def _take(self, prediction: Prediction) -> None:
-        """Score a prediction, which on a slow machine arrives after its frame was scored."""
+        """Score a prediction. On a slow machine it arrives after its frame was scored."""
         value, seq = prediction_db(prediction), prediction.frame.seq
         if not math.isfinite(value):
             return
@@ -204,7 +217,7 @@ class OnScreenMetricsOp(Operator):
         self._count(frame, on_screen, quality, before_db)
         scored = ScoredFrame(on_screen.rendered, quality, before_db, self._next_frame_db(frame, before_db))
         if self.log is not None and self._log_works:
-            # What ended the run, a full disk say, is said once: `stop` writes no more into a log that has failed.
+            # Do not write again in `stop` after a failed write, so that the error is reported once.
             self._log_works = False
             self.log.write(_entry(scored, frame, on_screen, until_ns))
             self._log_works = True
@@ -228,7 +241,11 @@ class OnScreenMetricsOp(Operator):
         return self._first_s is not None and frame.time_s - self._first_s >= SETTLING_S
 
     def _next_frame_db(self, frame: Frame, before_db: float) -> float:
-        """Return what the prediction of a frame scores, where it has arrived; count it, or remember its baseline for when it comes."""
+        """Return the PSNR of the frame's prediction in dB; NaN if it has not arrived.
+
+        After the start-up time the pair is added to the means, or the baseline is kept until the
+        prediction arrives.
+        """
         value = self._predicted.pop(frame.seq, math.nan)
         if self._is_settled(frame) and math.isfinite(before_db):
             if math.isfinite(value):
@@ -262,7 +279,7 @@ def _keep(values: OrderedDict[int, float], seq: int, value: float) -> None:
 
 
 def _entry(scored: ScoredFrame, frame: Frame, on_screen: ShownPicture, until_ns: float) -> Mapping[str, Value]:
-    """One line of the log: the frame's figures, and what was on the screen."""
+    """Return the log entry of a frame: its scores and the state of the display."""
     rendered = on_screen.rendered
     arrived_ns = (rendered.content or rendered.frame).arrived_ns
     return {
@@ -282,5 +299,5 @@ def _entry(scored: ScoredFrame, frame: Frame, on_screen: ShownPicture, until_ns:
 
 
 def _since(arrived_ns: int | None, now_ns: int | None) -> float | None:
-    """Milliseconds from the arrival of a frame."""
+    """Return the milliseconds between two timestamps; None if either is unknown."""
     return None if arrived_ns is None or now_ns is None else round((now_ns - arrived_ns) * 1e-6, 3)

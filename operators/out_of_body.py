@@ -1,4 +1,4 @@
-"""Keeps pictures from outside of the body out of everything that comes after: the recorder, the network, training and the display."""
+"""Gate that withholds pictures taken outside of the patient's body from all downstream components."""
 
 from __future__ import annotations
 
@@ -20,50 +20,54 @@ from operators.outcome import OutcomeBuilder
 log = logging.getLogger(__name__)
 
 Policy = Literal["withhold", "off"]
-"""What is done with frames from outside: nothing of the picture goes on, or they pass like others and nothing is judged."""
+"""`withhold`: replace such frames by black; `off`: pass all frames without a check."""
 WITHHELD = "out of body"
-"""`Frame.withheld` of such a frame."""
+"""Value of `Frame.withheld` for frames that the gate replaced."""
 NOT_EXAMINED = "could not be examined"
 
 
 class Gate(Protocol):
-    """Decides picture by picture whether a stream is inside of the body."""
+    """Classifier of a stream's pictures: inside or outside of the body."""
 
     def judge(self, image: NDArray[np.uint8]) -> str | None:
-        """None where the picture, RGB uint8 [H, W, 3], was taken inside, otherwise why not."""
+        """Return None for a picture taken inside of the body, otherwise the reason. image: uint8
+        RGB [H, W, 3].
+        """
         ...
 
     def close(self) -> None:
-        """Count the present picture as taken outside."""
+        """Assume from now on that the scope is outside of the body."""
         ...
 
 
 @dataclass(frozen=True)
 class OutOfBodyFrames:
-    """What the gate did."""
+    """Statistics of the out-of-body gate."""
 
     policy: Policy
     passed: int
-    """Frames that went on as they came."""
+    """Frames passed unchanged."""
     withheld: Mapping[str, int] = field(default_factory=dict)
     """Frames whose picture was replaced, by reason."""
 
 
 class OutOfBodyGateOp(Operator):
-    """Replaces the pictures that were not clearly taken inside of the body. It belongs directly after the source.
+    """Replaces pictures that were not clearly taken inside of the body. Connect it directly to the
+    source.
 
-    A frame that is withheld is black, has no right picture, depth, pose or mask, is left out of every loss, and says so in `withheld`. Black
-    rather than pixelated: from blocks that change with every frame a moving scene can be put together again, and black holds nothing.
-    A picture that cannot be examined counts as taken outside.
+    A withheld frame is black, has no right picture, depth or pose, counts as tissue everywhere, and
+    is excluded from every loss. Black is used rather than pixelation, because a moving scene can be
+    recovered from blocks that change with every frame. A picture that cannot be examined is
+    withheld.
 
     Inputs:
         frame: `Frame`.
 
     Outputs:
-        frame: `Frame`.
+        frame: `Frame`; with `withheld` set if its picture was replaced.
 
     Params:
-        policy: "withhold", or "off": every frame passes and none is judged.
+        policy: "withhold" or "off".
     """
 
     policy: Policy
@@ -118,7 +122,7 @@ class OutOfBodyGateOp(Operator):
 
 
 def withheld(frame: Frame) -> Frame:
-    """The frame without anything that shows what the picture showed."""
+    """Return a copy of the frame without any picture content."""
     size = frame.image.shape[:2]
     right = None if frame.right_image is None else np.zeros_like(frame.right_image)
     return frame.with_fields(

@@ -1,4 +1,4 @@
-"""What a run has reached, put together from what its operators have to say."""
+"""Outcome of a run, collected from its operators."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Part = TypeVar("Part")
 
 
 class OutcomeBuilder:
-    """Takes parts of the outcome: at most one of each type, files by name, notes in sentences.
+    """Collects parts of the outcome, output files by name, and notes for the user.
 
-    A part is a value of a class of its own (a frozen dataclass), defined beside the operator that contributes it; whoever reads the outcome
-    asks for that class.
+    A part is a frozen dataclass defined in the module of the operator that contributes it. There is
+    at most one part per class, and readers look it up by its class.
     """
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class OutcomeBuilder:
         self._notes: list[str] = []
 
     def add(self, part: object) -> None:
-        """Take a part. Raises InvalidInput when there is one of its type."""
+        """Add a part. Raises InvalidInput if a part of the same class exists."""
         kind = type(part)
         if kind in self._parts:
             raise InvalidInput(
@@ -33,38 +33,39 @@ class OutcomeBuilder:
         self._parts[kind] = part
 
     def output(self, name: str, path: Path) -> None:
-        """Say that the file or folder `path` was written. Raises InvalidInput when another one has the name."""
+        """Register a written file or folder. Raises InvalidInput if another path has the name."""
         if self._outputs.setdefault(name, path) != path:
             raise InvalidInput(f"two outputs of one run are named {name!r}: {self._outputs[name]} and {path}")
 
     def note(self, text: str) -> None:
-        """Say something about the run, in a sentence."""
+        """Add a note on the run for the user, one sentence."""
         self._notes.append(text)
 
     def find(self, kind: type[Part]) -> Part | None:
-        """The part of this type; None where nobody contributed one."""
+        """Return the part of this class; None if no operator contributed it."""
         return cast("Part | None", self._parts.get(kind))
 
     @property
     def parts(self) -> Mapping[type, object]:
-        """The parts so far, by type."""
+        """Parts so far, by class."""
         return dict(self._parts)
 
     @property
     def outputs(self) -> dict[str, Path]:
-        """What was written so far, by name."""
+        """Paths of the outputs so far, by name."""
         return dict(self._outputs)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The notes so far, in order."""
         return tuple(self._notes)
 
 
 @runtime_checkable
 class Contributor(Protocol):
-    """An operator, or a whole graph, that has something to say about its run."""
+    """An operator or a graph that contributes to the outcome of its run."""
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add what is known now. Called once the run is over, and once before it starts, so that a conflict is found before any work."""
+        """Add the current results. Called before the run, to detect conflicts early, and after the
+        run.
+        """
         ...

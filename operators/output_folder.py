@@ -1,17 +1,19 @@
-"""The folder that a run writes into: a new one, an empty one, or one that an earlier run of ours has left.
+"""Output folder of a run: created, empty, or left by an earlier run of this program.
 
-A run collects its results in a folder of its own inside, `.run-…`, and they take the place of the earlier ones all together when it ends:
+A run collects its results in the staging folder `.run-…` inside the output folder. At the end the
+results replace the earlier ones in one transaction:
 
-    .run-…  →  .complete-…   from here on the new results count
+    .run-…  →  .complete-…   commit point: the new results are valid
     the earlier results      → .old-…
     the new results          → their names
     .old-… is removed
 
-A run that is killed in between leaves no mixture of two runs: before the first step the earlier results are untouched, and after it the next
-run in this folder first does the steps that are left.
+An interruption never mixes two runs. Before the commit point the earlier results are untouched.
+After it, the next run in the folder completes the remaining steps.
 
-The marker lists each file that a run wrote, with a fingerprint. Only these are replaced and removed. A run refuses a folder in which a listed
-file was changed, or in which another file lies among the results. Files that appear while a run works are kept under `kept-…`.
+The marker file lists every file of a run with a fingerprint. Only listed files are replaced or
+removed. A run refuses a folder with modified listed files or foreign files among the results. Files
+that appear during a run are moved to `kept-…`.
 """
 
 from __future__ import annotations
@@ -37,28 +39,43 @@ _FORMAT = "intrasplat-output"
 MOST_MARKER_BYTES = 1 << 26
 _COMPLETE, _OLD, _KEPT = ".complete-", ".old-", "kept-"
 _PASSING = re.compile(r"\.(run|complete|old)-[0-9a-f]{8}")
-"""Folders of a run that is under way, or was killed."""
+"""Names of the transaction folders of a running or killed run."""
 _CONTENTS = ".contents.json"
 _FINGERPRINT_BYTES = 1 << 16
 RECORDINGS = "recordings"
-"""Holds what runs have recorded, one folder each. It is written as the run goes on, and no later run replaces it."""
+"""Folder of recorded sessions, one sub-folder each. It is written during a run and never replaced
+by a later one.
+"""
 _RESULT = re.compile(
     r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png|evaluation\.(?:json|html)|evaluation-\w+\.jsonl"
 )
-"""The names of results. In a folder of an earlier version, whose marker lists no files, all of them are ours."""
+"""Names of results. With the marker of an old version, which lists no files, all of them count as
+results of a run.
+"""
 _KNOWN = re.compile(rf"(?:{_RESULT.pattern})|model/(?:model(?:\.next)?\.safetensors|manifest(?:\.next)?\.json)")
-"""Files of results, for markers without fingerprints."""
+"""Paths of result files, for markers without fingerprints."""
 
 
 class OutputFolder:
-    """An output folder, ours alone while entered. Write into `path`, then call `publish()`; without it nothing has changed.
+    """Context manager that owns an output folder exclusively.
 
-    `earlier` says whether an earlier run's results are there. Raises OutputError (where a run must not write: see `output_paths`),
-    OutputFolderInUse (the folder holds something that is not ours, or another run writes into it), StorageFull.
+    Write results to `path`, then call `publish()`. Without `publish()` the folder stays unchanged.
+    `earlier` is True if the folder contains results of an earlier run.
+
+    Raises:
+        OutputError: writing to the folder is not allowed (see `output_paths`).
+        OutputFolderInUse: the folder contains foreign files, or another run writes into it.
+        StorageFull: the disk is full.
     """
 
     def __init__(self, folder: Path, made_by: str, inputs: Sequence[Path] = ()) -> None:
-        """made_by: the command. inputs: what the run reads."""
+        """Set the parameters without touching the disk.
+
+        Args:
+            folder: the output folder.
+            made_by: the command line, for the marker.
+            inputs: paths that the run reads; the folder must not overlap them.
+        """
         self.folder, self.made_by, self.inputs = folder, made_by, tuple(inputs)
         self.earlier = False
         self._made: list[Path] = []
@@ -71,7 +88,7 @@ class OutputFolder:
             stack.callback(self._remove_what_was_made)
             self._make()
             stack.enter_context(FolderLock(self.folder))
-            # Another run may have ended between the look above and the lock.
+            # Another run may have ended between the first check and the lock.
             ours = check_output_folder(self.folder)
             _finish_what_was_begun(self.folder)
             self.earlier = ours and bool(_results(self.folder))
@@ -90,7 +107,7 @@ class OutputFolder:
         self._stack.close()
 
     def publish(self) -> None:
-        """Put what lies in `path` in the place of the earlier results. Nothing there: nothing changes."""
+        """Replace the earlier results by the contents of `path`. No effect if `path` is empty."""
         with storage_errors(self.folder):
             if not any(self.path.iterdir()):
                 return
@@ -101,21 +118,21 @@ class OutputFolder:
             try:
                 _switch_to(self.folder, complete, self.made_by)
             except KeyboardInterrupt:
-                _switch_to(self.folder, complete, self.made_by)  # a moment's work: rather than leave it to the next run
+                _switch_to(
+                    self.folder, complete, self.made_by
+                )  # finish now, which is quick, instead of leaving it to the next run
                 raise
 
     def _make(self) -> None:
         missing = [part for part in (self.folder, *self.folder.parents) if not os.path.lexists(part)]
         for part in reversed(missing):
-            with contextlib.suppress(
-                FileExistsError
-            ):  # two runs that make it at the same time: one of them gets the lock
+            with contextlib.suppress(FileExistsError):  # two runs create it concurrently; one of them gets the lock
                 part.mkdir()
                 self._made.append(part)
 
     def _remove_what_was_made(self) -> None:
         for part in reversed(self._made):
-            with contextlib.suppress(OSError):  # not empty: something was written, or somebody else uses it
+            with contextlib.suppress(OSError):  # not empty: it contains files or another program uses it
                 part.rmdir()
 
     def _remove_marker(self) -> None:
@@ -125,9 +142,10 @@ class OutputFolder:
 
 
 def check_output_folder(folder: Path) -> bool:
-    """Whether `folder` holds an earlier run of ours, whose results a new run replaces. Changes nothing.
+    """Return True if `folder` contains an earlier run, whose results a new run replaces. Read-only.
 
-    Raises OutputFolderInUse for anything else that is not a new or an empty folder.
+    Raises:
+        OutputFolderInUse: the folder is neither new, nor empty, nor an earlier run's.
     """
     if not os.path.lexists(folder):
         return False
@@ -148,7 +166,7 @@ def check_output_folder(folder: Path) -> bool:
 
 
 def is_whole_output(folder: Path) -> bool:
-    """Return True for the output folder of a run in which every file that the run wrote is there."""
+    """Return True if the folder's marker is valid and every file that it lists exists."""
     marker = _read_marker(folder)
     if marker is None:
         return False
@@ -158,12 +176,10 @@ def is_whole_output(folder: Path) -> bool:
 
 
 def _check_results(folder: Path, marker: dict[str, object]) -> None:
-    """Raise OutputFolderInUse when a file that no run of ours wrote would be replaced: one among the results, or one with a result's name."""
+    """Raise OutputFolderInUse if publishing would replace a file that no run of this program wrote."""
     ours = _results(folder)
     foreign = [entry.name for entry in folder.iterdir() if _RESULT.fullmatch(entry.name) and entry.name not in ours]
-    if (
-        marker.get("arriving") is None
-    ):  # else a run was killed while its results were moved; the next one ends that first
+    if marker.get("arriving") is None:  # otherwise an interrupted transaction is pending, which the next run completes
         foreign += [
             path.relative_to(folder).as_posix() for path in _foreign_files(folder, ours, _contents(marker, "contents"))
         ]
@@ -174,7 +190,7 @@ def _check_results(folder: Path, marker: dict[str, object]) -> None:
 
 
 def _passing(name: str) -> bool:
-    """Whether only a run that is under way, or was killed, leaves such a name."""
+    """Return True for names that only a running or killed run leaves."""
     return name == LOCK or _PASSING.fullmatch(name) is not None
 
 
@@ -187,27 +203,35 @@ def _read_marker(folder: Path) -> dict[str, object] | None:
 
 
 def _write_marker(folder: Path, made_by: str, files: Iterable[str], **more: object) -> None:
-    """files: the results that are, or are about to be, in the folder. more: `contents`, fingerprints by path; while results arrive also `arriving`,
-    the folder from which they are moved, and `earlier`, the contents that they replace."""
+    """Write the marker file.
+
+    Args:
+        folder: the output folder.
+        made_by: the command line.
+        files: names of results that are, or will be, in the folder.
+        more: `contents` (fingerprints by path). During a transaction also `arriving` (source
+            folder)
+            and `earlier` (fingerprints of the replaced results).
+    """
     marker = {"format": _FORMAT, "version": 1, "made_by": made_by, "files": sorted(files), **more}
     write_whole(folder / MARKER, (json.dumps(marker) + "\n").encode())
 
 
 def _write_contents(results: Path) -> None:
-    """Note the fingerprint of every file of a run that is complete, beside its results."""
+    """Write the fingerprints of all files of a complete run into its results folder."""
     found = {path.relative_to(results).as_posix(): _fingerprint(path) for path in _files_in(results)}
     write_whole(results / _CONTENTS, json.dumps(found).encode())
 
 
 def _files_in(folder: Path) -> Iterator[Path]:
-    """Yield every file below a folder. Links are files."""
+    """Yield every file below a folder. Links to folders count as files."""
     for parent, folders, names in os.walk(folder):
         for name in [*names, *(each for each in folders if os.path.islink(os.path.join(parent, each)))]:
             yield Path(parent) / name
 
 
 def _fingerprint(path: Path) -> str:
-    """Return a digest of a file's length, beginning and end: enough to notice that somebody put another file in its place."""
+    """Return a digest of a file's length, beginning and end, to detect replaced files."""
     with open_regular(path, follow_links=False) as file:
         size = os.fstat(file.fileno()).st_size
         digest = hashlib.sha256(f"{size}\n".encode())
@@ -218,13 +242,15 @@ def _fingerprint(path: Path) -> str:
 
 
 def _contents(marker: dict[str, object], name: str) -> dict[str, str] | None:
-    """Return fingerprints by path; None of a marker that an earlier version wrote, which lists none."""
+    """Return fingerprints by path; None for a marker of an old version without fingerprints."""
     found = marker.get(name)
     return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else None
 
 
 def _foreign_files(folder: Path, results: Iterable[str], contents: dict[str, str] | None) -> list[Path]:
-    """Return the files among the results in `folder` that the run which wrote `contents` did not write, or that were changed since."""
+    """Return the files among the results that the run of `contents` did not write, or that changed
+    since.
+    """
     found = []
     for name in results:
         top = folder / name
@@ -243,7 +269,9 @@ def _foreign_files(folder: Path, results: Iterable[str], contents: dict[str, str
 
 
 def _results(folder: Path) -> list[str]:
-    """The names of the results that the marker lists and that are there. A name that leads elsewhere is no result of ours."""
+    """Return the names of existing results listed in the marker. Names with path separators are
+    ignored.
+    """
     marker = _read_marker(folder) or {}
     listed = marker.get("files")
     if not isinstance(listed, list):
@@ -253,7 +281,9 @@ def _results(folder: Path) -> list[str]:
 
 
 def _switch_to(folder: Path, complete: Path, made_by: str) -> None:
-    """Put the results in `complete` in the place of the earlier ones; may be called again after it was stopped at any point."""
+    """Replace the earlier results by those in `complete`. Resumable after an interruption at any
+    point.
+    """
     old = folder / (_OLD + complete.name.removeprefix(_COMPLETE))
     marker = _read_marker(folder) or {}
     arriving = [entry.name for entry in complete.iterdir() if entry.name != _CONTENTS]
@@ -279,13 +309,13 @@ def _switch_to(folder: Path, complete: Path, made_by: str) -> None:
 def _read_contents(complete: Path) -> dict[str, str]:
     try:
         found = json.loads(read_regular(complete / _CONTENTS, MOST_MARKER_BYTES))
-    except FileNotFoundError:  # an earlier version was killed here
+    except FileNotFoundError:  # an old version was interrupted here
         return {path.relative_to(complete).as_posix(): _fingerprint(path) for path in _files_in(complete)}
     return dict(found)
 
 
 def _remove_own(folder: Path, old: Path, contents: dict[str, str] | None) -> None:
-    """Remove the replaced results of an earlier run. Files that the run did not write stay, in a folder `kept-…`."""
+    """Remove the replaced results of an earlier run. Foreign files are moved to `kept-…`."""
     if not old.is_dir():
         return
     foreign = _foreign_files(old, [entry.name for entry in old.iterdir()], contents)
@@ -298,7 +328,7 @@ def _remove_own(folder: Path, old: Path, contents: dict[str, str] | None) -> Non
 
 
 def _finish_what_was_begun(folder: Path) -> None:
-    """After a run that was killed: put its results in place if they were complete, and remove what is left of it."""
+    """Complete or roll back the transaction of a killed run and remove its folders."""
     marker = _read_marker(folder) or {}
     for entry in sorted(folder.iterdir()):
         if _PASSING.fullmatch(entry.name) and entry.is_dir() and not entry.is_symlink():

@@ -1,4 +1,4 @@
-"""Where a run must not write: into a recording, over its own input, over what the user works in."""
+"""Rules on paths that a run must not write to: recordings, inputs, home and current folders."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from operators.own_files import is_own_file
 
 _UNSPECIFIC = frozenset({"images", "flow", "views"})
 SIDECARS = _UNSPECIFIC | {"images_right", "masks", "depth", "true_depth", "scene_flow"}
-"""Folders inside a recording whose every file belongs to it."""
+"""Names of sub-folders that belong to a recording."""
 DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json")
-"""Files that only a recording's folder has."""
+"""Names of files that occur only in a recording's folder."""
 MAX_PATH_BYTES = 4096
 BATCH_DATABASE = "batch.sqlite"
-"""Lies beside the results of a batch, which other runs must not replace: the batch would take theirs for its own."""
+"""Database next to the results of a batch. Other runs must not replace these results."""
 MARKER = ".intrasplat.json"
-"""Lies in every folder that this program has made, and only there."""
+"""Marker file of folders that this program created."""
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".npy", ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
 
 
 def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
-    """Raises OutputError where a run with these inputs must not collect its results in the folder `out`."""
+    """Raise OutputError if a run with these inputs must not use `out` as its output folder."""
     if len(os.fsencode(out)) >= MAX_PATH_BYTES:
         raise OutputError(f"--out has {len(os.fsencode(out))} bytes; a path has at most {MAX_PATH_BYTES - 1}")
     real = Path(os.path.realpath(out))
@@ -48,17 +48,18 @@ def check_file_path(
     into_recording: bool = False,
     option: str = "--out",
 ) -> None:
-    """Raise OutputError where a command with these inputs must not write the file `out`.
+    """Raise OutputError if a command with these inputs must not write the file `out`.
 
-    A file replaces nothing but an earlier output of this program, with `overwrite`. It never replaces an input, a part of one, or a file that another
-    name of an input leads to, and is never put among a recording's pictures.
+    With `overwrite`, an earlier output of this program is replaced, and no other file. An input, a
+    part of one or a hard link to one is never replaced, and no file is put among a recording's
+    pictures.
 
     Args:
-        out: The file.
-        inputs: Files and folders that the command reads.
-        overwrite: Replace an earlier output.
-        into_recording: `out` is made to lie in a recording's folder, beside its description.
-        option: Name by which the user gave `out`, for the messages.
+        out: the output file.
+        inputs: files and folders that the command reads.
+        overwrite: replace an earlier output.
+        into_recording: `out` belongs into a recording's folder, next to its description.
+        option: command line option that set `out`, for the messages.
     """
     if "\0" in str(out) or len(os.fsencode(out)) >= MAX_PATH_BYTES:
         raise OutputError(f"{option} {str(out)[:80]!r} is no name that a file can have; give another one")
@@ -101,7 +102,7 @@ def _check_no_recording(folder: Path, option: str) -> None:
 
 
 def _part_of(inputs: Sequence[Path], out: Path) -> Path | None:
-    """Return the file of an input that `out` is a hard link of."""
+    """Return the input file of which `out` is a hard link; None if there is none."""
     status = out.stat()
     if status.st_nlink < 2:
         return None
@@ -115,7 +116,15 @@ def _part_of(inputs: Sequence[Path], out: Path) -> Path | None:
 
 
 def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path], option: str = "--out") -> None:
-    """Raise OutputError when `real`, which the user called `out`, is inside an input or among a recording's images, masks or depth."""
+    """Raise OutputError if an output path is inside an input or among a recording's images, masks
+    or depth.
+
+    Args:
+        real: the resolved output path.
+        out: the path as given by the user, for the messages.
+        inputs: paths that the command reads.
+        option: command line option that set the path, for the messages.
+    """
     for source in inputs:
         if any(_same(parent, source) for parent in _with_parents(real)):
             raise OutputError(f"{option} {out} lies inside {source}, which the run reads; choose another {option}")
@@ -127,17 +136,22 @@ def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path], optio
 
 
 def _has_sidecar(folder: Path, name: str) -> bool:
-    """Whether a folder called `name` inside `folder` is part of a recording there (see `layouts`)."""
+    """Return True if the sub-folder `name` of `folder` is part of a recording there (see
+    `layouts`).
+    """
     if (folder / MARKER).exists() or not folder.is_dir():
         return False
     if any((folder / description).exists() for description in DESCRIPTIONS):
         return True
-    # Beside a video or pictures, a folder of an unspecific name means nothing. The others are read along with them.
+    # Next to a video or pictures, sub-folders of unspecific names are not read by the recording's
+    # loader.
     return name not in _UNSPECIFIC and (_holds_pictures(folder / "images") or _holds_pictures(folder))
 
 
 def _holds_pictures(folder: Path) -> bool:
-    """Whether a folder has pictures, videos or arrays of its own, and not those of a run of ours."""
+    """Return True if the folder contains pictures, videos or arrays that are not results of this
+    program.
+    """
     if (folder / MARKER).exists() or not folder.is_dir():
         return False
     return any(entry.suffix.lower() in _PICTURES for entry in folder.iterdir())
@@ -150,7 +164,7 @@ def _with_parents(path: Path) -> Iterator[Path]:
 
 
 def _same(first: Path, second: Path) -> bool:
-    """Whether two names lead to one file or folder; a bind mount or a system that ignores case gives one folder two names."""
+    """Return True if both paths name one file or folder, also through bind mounts or ignored case."""
     if first == second:
         return True
     try:

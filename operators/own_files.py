@@ -1,7 +1,7 @@
-"""Recognition of files that this program wrote, by their content. `--overwrite` replaces such files and no others.
+"""Recognition of this program's output files by content, so that `--overwrite` replaces no others.
 
-Each kind of output carries a mark of its own: a comment in a `.ply` or `.mp4`, the generator of a `.glb`, bytes behind the array of a `.npy`. A `.splat`
-has no place for a mark; its rows are checked instead.
+Each format carries a mark: a comment in `.ply` and `.mp4`, the generator of `.glb`, bytes after the
+array of `.npy`. A `.splat` has no space for a mark, so its rows are validated instead.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MOST_JSON_BYTES = 64 << 20
 
 
 def is_own_file(path: Path) -> bool:
-    """Return True if the file at `path` has the mark of this program's outputs of that suffix. False for a missing or unreadable file."""
+    """Return True if the file has the mark for its suffix. False for a missing or unreadable file."""
     recognise = _KINDS.get(path.suffix.lower())
     if recognise is None:
         return False
@@ -82,7 +82,7 @@ def _sequence(file: BinaryIO) -> bool:
 
 
 def _packed(file: BinaryIO) -> bool:
-    """Return True for a tar archive that begins with a manifest, as `pack` writes it."""
+    """Return True for a tar archive whose first member is a manifest, as written by `pack`."""
     block = file.read(512)
     return block[:100].rstrip(b"\0") == b"manifest.json" and block[257:262] == b"ustar"
 

@@ -1,4 +1,4 @@
-"""Where the scope was at each frame: the poses that came with the frames, or those that are estimated from the pictures, frame by frame."""
+"""Camera poses of frames: recorded with the stream, or estimated frame by frame from the pictures."""
 
 from __future__ import annotations
 
@@ -19,33 +19,36 @@ Poses = Literal["given", "estimated"]
 
 @dataclass(frozen=True)
 class EstimatedPoses:
-    """What the estimate of a run's poses came to."""
+    """Statistics of the pose estimation of a run."""
 
     frames: int
     not_placed: int
-    """Frames that stand where the one before stood: they were withheld, or too little of them could be recognised."""
+    """Frames that kept the previous pose, because they were withheld or had too few matched
+    features.
+    """
     begun: int
-    """How often points were taken up in a scene of which nothing was known; 1 where the scope was never lost."""
+    """Number of map initialisations; 1 if tracking was never lost."""
     returned: int
-    """How often an earlier key frame was seen again, by which poses are corrected."""
+    """Number of loop closures: recognised earlier key frames, which correct the poses."""
     explained: float
-    """Share of the pictures' motion, as a typical square, that the poses explain."""
+    """Share of the squared image motion that the poses explain, at most 1."""
     measured: bool
-    """Whether lengths have the unit of a depth that the frames had."""
+    """True if translations have the unit of the frames' depth."""
 
 
 class PoseOp(Operator):
-    """Gives each frame the pose that its picture and those before it tell, whatever pose it came with.
+    """Estimates the pose of each frame by visual odometry and replaces a recorded pose.
 
     Inputs:
-        frame: `Frame`, with its tool mask.
+        frame: `Frame` with its tool mask.
 
     Outputs:
         frame: `Frame` with `pose`.
 
     Params:
-        camera: that of the frames; the first one stands there. Raises InvalidSetting for one that is no pinhole.
-        measured: whether lengths may be told from the depth that frames come with.
+        camera: camera of the frames; its pose is the pose of the first frame. Raises InvalidSetting
+            if it is not a pinhole camera.
+        measured: allow the scale of translations to be taken from the frames' depth.
     """
 
     def __init__(self, fragment: Any, *args: Any, camera: Camera, measured: bool = True, **kwargs: Any) -> None:
@@ -97,7 +100,9 @@ class PoseOp(Operator):
 
 
 def check_poses(choice: str, camera: Camera) -> None:
-    """Raises InvalidSetting for what is not a name in `Poses`, and for frames whose poses cannot be estimated where that is asked for."""
+    """Raise InvalidSetting for an unknown choice, or for a camera that pose estimation does not
+    support.
+    """
     if choice not in get_args(Poses):
         raise InvalidSetting(f"poses is {choice!r}; choose {' or '.join(get_args(Poses))}")
     if choice == "estimated":
@@ -108,7 +113,14 @@ def check_poses(choice: str, camera: Camera) -> None:
 
 
 def pose_operators(fragment: Any, choice: Poses, camera: Camera, depth: str) -> Sequence[Operator]:
-    """What stands in front of depth so that frames have the poses that `choice` asks for: nothing for those that they come with. depth: the setting."""
+    """Return the operators to insert before depth estimation; none for recorded poses.
+
+    Args:
+        fragment: the graph.
+        choice: `given` (recorded) or `estimated`.
+        camera: camera of the frames.
+        depth: the setting `depth`; selects whether the frames' depth sets the scale.
+    """
     if choice == "given":
         return ()
     return (PoseOp(fragment, name="pose", camera=camera, measured=depth in ("auto", "recorded", "stereo")),)

@@ -1,4 +1,6 @@
-"""Render the deformed model from the camera of its frame, and predict frames that the model has not been trained on."""
+"""Rendering of the deformed model from the frame's camera, and prediction of frames before
+training.
+"""
 
 from __future__ import annotations
 
@@ -23,34 +25,36 @@ from operators.messages import DeformedScene, Prediction, RenderedFrame
 
 
 def displayed(image: torch.Tensor) -> NDArray[np.uint8]:
-    """A float image [H, W, 3] in 0..1 as it is displayed: RGB uint8, clipped and rounded to nearest."""
+    """Convert a float image [H, W, 3] in 0..1 to uint8 RGB on the host, clipped and rounded to
+    nearest.
+    """
     return _displayed(image).numpy()
 
 
 def _displayed(image: torch.Tensor) -> HostCopy:
-    # Rounded where it is: a byte per channel travels, not four.
+    # Converted on the device, to transfer one byte per channel instead of four.
     return HostCopy((image.clamp(0, 1) * 255).round().to(torch.uint8))
 
 
 class Rasterizer:
-    """Renders colour, depth and opacity with the renderer of a name, for one thread at a time.
+    """Renders colour, depth and opacity. Not thread-safe.
 
-    On a GPU a frame is queued on a stream of its own, which goes before the training that is queued for later frames; the calling thread waits
-    until the picture has arrived in page-locked memory.
+    On a GPU, work is queued on a high-priority stream, ahead of training queued for later frames.
+    The calling thread blocks until the picture is in page-locked host memory.
     """
 
     def __init__(self, renderer: str) -> None:
-        """renderer: a name in `gsplat_core.rendering.registry.RENDERERS`."""
+        """renderer: name in `gsplat_core.rendering.registry.RENDERERS`."""
         self.renderer = renderer
         self._made: Renderer | None = None
         self._made_for: tuple[int, int, str, torch.device] | None = None
         self._stream: torch.cuda.Stream | None = None
 
     def draw(self, scene: DeformedScene) -> RenderedFrame:
-        """Render a scene; returns when picture, depth and opacity are on the host."""
+        """Render a scene. Blocks until picture, depth and opacity are on the host."""
         with torch.inference_mode(), self._own_stream(scene.model):
             picture, output = self._render(scene, STANDARD_OUTPUTS)
-            # All three are queued before the first is waited for.
+            # Queue all three copies before waiting for the first.
             image, depth, alpha = _displayed(picture), HostCopy(output.depth), HostCopy(output.alpha)
             made_from = scene.reconstruction
             return RenderedFrame(
@@ -67,12 +71,12 @@ class Rasterizer:
             )
 
     def picture(self, scene: DeformedScene) -> NDArray[np.uint8]:
-        """Render the picture of a scene alone, RGB uint8 [H, W, 3]."""
+        """Render only the picture of a scene, uint8 RGB [H, W, 3]."""
         with torch.inference_mode(), self._own_stream(scene.model):
             return _displayed(self._render(scene, ("image",))[0]).numpy()
 
     def _render(self, scene: DeformedScene, outputs: Iterable[str]) -> tuple[torch.Tensor, RenderOutput]:
-        """Return the picture at the frame's exposure, and what was rendered."""
+        """Render a scene. Return the image scaled by the frame's exposure, and the raw output."""
         renderer = self._renderer_for(scene)
         reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
         renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
@@ -95,7 +99,7 @@ class Rasterizer:
         if self._stream is None:
             self._stream = torch.cuda.Stream(model.device, priority=-1)
         if isinstance(model, Model):
-            # Nothing says when its copy was complete; a snapshot orders that by itself.
+            # A plain model has no completion event; a snapshot synchronises by itself.
             self._stream.wait_stream(torch.cuda.current_stream(model.device))
         return cast(AbstractContextManager[Any], torch.cuda.stream(self._stream))
 
@@ -103,22 +107,21 @@ class Rasterizer:
 class RasterizeOp(Operator):
     """Renders colour, depth and opacity of each scene.
 
-    On a GPU this operator's thread waits for the picture (see `Rasterizer`); the other threads go on meanwhile.
-
-    With `predict_every` it also renders predictions: the model of the scene before, at the time and pose of this scene's frame, which that model
-    has not been trained on. Each picture is emitted before its prediction is rendered.
+    On a GPU this operator's thread blocks until the picture is on the host (see `Rasterizer`). With
+    `predict_every` the previous scene's model is also rendered at the time and pose of the current
+    frame, which that model was not trained on. Each picture is emitted before its prediction.
 
     Inputs:
         scene: `DeformedScene`.
 
     Outputs:
-        rendered: `RenderedFrame`, complete.
-        predicted: with `predict_every`, one `Prediction` for each frame.
+        rendered: `RenderedFrame`.
+        predicted: `Prediction` for each frame, if `predict_every` is set; its image may be None.
 
     Params:
-        renderer: a name in `gsplat_core.rendering.registry.RENDERERS`.
-        predict_every: every so many frames one is predicted; 0: none.
-        rasterizer: one that was used already; this operator is its only user from now on. None: it makes one.
+        renderer: name in `gsplat_core.rendering.registry.RENDERERS`.
+        predict_every: predict one in this many frames; 0 disables prediction.
+        rasterizer: warm rasterizer owned by this operator from now on; None creates one.
     """
 
     renderer: str
@@ -141,7 +144,7 @@ class RasterizeOp(Operator):
         self._before, self._drawn = None, 0
 
     def stop(self) -> None:
-        # Both hold a model and, on a GPU, memory.
+        # Both reference a model and GPU memory.
         self._rasterizer = self._before = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
@@ -157,7 +160,7 @@ class RasterizeOp(Operator):
         self._drawn += 1
         if before is None or self._drawn % self.predict_every or not _is_predictable(before, scene):
             return Prediction(scene.frame, None)
-        # The exposure is found in the picture, which a prediction does not know.
+        # Exposure is estimated from the frame's own picture, which a prediction must not use.
         frame = scene.frame.with_fields(exposure=before.frame.exposure)
         return Prediction(
             scene.frame, rasterizer.picture(replace(scene, frame=frame, model=before.model, reconstruction=None))
@@ -165,7 +168,7 @@ class RasterizeOp(Operator):
 
 
 def _is_predictable(before: DeformedScene, scene: DeformedScene) -> bool:
-    """Return True where `scene` continues the scene `before` with a frame that can be scored."""
+    """Return True if `scene` continues `before` and its frame can be scored."""
     frame, earlier = scene.frame, before.frame
     usable = frame.status is not FrameStatus.DAMAGED and frame.withheld is None
     continues = frame.new_scene is None and frame.scene == earlier.scene and frame.image.shape == earlier.image.shape

@@ -1,4 +1,4 @@
-"""Online reconstruction: the operator that owns the model and trains it as frames arrive."""
+"""Operator for online reconstruction: owns the model and trains it on arriving frames."""
 
 from __future__ import annotations
 
@@ -18,37 +18,39 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class ModelResult:
-    """The model of a run."""
+    """Final model of a run."""
 
     model: Model
-    """The newest one, in memory of its own."""
+    """Newest version, as an independent copy."""
 
 
 @dataclass(frozen=True)
 class TrainedEyes:
-    """Which pictures of a stereo scope the model was trained on."""
+    """Cameras of a stereo scope whose pictures the model was trained on."""
 
     eyes: Eyes
 
 
 def never_held_out(frame: Frame) -> bool:
-    """Every frame is trained on."""
+    """Return False: all frames are trained on."""
     return False
 
 
 class ReconstructOp(Operator):
-    """Trains on each frame and publishes the model right after, so that what is shown has seen the frame it shows.
+    """Trains on each frame, then publishes the model, so that a frame's picture includes its own
+    training.
 
     Inputs:
         frame: `Frame`.
 
     Outputs:
-        reconstruction: `Reconstruction` with the model as it is then: an immutable `Model`, or on a GPU a `Snapshot`.
+        reconstruction: `Reconstruction` with an immutable `Model`, or a `Snapshot` on a GPU.
 
     Params:
-        make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
-        held_out: frames for which it answers True are passed on with the newest model and never trained on. Damaged and withheld frames are
-            too; withheld frames before the first model are dropped.
+        make_reconstructor: factory called in `start()`; the operator owns the result exclusively.
+        held_out: returns True for frames to exclude from training. Such frames, and damaged or
+            withheld ones, are passed on with the newest model. Withheld frames before the first
+            model are dropped.
     """
 
     def __init__(
@@ -62,14 +64,14 @@ class ReconstructOp(Operator):
         self.make_reconstructor = make_reconstructor
         self.held_out = held_out
         self.newest: Model | Snapshot | None = None
-        """What was published last."""
+        """Last published model or snapshot."""
         self._reconstructor: Reconstructor | None = None
         self._eyes: Eyes = "left"
         super().__init__(fragment, *args, **kwargs)
 
     @property
     def model(self) -> Model | None:
-        """What was published last, as a model in memory of its own; on a GPU it is copied when it is asked for."""
+        """Last published model as an independent copy; on a GPU it is copied on access."""
         return None if self.newest is None else self.newest.as_model()
 
     def setup(self, spec: OperatorSpec) -> None:
@@ -81,7 +83,7 @@ class ReconstructOp(Operator):
         self.newest = None
 
     def stop(self) -> None:
-        # The optimiser's state and the slots go; the last model stays for whoever saves it.
+        # Free the optimiser state and the slots; keep the last model for saving.
         self.newest = self.model
         if self._reconstructor is not None:
             self._eyes = self._reconstructor.eyes.trained
@@ -91,12 +93,12 @@ class ReconstructOp(Operator):
         assert self._reconstructor is not None
         frame = op_input.receive("frame")
         if self.newest is None and frame.withheld is not None:
-            return  # there is nothing to show it with, and a model must not begin with it
-        # Without a first frame there is no model that a held-out one could be shown with.
+            return  # no model exists to show the frame, and a withheld frame must not start one
+        # The first frame is always trained on, because a held-out frame needs a model.
         kept_out = frame.status is FrameStatus.DAMAGED or frame.withheld is not None or self.held_out(frame)
         train = self.newest is None or not kept_out
         report = self._reconstructor.observe(frame, train=train)
-        # A held-out frame changes no parameter, but the model's time window now reaches it.
+        # A held-out frame changes no parameters but extends the model's time window.
         self.newest = self._reconstructor.publish()
         op_output.emit(
             Reconstruction(frame, self.newest, trained=train, steps=report.steps, arriving_loss=report.arriving_loss),

@@ -1,4 +1,4 @@
-"""Which part of a picture shows tissue that nobody sees at this moment, and how that is marked."""
+"""Detection and marking of remembered tissue: rendered, but not visible in the current frame."""
 
 from __future__ import annotations
 
@@ -10,33 +10,41 @@ from operators.endoscope.stage import tissue_of
 from operators.messages import RenderedFrame
 
 COVERED = 0.1
-"""Opacity from which on a picture shows something; where it is more transparent it is nearly black, and nothing is remembered there."""
+"""Minimum opacity of a covered pixel. Below it a pixel is nearly black and not marked."""
 DARKENED = 0.65
-"""How bright remembered tissue is drawn, beside what it was; it is drawn without colour."""
+"""Brightness factor of remembered tissue, which is drawn in grey."""
 LINES_PER_HEIGHT = 300
-"""The outline's width is the picture's height over this: 2 px of 512, so that video coding leaves it there."""
+"""Picture height divided by outline width. Gives 2 px at 512 px, which survives video coding."""
 
 
 class RememberedTissue:
-    """Finds remembered tissue in pictures from the endoscope's own view, and marks it.
+    """Finds and marks remembered tissue in pictures from the endoscope's own view.
 
-    Keeps the memory that it works in, of the size of the last picture. For one thread at a time.
+    Reuses work buffers of the size of the last picture. Not thread-safe.
     """
 
     def __init__(self) -> None:
         self._resize(0, 0)
         self._found: tuple[NDArray[np.uint8], tuple[int, int, int, int]] | None = None
-        """The last layer, and a box with all of it: left, top, width and height."""
+        """Last mask and its bounding box: left, top, width, height in pixels."""
 
     def _resize(self, height_px: int, width_px: int) -> None:
         self._grey, self._tools, self._scratch = (np.empty((height_px, width_px), np.uint8) for _ in range(3))
         self._colourless = np.empty((height_px, width_px, 3), np.uint8)
 
     def layer(self, rendered: RenderedFrame, whole: bool = False) -> NDArray[np.uint8] | None:
-        """uint8 [H, W], 255 where the picture shows tissue that the frame whose content it shows does not: behind a tool, under a
-        recorder's strip, outside of the field of view. 0 elsewhere; None where there is none.
+        """Return the mask of rendered tissue that is not visible in the content's frame.
 
-        whole: nobody sees any of the picture. Highlights are seen: the picture has them as the frame has them.
+        Such tissue is behind a tool, under the recorder's on-screen display, or outside of the
+        field of view. Specular highlights count as visible.
+
+        Args:
+            rendered: the picture with its frame and opacity.
+            whole: no part of the picture is currently visible, so that all covered pixels are
+                marked.
+
+        Returns:
+            uint8 [H, W], 255 = remembered, 0 elsewhere; None if no pixel is.
         """
         seen = tissue_of(rendered.content or rendered.frame)
         if whole or (seen is not None and seen.shape != rendered.alpha.shape):
@@ -51,7 +59,7 @@ class RememberedTissue:
                 return None
             self._found = layer, box
             hidden, alpha = (plane[top : top + high, left : left + wide] for plane in (layer, rendered.alpha))
-            # Most often the picture is opaque there; NaN is not.
+            # Fast path: the picture is usually opaque there. NaN fails the comparison.
             if alpha.min() >= COVERED:
                 return layer
             cv2.bitwise_and(hidden, cv2.inRange(alpha, COVERED, np.inf), dst=hidden)
@@ -60,9 +68,13 @@ class RememberedTissue:
     def mark(
         self, picture: NDArray[np.uint8], layer: NDArray[np.uint8], tissue: NDArray[np.uint8] | None = None
     ) -> None:
-        """Draw the pixels of a layer without colour and darker into an RGB picture [H, W, 3], in place; all others stay as they are.
+        """Draw masked pixels in dark grey, in place.
 
-        tissue: uint8 [H, W], 0 where a tool is: along its border the layer gets a light line. The border of the field of view needs none.
+        Args:
+            picture: uint8 RGB [H, W, 3], modified.
+            layer: uint8 [H, W] from `layer`, 255 = remembered.
+            tissue: uint8 [H, W], 0 = tool; draws a light outline along tool borders. None for no
+                outline.
         """
         height, width = layer.shape
         if self._grey.shape != layer.shape:
@@ -82,22 +94,24 @@ class RememberedTissue:
         cv2.copyTo(colourless, marked, pixels)
 
     def _line(self, tissue: NDArray[np.uint8], rows: slice, columns: slice, width_px: int) -> NDArray[np.uint8]:
-        """255 on the tools' pixels that are so close to tissue."""
+        """Return a mask of tool pixels within `width_px` of tissue, 255 = outline."""
         tools, inner = self._tools[rows, columns], self._scratch[rows, columns]
         cv2.threshold(np.asarray(tissue[rows, columns], np.uint8), 0, 255, cv2.THRESH_BINARY_INV, dst=tools)
-        # What lies beyond the picture's border counts as tool: no line is drawn along it.
+        # Erosion treats pixels beyond the picture's border as tool, so no line is drawn along it.
         cv2.erode(tools, np.ones((2 * width_px + 1, 2 * width_px + 1), np.uint8), dst=inner)
         return np.asarray(cv2.subtract(tools, inner, dst=inner), np.uint8)
 
 
 def _box(layer: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the smallest box with all that is not 0."""
+    """Return the bounding box of nonzero pixels: left, top, width, height."""
     left, top, wide, high = cv2.boundingRect(layer)
     return left, top, wide, high
 
 
 def marked(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """The rendered picture with remembered tissue marked: a copy, or itself where there is none."""
+    """Return the rendered picture with remembered tissue marked. It is a copy only if something is
+    marked.
+    """
     tissue = RememberedTissue()
     layer = tissue.layer(rendered)
     if layer is None:

@@ -1,4 +1,6 @@
-"""What was done to a model beside a live stream, call by call: with the same frames and the same calls its pictures come out again."""
+"""Log of the calls that changed a live model. Replaying the calls on the same frames reproduces its
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,13 @@ class ScheduleEvent:
 
     kind: Literal["begin_scene", "observe", "take_depth", "grow", "rehearse"]
     seq: int | None = None
-    """The frame that it was called with; None for rehearsal."""
+    """Sequence number of the frame argument; None for rehearsal."""
     frame: Frame | None = None
-    """That frame with its depth (`take_depth`)."""
+    """The frame with its depth, for `take_depth`."""
     steps: int = 0
-    """Steps on the newest frame (`observe`) or on the window (`rehearse`)."""
+    """Optimiser steps on the newest frame (`observe`) or on the window (`rehearse`)."""
     train: bool = True
-    """False for a frame that was shown and not trained on."""
+    """False for a frame that was displayed but not trained on."""
 
 
 ScheduleListener = Callable[[ScheduleEvent], None]

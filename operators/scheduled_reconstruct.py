@@ -1,4 +1,4 @@
-"""Online reconstruction by a recorded schedule: the calls that a live session made, made again."""
+"""Reconstruction that replays the recorded schedule of a live session."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ from operators.reconstruct import ReconstructOp
 
 
 class ScheduledReconstructOp(ReconstructOp):
-    """As `ReconstructOp`, with a `LiveReconstructor` that is called as the schedule says. A frame that the session passed over goes no further.
+    """`ReconstructOp` that repeats the recorded calls of a `LiveReconstructor`.
+
+    Frames that the session dropped produce no output.
 
     Params:
-        make_reconstructor: called where the schedule says that one was made.
-        schedule: its lines from the beginning; called in `start()`.
-        late_depths: what the frames of its `take_depth` lines got, in their order; called in `start()`.
+        make_reconstructor: factory called wherever the schedule records a new reconstructor.
+        schedule: called in `start()`; yields the lines of the schedule from the beginning.
+        late_depths: called in `start()`; yields the frame fields for each `take_depth` line, in
+            order.
     """
 
     def __init__(
@@ -44,13 +47,15 @@ class ScheduledReconstructOp(ReconstructOp):
     ) -> None:
         self.make_live, self.schedule, self.late_depths = make_reconstructor, schedule, late_depths
         self.missing: int | None = None
-        """The first frame that was trained on in the session and is not there now, it or its depth: from it on pictures may differ."""
+        """Sequence number of the first recorded frame, or late depth, that is missing; later
+        pictures may differ. None if complete.
+        """
         self._lines: Iterator[ScheduleLine | LostLine] = iter(())
         self._depths: Iterator[dict[str, Any] | None] = iter(())
         self._due: ScheduleLine | LostLine | None = None
         self._live: LiveReconstructor | None = None
         self._observed: OrderedDict[int, Frame] = OrderedDict()
-        """The frames that were observed last, by number."""
+        """The most recently observed frames, by sequence number."""
         super().__init__(fragment, *args, make_reconstructor=make_reconstructor, **kwargs)
 
     def start(self) -> None:
@@ -88,7 +93,9 @@ class ScheduledReconstructOp(ReconstructOp):
         )
 
     def _follow_to(self, frame: Frame) -> Observed | None:
-        """Make the calls that came before this frame was observed; None where it never was."""
+        """Replay the calls that precede this frame's observation. Return its line; None if it was
+        never observed.
+        """
         while self._due is not None:
             line = self._due
             if isinstance(line, Observed | SceneBegun) and line.seq > frame.seq:
@@ -107,7 +114,7 @@ class ScheduledReconstructOp(ReconstructOp):
         return None
 
     def _call(self, live: LiveReconstructor, line: SceneBegun | Grown | Rehearsed, frame: Frame) -> None:
-        """Make one call of those before `frame` was observed."""
+        """Replay one call that precedes the observation of `frame`."""
         if isinstance(line, Rehearsed):
             if live.gaussians:
                 live.rehearse(line.steps)
@@ -119,7 +126,7 @@ class ScheduledReconstructOp(ReconstructOp):
             self.newest = None
 
     def _take_depth(self, line: DepthTaken | LostLine) -> None:
-        """Give training depth that it was given after the frame itself."""
+        """Replay a late depth estimate, or note that the frame or depth is missing."""
         fields = next(self._depths, None) if isinstance(line, DepthTaken) else None
         frame = self._observed.get(line.seq)
         if fields is None or frame is None or self._live is None:

@@ -1,4 +1,4 @@
-"""Chains of operators that look at one frame at the same time, within one operator: what a live frame waits for is the longer chain."""
+"""Parallel execution of operator chains on one frame, to reduce the latency of live frames."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ from operators.outcome import Contributor, OutcomeBuilder
 
 
 class SideBySideOp(Operator):
-    """Runs chains of operators on each frame, all at once, then a last one on what they have found together.
+    """Runs several chains of operators on each frame in parallel, merges their results, and runs a
+    final chain.
 
-    Each operator of a chain takes a `Frame` at its input `frame` and gives it with more fields at its output `frame`. The first chain's frame
-    goes on, with the fields of `TAKEN_OVER` that the others add. Where the gate withholds the frame its own goes on instead, which
-    shows nothing of the picture.
+    Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at
+    its output `frame`. The result is the frame of the first chain with the fields `TAKEN_OVER` of
+    the others. If the gate withholds the frame, its result is used instead.
+
+    The operators belong to no graph. This operator starts and stops them and forwards their
+    contributions to the outcome.
 
     Inputs:
         frame: `Frame`.
@@ -28,12 +32,10 @@ class SideBySideOp(Operator):
         frame: `Frame`.
 
     Params:
-        gate: a chain whose first operator may withhold a frame from everything that comes after; the other chains see its picture all the
-            same.
-        first: the chain whose frame goes on.
+        gate: chain that may withhold a frame from downstream; the other chains see its picture.
+        first: chain whose frame is passed on.
         beside: further chains.
-        then: the last chain.
-        All operators are in no graph of their own: this one starts and stops them and contributes what they contribute.
+        then: final chain, run on the merged frame.
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class SideBySideOp(Operator):
 
     @property
     def parts(self) -> tuple[Operator, ...]:
-        """All operators of all chains."""
+        """Operators of all chains."""
         return (*self.gate, *self.first, *chain.from_iterable(self.beside), *self.then)
 
     def setup(self, spec: OperatorSpec) -> None:
@@ -75,12 +77,13 @@ class SideBySideOp(Operator):
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._pool is not None
         frame: Frame = op_input.receive("frame")
-        # The longest begin first.
+        # Submit the slowest chains first.
         others = [self._pool.submit(through, part, frame) for part in (*self.beside, self.gate)]
         try:
             decided = through(self.first, frame)
         finally:
-            # Whatever the first chain raises, the others are out of the way of the next frame.
+            # Wait for all chains even if the first one raises, so that none overlaps with the next
+            # frame.
             for other in others:
                 other.exception()
         *found, gated = [other.result() for other in others]
@@ -99,11 +102,16 @@ class SideBySideOp(Operator):
 
 
 TAKEN_OVER = ("mask", "rehearsal_mask")
-"""Fields that a frame takes over from another chain where it has none of its own."""
+"""Fields merged from other chains if the first chain's frame lacks them."""
 
 
 def with_findings(decided: Frame, found: Frame) -> Frame:
-    """The frame with what the other one has besides, and without the pixels that either leaves out of the loss."""
+    """Merge the frames of two chains.
+
+    Args:
+        decided: frame whose fields take precedence.
+        found: frame that supplies missing fields of `TAKEN_OVER`. The loss masks are intersected.
+    """
     added = {name: getattr(found, name) for name in TAKEN_OVER if getattr(decided, name) is None}
     if found.loss_mask is not None:
         own = decided.loss_mask
@@ -112,7 +120,7 @@ def with_findings(decided: Frame, found: Frame) -> Frame:
 
 
 def through(operators: Sequence[Operator], frame: Frame) -> Frame:
-    """The frame as it comes out of a chain."""
+    """Return the frame after passing through a chain."""
     for operator in operators:
         port: Any = _Passing(frame)
         operator.metadata = {}
@@ -122,7 +130,7 @@ def through(operators: Sequence[Operator], frame: Frame) -> Frame:
 
 
 class _Passing:
-    """The one input and the one output of an operator of a chain."""
+    """Input and output port of one operator in a chain."""
 
     def __init__(self, frame: Frame) -> None:
         self.frame = frame

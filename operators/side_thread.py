@@ -1,4 +1,4 @@
-"""A thread beside the graph: it takes what the graph leaves of the processor."""
+"""Priority of background threads, which use CPU time that the graph leaves idle."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import threading
 from contextlib import suppress
 
 NICENESS = 10
-"""How far such a thread steps back behind the graph where both want the processor."""
+"""Nice value of a background thread."""
 
 
 def step_back() -> None:
-    """Let the calling thread step back behind the others of this process, where the system knows priorities of threads."""
-    if sys.platform == "linux":  # elsewhere it means the whole process
-        with suppress(OSError):  # a system that does not allow it lets the thread run as all others do
+    """Lower the scheduling priority of the calling thread. No effect except on Linux."""
+    if sys.platform == "linux":  # elsewhere it would affect the whole process
+        with suppress(OSError):  # if not permitted, keep the normal priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
 def usable_cores() -> int:
-    """How many cores this process may use."""
+    """Number of CPU cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Writing to disks that may be full: stop while there is still room to finish what was begun; a file is whole or not there."""
+"""Writes to disks that may fill up: a reserve for finishing a run, and atomic file replacement."""
 
 from __future__ import annotations
 
@@ -13,33 +13,41 @@ from gsplat_core.io.files import PartialFile
 from operators.errors import OutputError, StorageFull
 
 STAGING_PREFIX = ".run-"
-"""What a run has written lies in a folder of such a name, inside the output folder, until the run ends."""
+"""Name prefix of the staging folder, inside the output folder, that holds results until the run
+ends.
+"""
 
 
 def mebibytes(count: float) -> str:
-    """A number of bytes for people."""
+    """Format a number of bytes in MiB or GiB."""
     return f"{count / 2**20:.1f} MiB" if count < 2**30 else f"{count / 2**30:.1f} GiB"
 
 
 def shown(folder: Path) -> Path:
-    """The folder by the name that the user gave, where it is the one in which a run collects its results."""
+    """Return the folder that the user gave, also for its staging folder."""
     return folder.parent if folder.name.startswith(STAGING_PREFIX) else folder
 
 
 @dataclass
 class StorageReserve:
-    """Keeps `reserve_bytes` free on the disk of `folder`, for the video's index, the model and the report.
+    """Keeps `reserve_bytes` free on the disk of `folder`, for the video's index, the model and the
+    report.
 
-    A video encoder does not always say that its disk is full: it writes a file that cannot be played. So the room is asked for before
-    each write.
+    The free space is checked before each write, because a video encoder may ignore a full disk and
+    produce an unplayable file.
     """
 
     folder: Path
     reserve_bytes: Callable[[], int]
-    """Asked before each write: the model that has to fit grows."""
+    """Called before each write, because the size of the model grows."""
 
     def require(self, bytes_to_write: int = 0) -> None:
-        """Raises StorageFull when writing `bytes_to_write` would use the reserve, OutputError when the folder is gone."""
+        """Check the free space before a write of `bytes_to_write` bytes.
+
+        Raises:
+            StorageFull: the write would use up the reserve.
+            OutputError: the folder no longer exists.
+        """
         with storage_errors(self.folder):
             free = shutil.disk_usage(self.folder).free
         needed = bytes_to_write + self.reserve_bytes()
@@ -52,7 +60,7 @@ class StorageReserve:
 
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turns what the system says while something is written to `folder` into StorageFull or OutputError; both name the folder."""
+    """Convert an OSError raised while writing to `folder` into StorageFull or OutputError."""
     try:
         yield
     except OSError as error:
@@ -75,9 +83,16 @@ def _sentence(folder: Path, error: OSError) -> OutputError:
 
 
 def write_whole(path: Path, data: bytes, reserve: StorageReserve | None = None) -> None:
-    """Write a file under another name and rename it, so that nobody ever sees half of it, and an earlier one stays until then.
+    """Write a file atomically, by writing to a temporary name and renaming.
 
-    Raises StorageFull, OutputError.
+    Args:
+        path: the file; an existing one is replaced only when the new one is complete.
+        data: its contents.
+        reserve: free disk space to be kept; None for no check.
+
+    Raises:
+        StorageFull: the disk is full or the reserve would be used up.
+        OutputError: the file cannot be written.
     """
     if reserve is not None:
         reserve.require(len(data))

@@ -1,4 +1,4 @@
-"""Which pixels are tissue: the masks that came with the frames, those that are found in them, or none."""
+"""Tool masks of frames: recorded with the stream, detected, or all tissue."""
 
 from __future__ import annotations
 
@@ -25,41 +25,51 @@ log = logging.getLogger(__name__)
 
 
 LEAST_TISSUE = MaskAndDepthSettings().least_tissue
-"""A found mask with a smaller share of tissue says that the whole picture is tool ..."""
+"""Minimum share of tissue in a detected mask. A mask with less marks the whole picture as tool."""
 BELIEVED_FRAMES = 10
-"""... and is believed for so many frames after one with tissue: a tool in front of the lens. After that, the finder takes tissue for tool."""
+"""Number of frames for which an all-tool mask is accepted after the last tissue, for example with a
+tool in front of the lens. After that it counts as a false detection.
+"""
 
 
 class MaskFinder(Protocol):
-    """Finds tools in the frames of one stream, in order."""
+    """Tool segmentation of the frames of one stream, in order."""
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The mask of a picture: RGB uint8 [H, W, 3] to uint8 [H, W], 1 = tissue, 0 = tool."""
+        """Segment a picture.
+
+        Args:
+            image: uint8 RGB [H, W, 3].
+
+        Returns:
+            uint8 [H, W], 1 = tissue, 0 = tool.
+        """
         ...
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Clear temporal state, at the start of a new scene."""
         ...
 
 
 @dataclass(frozen=True)
 class FoundMasks:
-    """What an operator that finds tools did."""
+    """Statistics of a tool detector."""
 
     method: str
-    """A name in `TOOL_MASKS`."""
+    """Name in `TOOL_MASKS`."""
     found: int
-    """Frames whose mask was found."""
+    """Frames with a detected mask."""
     recorded: int
-    """Frames that came with a mask, which they kept."""
+    """Frames with a recorded mask, which was kept."""
     tool_share: float
-    """Share of tool pixels, the mean over the frames whose mask was found."""
+    """Share of tool pixels, 0..1; mean over frames with a detected mask."""
     disbelieved: int = 0
-    """Frames in which everything was found to be tool for so long that all of it counted as tissue."""
+    """Frames whose all-tool mask was rejected, so that all pixels counted as tissue."""
 
 
 class RecordedToolMaskOp(Operator):
-    """Emits each frame with its recorded mask; a frame without one counts as all tissue, which is stated once.
+    """Emits each frame with its recorded mask. A frame without one counts as all tissue, logged
+    once.
 
     Inputs:
         frame: `Frame`.
@@ -95,9 +105,9 @@ class RecordedToolMaskOp(Operator):
 
 
 class FoundToolMaskOp(Operator):
-    """Finds the tools in each frame that comes without a mask; a frame that has one keeps it.
+    """Detects tools in frames without a mask. Recorded masks are kept.
 
-    Where a frame says that the scene is another one from here on, the finder forgets the stream.
+    The detector's temporal state is cleared at a new scene.
 
     Inputs:
         frame: `Frame`.
@@ -106,10 +116,10 @@ class FoundToolMaskOp(Operator):
         frame: `Frame` whose `mask` is set (1 = tissue, 0 = tool).
 
     Params:
-        make_finder: called by `start()`.
-        method: its name in `FoundMasks`.
-        doubts: take a picture that is all tool for all tissue, unless it comes soon after one that shows tissue. Grey tissue may look like
-            steel, and a stream of it must pass.
+        make_finder: factory called in `start()`.
+        method: name for `FoundMasks`.
+        doubts: reject an all-tool mask as all tissue, unless tissue was detected within the last
+            `BELIEVED_FRAMES` frames. Grey tissue can be mistaken for steel throughout a stream.
     """
 
     def __init__(
@@ -159,7 +169,9 @@ class FoundToolMaskOp(Operator):
         op_output.emit(frame, "frame")
 
     def _believed(self, frame: Frame, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the found mask, or one without tools where the finder has found no tissue for too long."""
+        """Return the detected mask, or an all-tissue mask if no tissue was detected for too many
+        frames.
+        """
         if frame.withheld is not None or not self.doubts:
             return mask
         if cv2.countNonZero(mask) >= LEAST_TISSUE * mask.size:
@@ -182,14 +194,14 @@ class FoundToolMaskOp(Operator):
 
 
 class BuiltInToolMaskOp(FoundToolMaskOp):
-    """Finds tools by colour, edges and consistency in time (`ToolFinder`)."""
+    """Detects tools by colour, edges and temporal consistency (`ToolFinder`)."""
 
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
         super().__init__(fragment, *args, make_finder=ToolFinder, method="builtin", doubts=True, **kwargs)
 
 
 class NoToolMaskOp(Operator):
-    """Emits each frame with every pixel as tissue, whatever mask it came with.
+    """Emits each frame with an all-tissue mask, replacing any recorded one.
 
     Inputs:
         frame: `Frame`.
@@ -208,10 +220,10 @@ class NoToolMaskOp(Operator):
 
 
 class OnnxToolMaskOp(FoundToolMaskOp):
-    """Finds tools by a network, an ONNX model (`OnnxToolFinder`), which is loaded once.
+    """Detects tools with an ONNX network (`OnnxToolFinder`), which is loaded once.
 
     Params:
-        path: the model's. Raises InvalidSetting for one that cannot be used.
+        path: the model file. Raises InvalidSetting if it cannot be used.
     """
 
     def __init__(self, fragment: Any, *args: Any, path: Path, **kwargs: Any) -> None:
@@ -229,13 +241,16 @@ class OnnxToolMaskOp(FoundToolMaskOp):
 
 
 def all_tissue(frame: Frame) -> NDArray[np.uint8]:
-    """A mask without tools for a frame."""
+    """Return a mask without tools for the frame, uint8 [H, W]."""
     return np.ones(frame.image.shape[:2], np.uint8)
 
 
 ToolMaskFactory = Callable[[Any, str, str], Operator]
-"""From the fragment, the operator's name and what followed the method's name after a colon ("" where nothing did) to an operator with one
-input and one output `frame`. Raises a UserError for what it cannot use."""
+"""Creates an operator with the input and output `frame` from the fragment, the operator's name and
+the method's argument.
+
+The argument is the text after the colon, or "". Raises a UserError if it is invalid.
+"""
 
 
 def _plain(kind: type[Operator], method: str) -> ToolMaskFactory:
@@ -262,18 +277,24 @@ TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
         "none": _plain(NoToolMaskOp, "none"),
     },
 )
-"""Ways to get tool masks, by name."""
+"""Factories of tool mask operators, by method."""
 
 
 def new_tool_mask(fragment: Any, choice: str, name: str = "tool_mask") -> Operator:
-    """The operator that `choice` names: a name in `TOOL_MASKS`, for some followed by a colon and an argument ("onnx:model.onnx").
+    """Create the tool mask operator for a setting.
 
-    Raises InvalidSetting for a name that is not known, and as the factory.
+    Args:
+        fragment: the graph.
+        choice: name in `TOOL_MASKS`, optionally with a colon and an argument ("onnx:model.onnx").
+        name: name of the operator.
+
+    Raises:
+        InvalidSetting: the name is unknown, or the factory rejects the argument.
     """
     method, _, argument = choice.partition(":")
     return TOOL_MASKS[method](fragment, name, argument)
 
 
 def check_tool_mask(choice: str) -> None:
-    """Raises as `new_tool_mask` does, before a run: for a name that is not known or a network that cannot be used."""
+    """Check the setting before a run. Raises InvalidSetting as `new_tool_mask` does."""
     new_tool_mask(None, choice)

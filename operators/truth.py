@@ -1,4 +1,4 @@
-"""Scores of what a recording's camera does not show: tissue behind tools, and depth, against the truth of a synthetic recording."""
+"""Scores against the ground truth of a synthetic recording: tissue behind tools, and depth."""
 
 from __future__ import annotations
 
@@ -20,51 +20,57 @@ from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
 
 SCORED_EVERY = 4
-"""Every so many frames one is scored."""
+"""One in this many frames is scored."""
 MOST_SCORED = 64
-"""Frames of a longer recording that are scored, evenly spread."""
+"""Maximum number of scored frames; longer recordings are sampled evenly."""
 FEWEST_PIXELS = 64
-"""A frame with fewer hidden pixels that were seen before is not scored behind its tools."""
+"""Minimum number of hidden, previously seen pixels for a frame to be scored behind its tools."""
 INPAINT_RADIUS_PX = 5
 
 
 @dataclass(frozen=True)
 class BehindTools:
-    """Mean PSNR over pixels behind a tool whose place was seen before, against the picture through the tool."""
+    """Mean PSNR of pixels behind a tool that were visible earlier, against the true picture without
+    tools.
+    """
 
     psnr_db: float
-    """PSNR of the reconstruction behind tools."""
+    """PSNR of the reconstruction, in dB."""
     last_seen_db: float
-    """Trivial baseline: each pixel as it was when no tool hid it last."""
+    """Trivial baseline in dB: each pixel's most recent visible value."""
     inpainted_db: float
-    """Trivial baseline: the frame's own picture, filled in from around the tool (Telea 2004)."""
+    """Trivial baseline in dB: the frame's own picture inpainted from around the tool (Telea 2004).
+    """
     frames: int
-    """Frames that were scored."""
+    """Number of scored frames."""
 
 
 @dataclass(frozen=True)
 class TruthResult:
-    """A run's pictures against the truth; None where there was nothing to compare."""
+    """Scores against ground truth; a field is None if it was not scored."""
 
     behind_tools: BehindTools | None
     depth: DepthShare | None
-    """Depth of tissue that the camera shows, with the best level and the best tilted plane of each frame as trivial baselines."""
+    """Depth of visible tissue, with the best plane (constant and tilted) of each frame as trivial
+    baselines.
+    """
     depth_behind_tools: DepthShare | None
     """Depth of tissue behind tools, with the same baselines."""
 
 
 class TruthOp(Operator):
-    """Compares what is rendered with a recording's tissue behind its tools.
+    """Compares rendered pictures with a recording's ground truth behind its tools.
 
-    Nothing of the truth reaches training. Pixels that no earlier frame has shown are left out, since no method can know them.
+    The truth never reaches training. Pixels that no earlier frame has shown are excluded, because
+    no method can reconstruct them.
 
     Inputs:
         rendered: `RenderedFrame`.
 
     Params:
-        behind: the truth.
-        camera: of the frames, at their size.
-        frame_count: of the recording.
+        behind: ground truth of the recording.
+        camera: camera of the frames, at their size.
+        frame_count: number of frames in the recording.
     """
 
     def __init__(
@@ -82,9 +88,9 @@ class TruthOp(Operator):
         self._own, self._last_seen, self._inpainted = ScoredMean(), ScoredMean(), ScoredMean()
         self._depth, self._hidden_depth = DepthShareSums(), DepthShareSums()
         self._memory: NDArray[np.uint8] | None = None
-        """Each pixel as it was seen last, RGB [H, W, 3]."""
+        """Last visible value of each pixel, uint8 RGB [H, W, 3]."""
         self._seen: NDArray[np.bool_] = np.zeros((0, 0), bool)
-        """[H, W]: some earlier frame has shown tissue there."""
+        """Pixels at which an earlier frame has shown tissue, bool [H, W]."""
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         rendered: RenderedFrame = op_input.receive("rendered")
