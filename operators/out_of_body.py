@@ -36,7 +36,7 @@ class Gate(Protocol):
         ...
 
     def close(self) -> None:
-        """Assume from now on that the scope is outside of the body."""
+        """Close the gate, as after a picture taken outside of the body."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""From a run to its output folder: everything that one run has made appears there together, or nothing does."""
+"""Atomic delivery of a run's results to its output folder."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from operators.errors import RunFailed
 from operators.output_folder import OutputFolder
 
 Report = Callable[[RunOutcome, Path], None]
-"""Writes what it makes of an outcome into a folder, beside the outcome's own files."""
+"""Writes report files made from the outcome into a folder, next to the run's own files."""
 
 
 class HasFolders(Protocol):
-    """Settings of a run: a frozen dataclass with `out`, the folder of its results."""
+    """Settings of a run: a frozen dataclass with the output folder `out`."""
 
     @property
     def out(self) -> Path: ...
 
     @property
     def inputs(self) -> Sequence[Path]:
-        """What the run reads from the disk."""
+        """Paths that the run reads."""
 
 
 Settings = TypeVar("Settings", bound=HasFolders)
@@ -35,12 +35,25 @@ def delivered(
     run: Callable[[Settings, list[str]], RunOutcome],
     report: Report | None = None,
 ) -> RunOutcome:
-    """Let `run` write into a folder of its own, add the report, and put all of it in the place of an earlier run's results.
+    """Run `run` in a staging folder, add the report, and replace an earlier run's results by the
+    new ones.
 
-    run: takes the settings with that folder as `out`, and a list for the notes of its report. A run that ends with RunFailed delivers
-    what it had reached; after any other exception the earlier results are there as before.
+    A run that ends with RunFailed delivers its partial results. After any other exception the
+    earlier results are unchanged.
 
-    Raises as `OutputFolder` and as `run`; a RunFailed carries the outcome with the final paths.
+    Args:
+        settings: settings of the run.
+        command: name of the command, for the marker of the output folder.
+        run: called with the settings, whose `out` is the staging folder, and a list of notes for
+            the report.
+        report: writes the report files; None for no report.
+
+    Returns:
+        The outcome with the final paths of the outputs.
+
+    Raises:
+        OutputError: as `OutputFolder` raises it.
+        RunFailed: the run ended early; carries the outcome with the final paths.
     """
     with OutputFolder(settings.out, command, settings.inputs) as output:
         notes = ["the output folder held an earlier run; this one replaces its files"] if output.earlier else []

@@ -1,4 +1,4 @@
-"""Where the heavy work runs."""
+"""Selection of the compute device, with the scheduler and the random seed for it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEVICES = ("cpu", "cuda")
 
 
 def check_device(device: str) -> None:
-    """Raises DeviceMissing where this machine or this build cannot run on `device`."""
+    """Raise DeviceMissing if this machine or this build cannot run on `device`."""
     import torch
 
     if device == "cpu":
@@ -35,17 +35,19 @@ def check_device(device: str) -> None:
 
 
 def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThreadScheduler:
-    """How an application that keeps every frame runs beside `device`; the frames' bytes do not depend on it.
+    """Return the scheduler of an application that processes every frame. Its choice does not affect
+    the results.
 
-    On the CPU the training keeps every core busy, and one thread runs all operators in turn. While a GPU trains, the host is free: decoding,
-    scoring and video each have a thread of their own, and what they do for one frame overlaps with the training on the next ones.
+    On the CPU, training occupies all cores, so one thread runs all operators in turn. With a GPU
+    the host is idle during training: each operator gets a thread, and decoding, scoring and
+    encoding overlap with the training on later frames.
     """
     return GreedyScheduler(app, clock=ManualClock()) if device == "cpu" else MultiThreadScheduler(app)
 
 
 @contextmanager
 def seeded(seed: int, device: str) -> Iterator[None]:
-    """Torch's random numbers start from `seed` inside, and go on as if nothing had happened afterwards."""
+    """Context manager that seeds torch's random generators and restores their state on exit."""
     import torch
 
     with torch.random.fork_rng(devices=range(torch.cuda.device_count()) if device == "cuda" else []):

@@ -1,4 +1,6 @@
-"""Evaluate a finished model, or the run that made it, on a recording: by several protocols, beside the trivial baselines."""
+"""Evaluation of a finished model, or of the run that made it, by several protocols with trivial
+baselines.
+"""
 
 from __future__ import annotations
 
@@ -52,12 +54,23 @@ def evaluate(
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
-    """Measure the baselines and the protocols; each frame's figures go to files in `folder`.
+    """Measure the baselines and the protocols.
 
-    run: how the model was made, where that is known. When `stop_requested` answers True, what was measured so far is the result.
+    Args:
+        model: the finished model.
+        run: settings of the run that made the model; None if unknown.
+        settings: recording, protocols and devices.
+        folder: folder for the per-frame logs, one per protocol.
+        progress: called after each frame.
+        stop_requested: polled; if True, the results so far are returned.
 
-    Raises InvalidSetting where the model does not fit the recording or a protocol that was asked for cannot be measured; DeviceMissing,
-    MemoryTooSmall, RecordingError, StorageFull.
+    Raises:
+        InvalidSetting: the model does not fit the recording, or a requested protocol cannot be
+            measured.
+        DeviceMissing: the device is not available.
+        MemoryTooSmall: the evaluation does not fit into memory.
+        RecordingError: the recording cannot be read.
+        StorageFull: the disk is full.
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
@@ -69,7 +82,7 @@ def evaluate(
 
 
 class _Work:
-    """One evaluation while it is made."""
+    """State of one evaluation in progress."""
 
     def __init__(
         self,
@@ -94,7 +107,7 @@ class _Work:
         self.window_s = model.time_window_s[0] - tolerance_s, model.time_window_s[1] + tolerance_s
 
     def done(self) -> Evaluation:
-        """Measure everything."""
+        """Measure the baselines and all selected protocols."""
         started_at, started_s = datetime.now(UTC), perf_counter()
         wanted = [name for name in PROTOCOLS if self._is_wanted(name)]
         with self._log("baselines") as record:
@@ -120,7 +133,9 @@ class _Work:
         )
 
     def _is_wanted(self, name: str) -> bool:
-        """Whether a protocol is to be measured. Raises InvalidSetting for one that was asked for and cannot be."""
+        """Return True if a protocol is to be measured. Raise InvalidSetting if a requested one
+        cannot be.
+        """
         asked = name in self.settings.protocols
         if not asked and (self.settings.protocols or name not in WITHOUT_LEARNING):
             return False
@@ -192,7 +207,7 @@ class _Work:
         return CausalRun(score, config.chosen_field, config.steps_per_frame, settings.seed, config.motion_prior)
 
     def _learning_settings(self) -> ReplaySettings:
-        """How the causal protocol learns: as the run did."""
+        """Return the training settings of the causal protocol: those of the run as far as known."""
         run, steps = self.run, self.settings.steps_per_frame
         if run is None:
             self.notes.append(
@@ -217,7 +232,7 @@ class _Work:
 
     def _geometry(self) -> Geometry:
         settings, count = self.settings, self.source.description.frame_count
-        assert count is not None  # a source without an end is not evaluated
+        assert count is not None  # sources without an end are rejected by `fitting_source`
         self._require_memory_of_picture()
         return measure_geometry(
             self._frames("geometry"),
@@ -259,8 +274,12 @@ class _Work:
         }
 
     def _of_final_model(self, right: bool = False):  # type: ignore[no-untyped-def]
-        """What the final model shows for a frame, in the colours that the left or the right eye sees; the right one's are foretold where it was not
-        trained on."""
+        """Return a function that renders the final model for a frame, in the colours of the left or
+        right eye.
+
+        If the model was not trained on the right eye, its colours are predicted from the left
+        eye's.
+        """
         settings, camera = self.settings, self.camera
         self._require_memory_of_picture()
         model = self.model.to(settings.device)
@@ -271,14 +290,16 @@ class _Work:
         return lambda frame, eye=None: pictures(shown, frame, eye)
 
     def _require_memory_of_picture(self) -> None:
-        """Raises MemoryTooSmall where no picture of the model fits into memory."""
+        """Raise MemoryTooSmall if rendering one picture does not fit into memory."""
         camera = self.camera
         if self.settings.device == "cpu":
             needed = render_bytes(camera.width_px, camera.height_px, self.model.parameter_count)
             require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
 
     def _frames(self, stage: str, from_s: float = -math.inf) -> SeenFrames:
-        """The frames that the model has seen; of a looped recording one round, or all of them from a time on."""
+        """Return the frames within the model's time window; of a looped recording the first round,
+        or all from `from_s` on.
+        """
         until_s = self.window_s[1]
         if math.isinf(from_s):
             until_s = min(until_s, self.playback.round_s - 0.5 / self.source.description.fps * self.playback.stretch)

@@ -1,4 +1,4 @@
-"""A finished model beside a recording: whether the one fits the other, and which frames the two have in common."""
+"""Compatibility of a finished model with a recording, and the frames that both have in common."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 
 SAME_CAMERA = 1e-3
-"""How far focal lengths and principal points may be apart, as a share of the picture's width."""
+"""Largest difference of focal length and principal point, as a share of the picture's width."""
 
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """How a model was made, as far as the report beside it says."""
+    """Settings of the run that made a model, as read from its report."""
 
     folder: Path
     command: str
@@ -35,25 +35,33 @@ class EvaluatedRun:
     steps_per_frame: int | None
     scale: float
     heldout: bool
-    """Whether the protocol's held-out frames were kept from training."""
+    """True if the protocol's held-out frames were excluded from training."""
     eyes: Eyes = "left"
     fps: float | None = None
-    """The rate at which a live run played; None: the recording's own."""
+    """Playback rate of a live run, in frames/s; None for the recording's own rate."""
 
 
 @dataclass(frozen=True)
 class Playback:
-    """How a stream's times follow from those of the recording that it played, as `RealtimeSource` does it."""
+    """Mapping of a recording's timestamps to those of the stream that played it (see
+    `RealtimeSource`).
+    """
 
     last_s: float
-    """When the last frame of the recording was there, the first time."""
+    """Timestamp of the recording's last frame in the first round, in seconds."""
     stretch: float = 1.0
-    """Of all times: a recording of 30 frames/s that is played at 60 is over in half of its time."""
+    """Factor on all timestamps: 0.5 for a recording of 30 frames/s played at 60."""
     round_s: float = math.inf
-    """How long one round of a looped recording takes; infinite where it is not looped."""
+    """Duration of one round of a looped recording, in seconds; infinite if not looped."""
 
     def times(self, frame: Frame, turn: int, frames: int) -> Frame:
-        """The frame with its number and time in a round, counted from 0, of a recording of so many frames."""
+        """Return the frame with the number and timestamp that it had in the stream.
+
+        Args:
+            frame: frame of the recording.
+            turn: round of a looped recording, from 0.
+            frames: number of frames in the recording.
+        """
         if turn == 0 and self.stretch == 1:
             return frame
         offset_ns = round(turn * self.round_s * 1e9) if turn else 0
@@ -62,7 +70,7 @@ class Playback:
 
 @dataclass(frozen=True)
 class SeenFrames:
-    """The frames of a source from one time to another; read from the beginning each time they are iterated."""
+    """Frames of a source within a time range; each iteration reads from the beginning."""
 
     source: FrameSource
     from_s: float
@@ -91,21 +99,33 @@ class SeenFrames:
 
 
 def frame_tolerance_s(fps: float) -> float:
-    """A frame right after the last one that was trained on is still within a model's time: the split holds out the last frame of some
-    recordings."""
+    """Return the tolerance of a model's time window in seconds, slightly more than one frame
+    interval.
+
+    The frame after the last trained one counts as inside, because the held-out split of some
+    recordings includes the last frame.
+    """
     return 1.01 / fps
 
 
 def fitting_source(
     address: Path | str, model: Model, scale: float | None, max_frames: int | None, run: EvaluatedRun | None = None
 ) -> tuple[FrameSource, float, Playback, list[str]]:
-    """The recording at the model's size; returns it, its scale, how it was played, and in sentences what a reader of the figures must know.
+    """Open the recording at the model's size and check that it fits the model.
 
-    scale: of the frames; None takes the one that leads to the model's size: a session that was recorded at it needs none.
-    run: how the model was made.
+    Args:
+        address: address of the recording.
+        model: the finished model.
+        scale: scale of the frames; None selects the scale that gives the model's size.
+        max_frames: number of frames to read; None for all.
+        run: settings of the run that made the model; None if unknown.
 
-    Raises InvalidSetting where the model cannot have been made from such a recording: another camera, another shape of the picture, or
-    times that have nothing in common; and as `open_source`.
+    Returns:
+        The source, its scale, the mapping of its timestamps, and notes for the report.
+
+    Raises:
+        InvalidSetting: the model cannot come from such a recording, because camera, aspect ratio or
+            time range differ. Also as `open_source`.
     """
     notes: list[str] = []
     source = open_source(address, SourceOptions(scale or 1.0, max_frames))
@@ -140,7 +160,9 @@ def fitting_source(
 
 
 def _scale_of_model(made: Camera, seen: Camera, run_scale: float | None) -> float:
-    """The scale at which pictures of the camera `seen` have the size of the model's; that of the run where it leads there."""
+    """Return the scale at which pictures of `seen` have the size of `made`; preferably 1 or the
+    run's scale.
+    """
     for scale in (1.0, run_scale):
         if scale is not None:
             scaled = seen.scaled(scale)
@@ -150,7 +172,7 @@ def _scale_of_model(made: Camera, seen: Camera, run_scale: float | None) -> floa
 
 
 def _check_camera(made: Camera, seen: Camera, name: str) -> None:
-    """Raises InvalidSetting unless both cameras see the same, up to the size of the picture."""
+    """Raise InvalidSetting unless both cameras have the same intrinsics up to the picture size."""
     if made.model != seen.model:
         raise InvalidSetting(
             f"the model was made with a {made.model} camera, and {name} has a {seen.model} one; give the recording that it was made from"
@@ -161,7 +183,7 @@ def _check_camera(made: Camera, seen: Camera, name: str) -> None:
             f"the model's pictures have {made.width_px}x{made.height_px} px, those of {name} {seen.width_px}x{seen.height_px} px, which is"
             " another shape; give the recording that it was made from"
         )
-    # The height is rounded on its own, so that rows are scaled by a little more or less than columns.
+    # The height is rounded separately, so rows and columns have slightly different scales.
     wanted = made.scaled(ratio).K if ratio != 1 else made.K
     apart = float(np.abs(wanted - seen.K).max()) / seen.width_px
     if apart > SAME_CAMERA + 1.0 / seen.height_px * (ratio != 1):
@@ -174,9 +196,20 @@ def _check_camera(made: Camera, seen: Camera, name: str) -> None:
 def _playback(
     model: Model, description: SourceDescription, fps: float | None, shortened: bool
 ) -> tuple[Playback, list[str]]:
-    """How the recording's times became the model's, and what to say about it. shortened: whether only its beginning is read.
+    """Derive the mapping of timestamps from the model's time window.
 
-    Raises InvalidSetting when they have no time in common."""
+    Args:
+        model: the finished model.
+        description: the recording.
+        fps: playback rate of the run, in frames/s; None for the recording's own rate.
+        shortened: only the beginning of the recording is read.
+
+    Returns:
+        The mapping and notes for the report.
+
+    Raises:
+        InvalidSetting: model and recording have no time in common.
+    """
     assert description.frame_count is not None
     stretch = 1.0 if fps is None else description.fps / fps
     start_s, end_s = model.time_window_s
@@ -199,15 +232,17 @@ def _playback(
 
 
 def _session_playback(model: Model, folder: Path, description: SourceDescription) -> tuple[Playback, list[str]]:
-    """A recorded session has the times of the run that it was, whatever that played, and lacks the frames that the run never got."""
+    """Return the mapping of a recorded session, whose timestamps are already those of the run."""
     lines = islice(SessionReader(folder).frame_lines(), description.frame_count)
     last_s = max((line.pts_ns * 1e-9 for line in lines), default=0.0)
     return Playback(last_s), _common_time(model, description.name, last_s, frame_tolerance_s(description.fps))
 
 
 def _common_time(model: Model, name: str, recorded_s: float, tolerance_s: float) -> list[str]:
-    """What to say where the model has seen more than a recording that ends at `recorded_s`. Raises InvalidSetting when they have no time in
-    common."""
+    """Return a note if the model's time window ends after the recording.
+
+    Raises InvalidSetting if the model's time window begins after the recording's end, `recorded_s`.
+    """
     start_s, end_s = model.time_window_s
     if start_s > recorded_s + tolerance_s:
         raise InvalidSetting(

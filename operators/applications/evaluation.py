@@ -1,4 +1,4 @@
-"""What an evaluation is asked for, and what it gives."""
+"""Settings and results of an evaluation."""
 
 from __future__ import annotations
 
@@ -20,31 +20,33 @@ from operators.sources.source import SourceDescription
 
 PROTOCOLS = ("heldout", "live", "retention", "second_eye", "geometry", "causal")
 WITHOUT_LEARNING = ("heldout", "live", "retention", "second_eye", "geometry")
-"""What is measured unless protocols are named: `causal` learns from the whole recording again."""
+"""Default protocols; `causal` is excluded because it trains on the whole recording again."""
 
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What to measure, and how."""
+    """Selection of protocols and their parameters. Raises InvalidSetting for a value out of range."""
 
     recording: Path | str
     protocols: tuple[str, ...] = ()
-    """Names in PROTOCOLS; none: all that can be measured without learning again."""
+    """Names in `PROTOCOLS`; empty selects all measurable protocols of `WITHOUT_LEARNING`."""
     device: str = "cpu"
     renderer: str = "alpha"
     scale: float | None = None
-    """Of the frames; None takes the one that the model was made at."""
+    """Scale of the frames; None for the scale at which the model was made."""
     max_frames: int | None = None
     steps_per_frame: int | None = None
-    """Of the causal protocol; None takes the run's."""
+    """Optimiser steps per frame in the causal protocol; None for the run's."""
     motion_prior: str | None = None
-    """Of the causal protocol: a name in MOTION_PRIORS; None takes the default."""
+    """Motion prior of the causal protocol, a name in `MOTION_PRIORS`; None for the default."""
     last_s: float = LAST_S
-    """How much of the stream's end retention renders again."""
+    """Duration at the end of the stream that the retention protocol renders, in seconds."""
     places: tuple[Visits, ...] | None = None
-    """Stays at places, for retention; None finds them by the poses."""
+    """Visits to places for the retention protocol; None detects them from the poses."""
     poses: Path | None = None
-    """Of geometry: a `poses.npy` with the poses that the model was made with; None: those of the recording."""
+    """File `poses.npy` with the poses that the model was made with, for the geometry protocol; None
+    for the recording's.
+    """
 
     def __post_init__(self) -> None:
         for name in self.protocols:
@@ -63,7 +65,7 @@ class EvaluationSettings:
 
 @dataclass(frozen=True)
 class CausalRun:
-    """What predicting each frame scores, and how was learned in between."""
+    """Prediction score of the causal protocol, with its training settings."""
 
     score: Score
     field: str
@@ -74,7 +76,7 @@ class CausalRun:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything that was measured; None for a protocol that was not."""
+    """Results of all protocols; None for a protocol that was not measured."""
 
     description: SourceDescription
     scale: float
@@ -90,6 +92,6 @@ class Evaluation:
     geometry: Geometry | None = None
     second_eye: SecondEye | None = None
     returns: Mapping[str, tuple[Return, ...]] = field(default_factory=dict)
-    """How soon places were found again, by protocol."""
+    """Recovery of each place after a return to it, by protocol."""
     logs: Mapping[str, Path] = field(default_factory=dict)
-    """Each frame's figures, by protocol."""
+    """Files with per-frame scores, by protocol."""

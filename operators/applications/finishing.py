@@ -1,4 +1,4 @@
-"""What a session does once its graph has ended."""
+"""Steps that a session performs after its graph has ended."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ from operators.storage import storage_errors
 
 
 def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], None]:
-    """Writes the run's model to `model/` in `out`. `fitted` was there before the graph ran, and is saved even if no frame was shown."""
+    """Return a step that saves the run's model to `out/model`.
+
+    Args:
+        out: output folder of the run.
+        fitted: model trained before the graph ran, saved even if no frame was displayed.
+    """
 
     def save(session: Session) -> None:
         if fitted is not None and session.reached.find(ModelResult) is None:
@@ -35,7 +40,9 @@ def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], N
 
 
 def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
-    """Adds the `Baselines` of the frames that were shown; it reads them from the source again, twice."""
+    """Return a step that measures trivial baselines on the displayed frames, by reading the source
+    twice more.
+    """
 
     def measure(session: Session) -> None:
         if session.stop_requested() or session.failure is not None:
@@ -55,7 +62,7 @@ def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
 
 @dataclass(frozen=True)
 class FirstFrames:
-    """The first frames of a source that is not open; read from the beginning each time they are iterated."""
+    """The first `count` frames of a closed source; each iteration reads from the beginning."""
 
     source: FrameSource
     count: int

@@ -1,4 +1,6 @@
-"""Measuring a finished model in three dimensions: pictures from any camera, and the poses that it was made with."""
+"""Geometric evaluation of a finished model: pictures from arbitrary cameras, and the model's own
+poses.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,16 @@ from gsplat_core.scene.model import Model
 
 
 class SeenFromAnywhere:
-    """Pictures of a model from any camera; one renderer for each size and projection."""
+    """Renders a model from arbitrary cameras, with one renderer per picture size and projection."""
 
     def __init__(self, device: str = "cpu", renderer: str = "alpha") -> None:
         self._device, self._renderer = device, renderer
         self._makers: dict[Camera, PictureMaker] = {}
 
     def __call__(self, model: Model, camera: Camera, frame: Frame) -> Picture:
-        """The model at the frame's time and with its exposure, from where `camera` is, and in the colours that it sees from there."""
+        """Render the model from `camera` at the frame's timestamp and exposure, in the colours
+        visible from there.
+        """
         lens = camera.with_pose(np.eye(4))
         maker = self._makers.get(lens)
         if maker is None:
@@ -42,9 +46,19 @@ def measure_geometry(
     truth: GroundTruth,
     poses: Path | None = None,
 ) -> Geometry:
-    """`evaluate_geometry` of a model that was made with the poses of a file, or with those of the frames.
+    """Run `evaluate_geometry` with the poses that the model was made with.
 
-    Raises RecordingInvalid for a file that holds no poses of as many frames.
+    Args:
+        frames: frames of the recording.
+        frame_count: number of frames.
+        camera: camera of the frames.
+        model: the finished model.
+        pictures: renderer.
+        truth: ground truth of the recording.
+        poses: file with the poses; None for those of the frames.
+
+    Raises:
+        RecordingInvalid: the file does not contain `frame_count` poses.
     """
     read = None if poses is None else read_poses(poses, frame_count, Findings(strict=True))
     own = lambda frame: frame.pose if read is None else read[frame.seq]

@@ -1,12 +1,13 @@
-"""Live: a stream is reconstructed and shown beside a clock, without an end.
+"""Live reconstruction and display of an endless stream.
 
-                          depth (beside)
-                       ┌┈┈┈┈┈┘     └┈┈┈┐
-    source → analysis ─┴┬─► reconstruct ◄┘ → deform → rasterize → display ─┬─► sinks
-                        └──────────────────────────► on_screen ◄───────────┘
+                      depth (background thread)
+                   ┌┈┈┈┈┈┘     └┈┈┈┐
+source → analysis ─┴┬─► reconstruct ◄┘ → deform → rasterize → display ─┬─► sinks
+                    └──────────────────────────► on_screen ◄───────────┘
 
-Each operator has a thread of its own, and so has depth, which nothing waits for: it is found for the newest frame and reaches training when it is there. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
-`display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
+Each operator has its own thread. Depth estimation runs in a background thread on the newest frame
+and reaches training late. The queues into `reconstruct`, `rasterize` and `display` drop the oldest
+frame and count dropped frames. Displayed pictures carry their age.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ from operators.storage import StorageReserve
 
 
 class LiveApplication(Application):
-    """Composes the graph."""
+    """Graph of a live run."""
 
     def __init__(
         self,
@@ -77,7 +78,7 @@ class LiveApplication(Application):
         self._on_scored, self._on_shown = on_scored, on_shown
 
     def compose(self) -> None:
-        """Wire the operators; see the module's picture."""
+        """Create and connect the operators (see the diagram of the module)."""
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(
@@ -141,7 +142,9 @@ class LiveApplication(Application):
             self.add_flow(self.metrics, progress, {("scored", "message")}, policy="drop_oldest")
 
     def room_to_finish(self) -> int:
-        """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
+        """Return the disk space that finishing needs, in bytes: the newest model in float32 and the
+        report.
+        """
         return REPORT_RESERVE_BYTES + 4 * self.reconstruct.parameter_count
 
 
@@ -153,9 +156,19 @@ def live(
     on_shown: Callable[[Any], None] | None = None,
     report: Report | None = None,
 ) -> RunOutcome:
-    """Reconstruct a source live until it ends, the time is over, or the run is asked to stop; what was reached is written in any case.
+    """Reconstruct a source until it ends, the duration elapses or a stop is requested, and write
+    the results.
 
-    Raises a UserError before anything is written for settings that cannot work, and RunFailed, with the outcome, when a part failed.
+    Args:
+        settings: settings of the run.
+        stop_requested: polled; True ends the run.
+        on_scored: called for each scored frame with the graph.
+        on_shown: called with each `ShownPicture`.
+        report: writes the report files; None for no report.
+
+    Raises:
+        UserError: invalid settings, raised before anything is written.
+        RunFailed: a component failed; carries the outcome, and the results so far are saved.
     """
 
     def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
@@ -183,9 +196,13 @@ def live(
 
 
 def measured_size(settings: LiveSettings, about: SourceDescription, share: float = SHARE_OF_INTERVAL) -> WorkingSize:
-    """Choose the size at which this machine keeps up with a stream; runs the graph at several sizes on trial.
+    """Find the largest size at which this machine keeps up with a stream, by trial runs at several
+    sizes.
 
-    share: of the time between two frames that a frame may take.
+    Args:
+        settings: settings of the run.
+        about: description of the stream.
+        share: share of the frame interval that a frame may take.
     """
 
     def paced(tissue: PacedTissue, tried: LiveSettings) -> LiveApplication:
@@ -199,9 +216,9 @@ def measured_size(settings: LiveSettings, about: SourceDescription, share: float
 
 
 def on_trial(settings: LiveSettings, source: FrameSource, notes: list[str]) -> tuple[LiveSettings, FrameSource]:
-    """Run the graph on trial; returns the settings and the source at the size that the run works at.
+    """Perform the trial run. Return the settings and the source at the working size.
 
-    Where no scale was given, a run on a CPU chooses it by what this machine measures, and says so in `notes`.
+    On a CPU without a given scale the working size is measured and reported in `notes`.
     """
     if settings.device != "cpu" or settings.scale is not None:
         trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
@@ -213,7 +230,8 @@ def on_trial(settings: LiveSettings, source: FrameSource, notes: list[str]) -> t
 
 
 def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
-    """Check everything that can be checked before the first frame; returns the source, and adds what is to be said about it to `notes`.
+    """Perform all checks that are possible before the first frame. Return the source and add to
+    `notes`.
 
     Raises as `live` does before anything is written.
     """

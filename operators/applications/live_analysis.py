@@ -1,4 +1,4 @@
-"""What looks at a live frame before anything is learned from it."""
+"""Analysis of a live frame before training."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from operators.side_by_side import SideBySideOp
 from operators.tool_mask import new_tool_mask
 
 BESIDE = "highlights"
-"""The stage that needs no other one: it runs beside them."""
+"""A stage with no dependencies; runs concurrently with the other picture stages."""
 
 
 def analysis_operator(
@@ -26,11 +26,17 @@ def analysis_operator(
     behind_gate: Sequence[Operator] = (),
     behind: Sequence[Operator] = (),
 ) -> Operator:
-    """The operator between the source and the reconstruction; it takes and gives `frame`.
+    """Return the operator between source and reconstruction, with the input and output `frame`.
 
-    Tools and highlights are looked for while the others judge the picture. tool_mask: how tools are found, a name in `TOOL_MASKS`.
-    out_of_body: what happens to pictures from outside of the body. depth: what gives a frame its pose, and says which depth it keeps. behind_gate: operators that see each frame as it comes through that
-    gate. behind: those that see it at the end.
+    Tools and highlights are detected in parallel to the other checks of the picture.
+
+    Args:
+        fragment: the graph.
+        tool_mask: tool detector, a name in `TOOL_MASKS`.
+        out_of_body: policy for pictures from outside of the body.
+        depth: operators that set the pose of a frame and select its recorded depth.
+        behind_gate: operators inserted directly after the out-of-body gate.
+        behind: operators appended at the end.
     """
     others = [name for name in PICTURE_STAGES if name != BESIDE]
     stream = OrdinaryStream()

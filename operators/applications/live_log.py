@@ -1,4 +1,6 @@
-"""What the log of a live run says about what was on the screen when each frame was replaced by the next."""
+"""Reader for the log of a live run, which records the picture on display when each next frame
+arrived.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ _NS_PER_MS = 1e6
 
 @dataclass(frozen=True)
 class _Line:
-    """One frame and the picture that was on the screen when the next one came, which the run has scored against it."""
+    """A frame with the score and timing of the picture on display when the next frame arrived."""
 
     seq: int
     time_s: float
@@ -28,25 +30,32 @@ class _Line:
     shown_seq: int
     shown_ns: int
     age_ms: float
-    """Of the picture when it was shown."""
+    """Age of the picture at display, in milliseconds."""
     state: str
     withheld: str | None
     previous_frame_db: float
-    """What the raw frame before scored instead; NaN where it was not measured."""
+    """Tissue PSNR in dB of the previous raw frame; NaN if not measured."""
     quality: FrameQuality
 
 
 def is_live_log(path: Path) -> bool:
-    """Whether a run's log says when its pictures were shown. Raises InvalidSetting for a file that is no log."""
+    """Return True if a run's log has display times. Raise InvalidSetting if the file is not a log."""
     first = next(_entries(path), None)
     return first is not None and "shown_ns" in first and "arrived_ns" in first
 
 
 def read_live_log(path: Path, record: Record | None = None) -> Live:
-    """The live protocol's figures of a run, from its log. Raises InvalidSetting for a line that is none of such a log.
+    """Compute the scores of the live protocol from a run's log.
 
-    The pictures themselves were scored while they were shown (`OnScreenMetricsOp`). The last frame is left out, since nobody knows when the
-    next one would have come. record: given each scored frame's figures.
+    The run scored the pictures when they were displayed (`OnScreenMetricsOp`). The last frame is
+    excluded, because its display duration is unknown.
+
+    Args:
+        path: the log file.
+        record: called with the scores of each frame.
+
+    Raises:
+        InvalidSetting: a line is not an entry of a live log.
     """
     sums = LiveSums(record)
     last_shown: tuple[int, int] | None = None

@@ -1,4 +1,4 @@
-"""What a live run is asked for."""
+"""Settings of a live run, and their defaults per device."""
 
 from __future__ import annotations
 
@@ -25,81 +25,103 @@ from operators.tool_mask import check_tool_mask
 LIVE_WINDOW_FRAMES = {"cpu": 60, "cuda": 150}
 LIVE_BUMP_SPACING_S = {"cpu": 0.2, "cuda": 0.1}
 LIVE_HISTORY_S = {"cpu": 3.0, "cuda": 6.0}
-"""How much of the past stays deformable: what the window holds at 30 frames a second, and a little more. On a CPU each second of it makes
-every step longer."""
+"""Duration of the past that stays deformable, in seconds, slightly more than the training window at
+30 frames/s. Longer histories slow down every step on a CPU.
+"""
 LIVE_MOTION_DETAIL: Detail = "half"
 LIVE_GAUSSIANS = {"cpu": 12_000, "cuda": 45_000}
 LIVE_MOST_GAUSSIANS = 100_000
-"""At the start of a scene, for large pictures; twice as many may be there in all."""
+"""Maximum number of initial Gaussians of a scene, for large pictures. The capacity is twice the
+initial number.
+"""
 LIVE_PIXELS_PER_GAUSSIAN = 13
-"""On a GPU, for pictures that are larger than the usual ones."""
+"""Pixels per initial Gaussian on a GPU, for pictures larger than usual."""
 LIVE_TRAINING = {
     "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5),
     "cuda": LiveTraining(colour_relaxation=1.5),
 }
 LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
-"""What colours are corrected by where there are few steps; with many L1 follows motion better."""
+"""Use a squared colour loss. It suits few steps per frame; with many steps, L1 follows motion
+better.
+"""
 LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
-"""Steps that a frame gets though it is shown late."""
+"""Minimum number of optimiser steps per frame, even past the display deadline."""
 LIVE_LEAST_SHARE = {"cpu": 0.34, "cuda": 0.2}
-"""Share of the time between frames that training gets though a frame is shown later for it: a few steps."""
+"""Share of the frame interval guaranteed for training, even past the display deadline."""
 LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
-"""A frame is shown after this share of the time between frames, and at most so many milliseconds. A step on a CPU is worth more than showing it
-sooner, as long as it is shown before the next frame comes."""
+"""Display deadline: share of the frame interval, and upper limit in milliseconds. On a CPU another
+step improves the picture more than an earlier display, up to the next frame.
+"""
 LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 5}
-"""Steps of a scene's first frame: its picture, and the frames behind it, wait for them."""
+"""Minimum number of steps on a scene's first frame. Its display and the following frames wait for
+them.
+"""
 LIVE_PREDICT_EVERY = {"cpu": 8, "cuda": 4}
-"""Every so many pictures the next frame's prediction is rendered and scored. It costs as much as a picture and its score."""
+"""One in this many pictures is also predicted and scored, at about the cost of rendering and
+scoring a picture.
+"""
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
-"""How long a frame may wait before it is passed over. A GPU catches up within a few frames; two cores would show each of them late."""
+"""Longest wait of a frame before it is dropped, in frame intervals. A GPU catches up within a few
+frames; a CPU would display each of them late.
+"""
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
-"""With few steps a frame, optical flow tells where the tissue is sooner than training does; on a GPU the flow itself takes longer."""
+"""Initialise motion by optical flow. With few steps, flow follows the tissue faster than training;
+on a GPU, flow is slower than training.
+"""
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
-"""Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
+"""Weight of SSIM next to L1, which improves tracking of motion. On a CPU a step with SSIM takes 1.5
+times as long.
+"""
 
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """What to reconstruct live, how, and where the results go. Raises InvalidSetting for a value out of its range."""
+    """Settings of a live run. Raises InvalidSetting for a value out of range."""
 
     source: str
-    """An address (see `open_source`)."""
+    """Address of the source (see `open_source`)."""
     out: Path
     device: str = "cpu"
     field: str = "auto"
     renderer: str = "alpha"
     seed: int = 0
     eyes: Eyes = "left"
-    """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known. Depth is found from both in either case, and what is
-    shown is the left one's: the right one takes steps from it."""
+    """Pictures of a stereo scope used for training; `both` requires the right camera's calibration.
+    Stereo depth uses both pictures in any case. The display shows the left one, from which the
+    right one takes steps.
+    """
     scale: float | None = None
-    """Resize the stream's pictures by this factor. None: as much as this machine needs on a CPU (`working_size`), not at all on a GPU."""
+    """Scale of the stream's pictures. None: chosen by measurement on a CPU (`working_size`), 1 on a
+    GPU.
+    """
     max_frames: int | None = None
     seconds: float | None = None
-    """End after so long; None: when the source ends or the run is interrupted."""
+    """Maximum duration in seconds; None: until the source ends or the run is interrupted."""
     loop: bool = False
-    """Play a recording again and again."""
+    """Play a recording in a loop."""
     fps: float | None = None
-    """Play a recording at this rate instead of its own."""
+    """Playback rate of a recording in frames/s; None: its own rate."""
     record: Path | None = None
-    """Record the session into this folder, which is not there yet; None: it is not recorded."""
+    """New folder for a recording of the session; None: no recording."""
     recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
-    """How it is recorded."""
+    """Options of the session recording."""
     report: bool = True
-    """Gather what a report shows: a line of figures for each frame, key frames, SSIM and the digest of the pictures. A run without an end
-    has no report, and its log would grow."""
+    """Collect data for the report: per-frame scores, key frames, SSIM and a digest of the pictures.
+    Disable for endless runs, because the log grows.
+    """
     tool_mask: str = "builtin"
-    """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
+    """Tool detector for frames without a recorded mask, a name in `operators.tool_mask.TOOL_MASKS`.
+    """
     depth: str = "auto"
-    """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
+    """Depth source: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     poses: Poses = "given"
-    """Where the scope is: as the frames say, or as is estimated from the pictures (`operators.pose`)."""
+    """Pose source: recorded with the frames, or estimated from the pictures (`operators.pose`)."""
     out_of_body: Policy = "withhold"
-    """What happens to pictures from outside of the body: nothing of them goes on, or (`off`) they are not looked for."""
+    """Policy for pictures from outside of the body: `withhold`, or `off` for no check."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining | None = None
-    """None: as suits the number of steps that the device can make in a frame's time."""
+    """Training parameters; None: device default."""
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
@@ -118,12 +140,12 @@ class LiveSettings:
 
     @property
     def given_scale(self) -> float:
-        """The factor that was asked for; 1 where none was."""
+        """Requested scale; 1 if none was given."""
         return 1.0 if self.scale is None else self.scale
 
     @property
     def chosen_clock(self) -> ClockSettings:
-        """When frames are shown."""
+        """Display deadlines and step limits with the defaults of the device filled in."""
         at_least = self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
         fewest = self.clock.fewest_steps or at_least
         share, most_ms = LIVE_SHOW_AFTER[self.device]
@@ -140,17 +162,17 @@ class LiveSettings:
 
     @property
     def chosen_training(self) -> LiveTraining:
-        """How the steps are taken."""
+        """Training parameters, by default those of the device."""
         return self.training or LIVE_TRAINING[self.device]
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """What the run reads from the disk."""
+        """Paths that the run reads."""
         path = Path(self.source)
         return (*((path,) if path.exists() else ()), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
-        """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
+        """Return the reconstructor's settings for frames of `pixels` pixels. Raises InvalidSetting."""
         device = self.device
         wanted = LIVE_GAUSSIANS[device]
         if device == "cuda":
@@ -173,7 +195,7 @@ class LiveSettings:
         )
 
     def stated(self) -> RunSettings:
-        """What the report says about them."""
+        """Return the settings that the report states."""
         return RunSettings(
             device=self.device,
             engine="embedded",

@@ -1,4 +1,6 @@
-"""What is done before a live stream's first frame, so that no frame has to wait for it."""
+"""Preparation of a live run before its first frame: warm-up and interpreter settings for low
+latency.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,19 @@ from operators.rasterize import Rasterizer
 from operators.sources.source import FrameSource
 
 GARBAGE_THRESHOLDS = (20_000, 20, 1000)
-"""Garbage is looked for seldom, and mostly among what is new: no frame makes cycles of objects, and a whole search takes tens of ms."""
+"""Thresholds of the garbage collector. Collections are rare and mostly of young objects: processing
+a frame creates no cycles, and a full collection takes tens of milliseconds.
+"""
 SWITCH_INTERVAL_S = 0.0002
-"""How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
+"""Interpreter switch interval in seconds. With the default of 5 ms, a thread could wait that long
+for the GIL.
+"""
 OPENCV_THREADS = 1
-"""More of them take longer to start than small pictures take to look at."""
+"""Number of OpenCV threads. Starting more takes longer than processing a small picture."""
 
 
 def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
-    """A reconstructor for the frames of a source."""
+    """Create a reconstructor for the frames of a source."""
     camera = source.description.camera
     return LiveReconstructor(
         settings.reconstructor_config(camera.width_px * camera.height_px),
@@ -43,20 +49,21 @@ def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveR
 
 @dataclass(frozen=True)
 class LiveParts:
-    """What a live run works with."""
+    """Components of a live session."""
 
     reconstructor: LiveReconstructor
     rasterizer: Rasterizer
 
 
 def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
-    """The parts for the frames of a source; their first use takes long."""
+    """Create the components for a source. Their first use is slow (see `warm_up`)."""
     return LiveParts(new_live_reconstructor(settings, source), Rasterizer(settings.renderer))
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
-    """New parts that have done everything once that takes long the first time: graphs are captured, memory is taken, the length of a step is
-    known. The stream's first frame then has to wait for none of it."""
+    """Create the components and exercise them: capture graphs, allocate memory, measure the
+    duration of a step.
+    """
     camera = source.description.camera
     parts = new_parts(settings, source)
 
@@ -71,7 +78,9 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
 
 @contextmanager
 def low_latency() -> Iterator[None]:
-    """Inside, threads take turns often, and what exists already is never searched for garbage again."""
+    """Context manager with a short interpreter switch interval and existing objects exempt from
+    garbage collection.
+    """
     interval_s = sys.getswitchinterval()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(min(threads, OPENCV_THREADS))

@@ -1,7 +1,8 @@
-"""How much memory a run takes, so that one that cannot fit is refused before it starts.
+"""Memory estimates, to refuse a run that cannot fit before it starts.
 
-Rules of thumb, fitted to the peak resident size of replays on a CPU: `sinus` (540x540) and `cutting` (640x512) at scales 0.5, 1 and 2, 2 to
-156 frames. Together with what the process takes before its first frame (0.5 GiB) they are within 10 % of each.
+The constants are fitted to the peak resident size of replays on a CPU: `sinus` (540x540) and
+`cutting` (640x512) at scales 0.5, 1 and 2, with 2 to 156 frames. Including the 0.5 GiB that the
+process uses before its first frame, the estimates are within 10 % of each measurement.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from operators.sources.source import SourceDescription
 from operators.storage import mebibytes
 
 FIXED_BYTES = 16 * 2**20
-"""Threads, the video's encoder, the report."""
+"""Memory of threads, the video encoder and the report."""
 OTHER_FIELD_BYTES = 256 * 2**20
-"""A field that is not made of basis functions, with what its training needs: HexPlane, measured with 30,000 Gaussians."""
+"""Memory of a field without basis functions, including training: HexPlane, measured with 30,000
+Gaussians.
+"""
 PIXEL_BYTES = 200
-"""For each pixel of a frame: training, scoring, the pictures of the report."""
+"""Bytes per pixel for training, scoring and the report's pictures."""
 WINDOW_PIXEL_BYTES = 26
-"""For each pixel of every frame that is kept for training."""
+"""Bytes per pixel of each frame kept for training."""
 PARAMETER_BYTES = 32
-"""For each number of the model: itself, Adam's two moments, snapshots and what is being saved."""
+"""Bytes per model parameter: the value, Adam's two moments, snapshots and the copy for saving."""
 _CANONICAL = 14
 _BUMP = 15
 _BUMPS_AT_START = 5
@@ -30,14 +33,21 @@ RENDER_PARAMETER_BYTES = 12
 
 
 def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offline: bool = False) -> int:
-    """What a replay of the source takes, or an offline reconstruction, which keeps every frame."""
+    """Estimate the memory of a replay in bytes.
+
+    Args:
+        source: description of the recording.
+        config: settings of the reconstructor.
+        offline: offline reconstruction, which keeps every frame.
+    """
     frames = source.frame_count or config.window_frames
     kept = frames if offline else min(frames, config.window_frames)
     pixels = source.width_px * source.height_px
-    # A field of basis functions grows with the stream.
+    # A field of basis functions grows with the duration of the stream.
     basis = config.chosen_field == "basis"
     bumps = _BUMPS_AT_START + round(frames / source.fps / config.bump_spacing_s) if basis else 0
-    # Offline every Gaussian is there in the end; online they come where tissue appears, on a fixed scope hardly any.
+    # Offline training ends with all Gaussians. Online, Gaussians are added for new tissue, of which
+    # a fixed scope shows little.
     gaussians = config.max_gaussians if offline else config.gaussians
     model = PARAMETER_BYTES * gaussians * (_CANONICAL + _BUMP * bumps)
     return (
@@ -46,12 +56,20 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
 
 
 def render_bytes(width_px: int, height_px: int, parameters: int) -> int:
-    """What rendering pictures of this size takes, from a model of so many numbers that has been loaded."""
+    """Estimate the memory in bytes for rendering pictures of this size from a loaded model of
+    `parameters` values.
+    """
     return FIXED_BYTES + width_px * height_px * RENDER_PIXEL_BYTES + RENDER_PARAMETER_BYTES * parameters
 
 
 def require_memory(needed: int, what: str, advice: str) -> None:
-    """Raises MemoryTooSmall when this machine, or the limits of this process, cannot give so many bytes."""
+    """Raise MemoryTooSmall if less than `needed` bytes are available.
+
+    Args:
+        needed: required memory in bytes.
+        what: subject of the error message.
+        advice: remedy, for the error message.
+    """
     available = available_bytes()
     if available is not None and needed > available:
         raise MemoryTooSmall(

@@ -1,4 +1,4 @@
-"""What an application reports about its progress while it runs."""
+"""Progress reports of a running application."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Progress:
-    """One step of progress."""
+    """Progress of one stage of a run."""
 
     stage: str
-    """What is being done, in a word."""
+    """Name of the stage, one word."""
     done: int
     total: int
     unit: str = "frames"
     psnr_tissue_db: float | None = None
-    """Tissue PSNR of the newest displayed frame; its training error where `trained`."""
+    """Tissue PSNR of the newest displayed frame in dB; its training error if `trained`."""
     previous_frame_db: float | None = None
-    """Tissue PSNR of the raw frame before it, shown instead."""
+    """Tissue PSNR in dB of the previous raw frame (trivial baseline)."""
     next_frame_db: float | None = None
-    """Tissue PSNR of the next frame, predicted before it was trained on: no training error."""
+    """Tissue PSNR in dB of the frame's prediction before training on it."""
     trained: bool = True
-    """The newest displayed frame was trained on before it was shown."""
+    """True if the newest displayed frame was trained on before display."""
 
 
 ProgressCallback = Callable[[Progress], None]

@@ -1,6 +1,8 @@
-"""Offline reconstruction: train on all training frames at once, then show and score every frame.
+"""Offline reconstruction: training on all training frames at once, then display and scoring of
+every frame.
 
-The held-out frames of the protocol are never trained on. The evaluation is the replay's graph with a model that learns nothing more.
+The protocol's held-out frames are excluded from training. The evaluation uses the graph of replay
+with a fixed model.
 """
 
 from __future__ import annotations
@@ -31,22 +33,22 @@ from operators.sources.source import FrameSource
 
 
 class FittedModel:
-    """A finished model where the graph expects a reconstructor: it observes without learning."""
+    """Adapter that presents a finished model as a reconstructor, which observes without training."""
 
     def __init__(self, model: Model, eyes: BothEyes) -> None:
         self.model, self.eyes = model, eyes
 
     def observe(self, frame: Frame, *, steps: int | None = None, train: bool = True) -> ObserveReport:
-        """Learn nothing."""
+        """Return a report without training steps."""
         return ObserveReport(frame.seq, 0, None, self.model.gaussians.count)
 
     def publish(self) -> Model:
-        """The finished model."""
+        """Return the finished model."""
         return self.model
 
 
 class _StopFitting(Exception):
-    """Leaves `fit` between two steps."""
+    """Raised between two steps to leave `fit` after a stop request."""
 
 
 def reconstruct(
@@ -56,11 +58,18 @@ def reconstruct(
     stop_requested: Callable[[], bool] = lambda: False,
     report: Report | None = None,
 ) -> RunOutcome:
-    """Train offline for `steps` steps, then evaluate; writes what a replay writes.
+    """Train offline, then evaluate, and write the same files as a replay.
 
-    When `stop_requested` answers True while training, the model is saved as it is then and not evaluated; while evaluating, as in a replay.
+    Args:
+        settings: settings of the run; held-out frames are always excluded.
+        steps: number of optimiser steps.
+        progress: called after each step or frame.
+        stop_requested: polled. True during training saves the model without evaluation; True during
+            evaluation acts as in a replay.
+        report: writes the report files; None for no report.
 
-    Raises as `replay`; InvalidSetting for fewer steps than one.
+    Raises:
+        InvalidSetting: `steps` is out of range. Also as `replay`.
     """
     check_steps("steps", steps)
 
@@ -110,7 +119,11 @@ def _fit(
     stop_requested: Callable[[], bool],
     notes: list[str],
 ) -> tuple[Model, BothEyes, int]:
-    """Train; returns the model, the eyes that it was trained on, and how many steps were made. Adds what is to be said about its depth to `notes`."""
+    """Train the model and add notes on its depth to `notes`.
+
+    Returns:
+        The model, the eyes it was trained on, and the number of completed steps.
+    """
     description = source.description
     if description.digest is None or description.frame_count is None:
         raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
@@ -126,7 +139,8 @@ def _fit(
             raise _StopFitting
 
     frames = FirstFrames(source, description.frame_count)
-    # Offline parallax is found from all frames at once, in `fit`, and not from the frames before each.
+    # `fit` computes offline parallax from all frames at once, so it is not estimated per frame
+    # here.
     choice = "none" if settings.depth == "parallax" else settings.depth
     finder = DepthFinder(choice, description.camera, device=settings.device)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):

@@ -1,4 +1,4 @@
-"""What a live run needs to be recorded: the recorder, and the lines that say how the model was trained."""
+"""Recording of a live run: frames, pictures and the schedule of training."""
 
 from __future__ import annotations
 
@@ -33,11 +33,14 @@ if TYPE_CHECKING:
     from operators.applications.live_settings import LiveSettings
 
 RECORDING_RESERVE_BYTES = 64 * 2**20
-"""Room that a recording leaves on the disk, beside what finishing the run needs."""
+"""Disk space that a recording leaves free in addition to the space for finishing the run, in bytes.
+"""
 
 
 def new_recording_folder(out: Path) -> Path:
-    """Where a run that starts now and writes its results into `out` is recorded. The folder itself is made when the recording begins."""
+    """Return a new folder name for the recording of a run with the output folder `out`. Creates
+    nothing.
+    """
     base = out / RECORDINGS / datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     folder, more = base, 1
     while folder.exists():
@@ -48,7 +51,7 @@ def new_recording_folder(out: Path) -> Path:
 def new_recorder(
     folder: Path, source: SourceDescription, settings: LiveSettings, room_to_finish: Callable[[], int]
 ) -> SessionRecorder:
-    """A recorder for a run; it is opened when the graph starts."""
+    """Create the recorder of a run. The graph opens it at its start."""
     info = SessionInfo(
         source=source.name[:1000],
         utc=datetime.now(UTC).isoformat(),
@@ -64,38 +67,47 @@ def new_recorder(
 
 
 class RunRecording:
-    """Puts the recording of a live run into its graph. Without a folder to record into it changes nothing."""
+    """Inserts the recording of a live run into its graph. Without a recording folder it has no
+    effect.
+    """
 
     def __init__(
         self, graph: Application, settings: LiveSettings, source: SourceDescription, room: Callable[[], int]
     ) -> None:
-        """room: bytes on the disk that finishing the run needs."""
+        """Create the recorder if the settings ask for a recording.
+
+        Args:
+            graph: graph of the run.
+            settings: settings of the run.
+            source: description of the stream.
+            room: returns the disk space that finishing the run needs, in bytes.
+        """
         self._graph, self._settings, self._is_stereo = graph, settings, source.is_stereo
         self.recorder: SessionRecorder | None = None
         if settings.record is not None:
             self.recorder = new_recorder(settings.record, source, settings, room)
 
     def behind_gate(self) -> list[Operator]:
-        """What records each frame as it comes through the out-of-body gate."""
+        """Return the operators that record each frame after the out-of-body gate."""
         if self.recorder is None:
             return []
         return [RecordFramesOp(self._graph, name="recorded_frames", recorder=self.recorder)]
 
     def behind_analysis(self) -> list[Operator]:
-        """What records each frame as it goes into training."""
+        """Return the operators that record the analysis results of each frame before training."""
         if self.recorder is None:
             return []
         return [RecordPreparationOp(self._graph, name="recorded_preparation", recorder=self.recorder)]
 
     def pictures_of(self, display: Operator) -> None:
-        """Record what `display` shows."""
+        """Record the pictures that `display` emits."""
         if self.recorder is not None:
             pictures = RecordPicturesOp(self._graph, name="recorded_pictures", recorder=self.recorder)
             self._graph.add_flow(display, pictures, {("shown", "shown")}, policy="drop_oldest", capacity=8)
 
     @property
     def listener(self) -> ScheduleListener | None:
-        """Writes every call that changes the model."""
+        """Callback that records every call that changes the model; None without a recording."""
         if self.recorder is None:
             return None
         recorder = self.recorder
@@ -109,7 +121,7 @@ class RunRecording:
         return told
 
     def made_by(self, make: Callable[[], LiveReconstructor]) -> Callable[[], LiveReconstructor]:
-        """`make`, and write what was made."""
+        """Return a factory that calls `make` and records the settings of the new reconstructor."""
         if self.recorder is None:
             return make
         recorder, settings = self.recorder, self._settings
@@ -144,7 +156,7 @@ def _line(event: ScheduleEvent) -> ScheduleLine:
 
 
 def _json(settings: Any) -> dict[str, Any]:
-    """The fields of a dataclass, in what JSON has."""
+    """Return the fields of a dataclass as JSON values."""
     assert dataclasses.is_dataclass(settings)
     values: dict[str, Any] = TypeAdapter(type(settings)).dump_python(settings, mode="json")
     return values

@@ -1,4 +1,4 @@
-"""A finished model as a video or as images, over its time window, from its own camera or from elsewhere."""
+"""Rendering of a finished model to a video or images over its time window, from selectable views."""
 
 from __future__ import annotations
 
@@ -50,14 +50,32 @@ def render_model(
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Render the model at `fps` frames per second of its own time, to `out`: a file ending in .mp4, or a folder of PNG images.
+    """Render the model to a video file or a folder of PNG images.
 
-    What was never seen is hatched in all views but the recorded one.
+    All views but the recorded one hatch unobserved areas. An existing video is replaced only with
+    `overwrite`, an existing folder only if an earlier run made it. Either stays unchanged until the
+    new one is complete.
 
-    A video that is there already is replaced only with `overwrite`, a folder of images only when an earlier run made it; either stays as it
-    was until the new one is complete. Returns the number of frames written; what was written before a stop is complete.
+    Args:
+        bundle: the saved model.
+        out: a file ending in .mp4, or a folder.
+        fps: frames per second of the model's time.
+        scale: factor on the size of the model's camera.
+        device: `cpu` or `cuda`.
+        renderer: name of the renderer.
+        view: camera path.
+        overwrite: replace an existing video of this program.
+        progress: called after each frame.
+        stop_requested: polled; True ends the rendering.
 
-    Raises BundleError, DeviceMissing, InvalidSetting, OutputError.
+    Returns:
+        Number of frames written, also after a stop.
+
+    Raises:
+        BundleError: the model cannot be read.
+        DeviceMissing: the device is not available.
+        InvalidSetting: an option is out of range.
+        OutputError: `out` cannot be written or must not be replaced.
     """
     check_scale(scale)
     frames_to_render((0, 0), fps)
@@ -68,7 +86,7 @@ def render_model(
     check_device(device)
     check_renderer(renderer, device)
     model = load_model(bundle).to(device)
-    if is_scene_file(bundle) and view.name == RECORDED.name:  # no camera was recorded
+    if is_scene_file(bundle) and view.name == RECORDED.name:  # such files contain no camera
         view = ViewWish("orbit")
     check_shown_size(model.camera.width_px, model.camera.height_px, scale)
     camera = model.camera.scaled(scale)
@@ -89,7 +107,7 @@ def render_model(
 
 
 class _Pictures:
-    """Draws a model from a view; for one thread."""
+    """Renders a model from a view. Not thread-safe."""
 
     def __init__(self, model: Model, view: View, make_renderer: Callable[[], Renderer]) -> None:
         self._model, self.view = model, view
@@ -98,7 +116,7 @@ class _Pictures:
             renderer.prepare(seen or model)
 
     def at(self, time_s: float) -> NDArray[np.uint8]:
-        """RGB uint8 [H, W, 3]: the view's pictures side by side."""
+        """Render the view's pictures side by side, uint8 RGB [H, W, 3]."""
         with torch.inference_mode():
             drawn = zip(self._eyes, self.view.cameras(time_s), strict=True)
             return np.hstack([self._picture(seen, renderer, camera, time_s) for (seen, renderer), camera in drawn])
@@ -115,7 +133,9 @@ class _Pictures:
 
 
 def _eyes_of(model: Model, view: View) -> list[Model | None]:
-    """The model as an eye of the scope saw it, for each of the pictures that stand side by side; None where none did."""
+    """Return the model variant for each picture side by side; None renders colours by viewing
+    direction.
+    """
     if not view.is_virtual:
         return [model]
     if view.across == 1:
@@ -130,7 +150,7 @@ def _images(
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
 ) -> Iterator[NDArray]:
-    """RGB uint8 [H, W, 3], over the view's time window, until a stop is requested."""
+    """Yield uint8 RGB pictures [H, W, 3] over the view's time window until a stop is requested."""
     for k in range(count):
         if stop_requested():
             return
@@ -140,7 +160,9 @@ def _images(
 
 
 def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
-    """Write the video beside its name and rename it. One that ends early is kept where there was none before."""
+    """Write the video atomically. After an error the partial video is kept only if no earlier one
+    exists.
+    """
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
     with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
@@ -161,7 +183,9 @@ def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int],
 
 
 def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) -> int:
-    """Write numbered PNG files. A run that ends early delivers its images where none were before."""
+    """Write numbered PNG files. After an error the images so far are kept only if the folder was
+    empty.
+    """
     written = 0
     with OutputFolder(out, "render", inputs) as output:
         reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)
@@ -185,7 +209,7 @@ def _check_video_path(inputs: Sequence[Path], out: Path, overwrite: bool) -> Non
 
 
 def _check_not_trained_on(model: Model, out: Path) -> None:
-    """A recording is worth more than any rendering of a model that was made from it."""
+    """Raise OutputError if `out` is the recording that the model was trained on."""
     if model.training_digest is None or not out.is_file():
         return
     try:

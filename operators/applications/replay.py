@@ -1,14 +1,16 @@
-"""Replay: a recording, or another source with an end, is reconstructed, shown and measured frame by frame.
+"""Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finite
+source.
 
-    source → tool_mask → (pose) → depth → reconstruct → deform → rasterize → video
-                                                                  → metrics → keyframes
-                                                                            → progress
+source → tool_mask → (pose) → depth → reconstruct → deform → rasterize → video
+                                                              → metrics → keyframes
+                                                                        → progress
 
-`video` and `keyframes` are the sinks that `ReplaySettings.sinks` names.
+`ReplaySettings.sinks` selects the sinks, here `video` and `keyframes`.
 
-Deterministic: each operator takes its frames in order and shares nothing with the others but messages, time comes from the recording, work
-per frame is a count, every edge blocks. The same recording, settings and device give the same `frames_sha256`, on either engine and with
-any number of threads (`scheduler_for`).
+Each operator processes its frames in order and shares only messages. Timestamps come from the
+recording, the work per frame is a fixed number of steps, and every edge blocks. The same recording,
+settings and device therefore give the same `frames_sha256` on either engine and with any number of
+threads (`scheduler_for`).
 """
 
 from __future__ import annotations
@@ -55,39 +57,43 @@ from operators.storage import StorageReserve
 from operators.truth import TruthOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
-"""Room on the disk that stays free for the video's index and the report."""
+"""Disk space reserved for the video's index and the report, in bytes."""
 PIXELS_PER_GAUSSIAN = 4
 
 
 @dataclass(frozen=True)
 class ReplaySettings:
-    """What to replay, how, and where the results go."""
+    """Settings of a replay. Raises InvalidSetting for a value out of range."""
 
     recording: Path | str
-    """A recording, or a source with an end: `scheme://address` (see `open_source`)."""
+    """Path of a recording, or address of a finite source, `scheme://address` (see `open_source`).
+    """
     out: Path
     device: str = "cpu"
     engine: Engine = "embedded"
     field: str = "auto"
     renderer: str = "alpha"
-    """A name in `gsplat_core.rendering.registry.RENDERERS`."""
+    """Name in `gsplat_core.rendering.registry.RENDERERS`."""
     sinks: tuple[str, ...] = ("video", "keyframes")
     """Names in `operators.sinks.registry.SINKS`."""
     seed: int = 0
     steps_per_frame: int | None = None
-    """Optimiser steps per frame; None is the reconstructor's default."""
+    """Optimiser steps per frame; None for the reconstructor's default."""
     max_frames: int | None = None
     scale: float = 1.0
     ignore_schedule: bool = False
-    """Replay a recorded session like any other recording, and not with the calls that it made."""
+    """Replay a recorded session as a plain recording, ignoring its schedule of calls."""
     depth: str = "auto"
-    """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
+    """Depth source: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     eyes: Eyes | None = None
-    """Pictures of a stereo scope that are trained on; None: the left ones, which are displayed."""
+    """Pictures of a stereo scope used for training; None: the left ones, which are also displayed.
+    """
     poses: Poses = "given"
-    """Where the scope was: as the recording says, or as is estimated from the pictures, frame by frame (`operators.pose`)."""
+    """Pose source: the recording, or frame-by-frame estimation from the pictures
+    (`operators.pose`).
+    """
     heldout: bool = False
-    """Show the protocol's held-out frames without training on them, and score them apart."""
+    """Exclude the protocol's held-out frames from training and score them separately."""
 
     def __post_init__(self) -> None:
         if self.engine not in get_args(Engine):
@@ -104,17 +110,25 @@ class ReplaySettings:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """What the run reads from the disk."""
+        """Paths that the run reads."""
         return (Path(self.recording), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
-        """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
+        """Return the reconstructor's settings.
+
+        Args:
+            pixels: pixels per frame, which limit the number of Gaussians; None for no limit.
+            offline: settings for `Reconstructor.fit`.
+
+        Raises:
+            InvalidSetting: the settings are inconsistent.
+        """
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
         config = replace(config, eyes=self.eyes or "left")
         if offline:
             config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:
-            # More Gaussians than a quarter of the pixels have nothing to show.
+            # Pixels limit the useful number of Gaussians to a quarter of their count.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)
             config = replace(
                 config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most)
@@ -122,7 +136,7 @@ class ReplaySettings:
         return config if self.steps_per_frame is None else replace(config, steps_per_frame=self.steps_per_frame)
 
     def stated(self, *, online: bool) -> RunSettings:
-        """What the report says about them. online: whether training is done frame by frame."""
+        """Return the settings that the report states. online: training is done frame by frame."""
         config = self.reconstructor_config()
         return RunSettings(
             device=self.device,
@@ -137,7 +151,7 @@ class ReplaySettings:
 
 
 class ReplayApplication(Application):
-    """Composes the graph."""
+    """Graph of a replay."""
 
     def __init__(
         self,
@@ -152,7 +166,20 @@ class ReplayApplication(Application):
         stage: str = "replay",
         predicts: bool = True,
     ) -> None:
-        """predicts: score each frame's prediction by the model that has not seen it; False for a model that has seen all frames."""
+        """Store the parameters; `compose` creates the operators.
+
+        Args:
+            source: source of the frames.
+            settings: settings of the replay.
+            reserve_bytes: disk space to keep free, in addition to the model.
+            progress: called after each scored frame.
+            stop_requested: polled; True ends the stream.
+            make_reconstructor: factory of the reconstructor; None for the default of the settings.
+            followed: recorded session whose schedule is replayed; None for a plain replay.
+            stage: name of the stage in progress reports.
+            predicts: score predictions made before training; False for a model that has seen all
+                frames.
+        """
         super().__init__(name="replay", track=True)
         self.scheduler(scheduler_for(settings.device, self))
         self.frame_source = source
@@ -165,7 +192,7 @@ class ReplayApplication(Application):
         self._followed = followed
 
     def compose(self) -> None:
-        """Wire the operators; see the module's picture."""
+        """Create and connect the operators (see the diagram of the module)."""
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
@@ -182,7 +209,7 @@ class ReplayApplication(Application):
         self.add_flow(deform, rasterize, {("scene", "scene")})
         options = SinkOptions(out, self.frame_source.description, reserve)
         sinks = [SINKS[name](self, name, options) for name in settings.sinks]
-        # A sink takes what is rendered, or what is rendered and scored.
+        # A sink consumes either rendered or scored frames.
         for sink in sinks:
             port, kind = input_of(sink)
             if kind is RenderedFrame:
@@ -201,7 +228,7 @@ class ReplayApplication(Application):
         self.add_flow(self.metrics, progress, {("scored", "message")})
 
     def _compare_with_truth(self, rasterize: RasterizeOp) -> None:
-        """Score what no camera shows, where the recording knows the tissue behind its tools."""
+        """Add scores against ground truth if the recording provides the tissue behind its tools."""
         folder, about = Path(self.settings.recording), self.frame_source.description
         if about.frame_count is None or not folder.is_dir():
             return
@@ -218,7 +245,9 @@ class ReplayApplication(Application):
         )
 
     def room_to_finish(self) -> int:
-        """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
+        """Return the disk space that finishing needs, in bytes: the newest model in float32 and the
+        report.
+        """
         model = self.reconstruct.newest
         return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
 
@@ -226,7 +255,9 @@ class ReplayApplication(Application):
         return self.settings.heldout and is_heldout(frame.seq)
 
     def announce(self) -> None:
-        """Say how much there is to do: the first frame, which starts the model, takes long."""
+        """Report zero progress before the first frame, which takes long because it initialises the
+        model.
+        """
         self._show(0, None)
 
     def _report(self, scored: ScoredFrame) -> None:
@@ -259,14 +290,19 @@ def replay(
     stop_requested: Callable[[], bool] = lambda: False,
     report: Report | None = None,
 ) -> RunOutcome:
-    """Run a replay; writes the video, the model and the frames' figures into the output folder.
+    """Run a replay and write the video, the model and the per-frame scores into the output folder.
 
-    When `stop_requested` answers True the frames in flight are finished and everything is written; the outcome says so. `report` writes
-    what it makes of the outcome beside them (see `delivered`).
+    Args:
+        settings: settings of the replay.
+        progress: called after each scored frame.
+        stop_requested: polled; after True the frames in flight are finished and all results
+            written.
+        report: writes the report files (see `delivered`); None for no report.
 
     Raises:
         RecordingError, InvalidSetting, DeviceMissing, OutputError: before anything was written.
-        RunFailed: the run ended early; what it had reached is saved, and the error carries the outcome.
+        RunFailed: the run ended early; the results so far are saved, and the error carries the
+            outcome.
     """
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
@@ -281,7 +317,8 @@ def replay(
             inside.stated(online=True),
             command="replay",
             engine=inside.engine,
-            # A session passes frames over, so that what it showed is not the beginning of what it read.
+            # A session drops frames, so the displayed frames are not simply the first ones of the
+            # recording.
             finish=[saves_model(inside.out), *([] if followed else [measures_baselines(source)])],
             notes=notes,
             stop_requested=stop_requested,
@@ -291,9 +328,16 @@ def replay(
 
 
 def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False) -> FrameSource:
-    """Check all that can be checked before the first frame; returns the source, and adds what is to be said of it to `notes`. offline: for `fit`.
+    """Perform all checks that are possible before the first frame. Return the source and add to
+    `notes`.
 
-    Raises as `replay` does before anything is written.
+    Args:
+        settings: settings of the replay.
+        notes: list that receives notes for the report.
+        offline: prepare for `Reconstructor.fit`.
+
+    Raises:
+        UserError: as `replay` raises it before anything is written.
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
@@ -319,7 +363,7 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
 
 
 def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline: bool = False) -> Reconstructor:
-    """A reconstructor for the frames of a source; offline: for `fit`."""
+    """Create a reconstructor for the frames of a source; `offline` for `Reconstructor.fit`."""
     description = source.description
     return Reconstructor(
         settings.reconstructor_config(description.width_px * description.height_px, offline=offline),

@@ -1,4 +1,4 @@
-"""What is found in a frame of a replay before anything is learned from it."""
+"""Analysis of a replayed frame before training."""
 
 from __future__ import annotations
 
@@ -21,12 +21,16 @@ if TYPE_CHECKING:
 def replay_analysis(
     graph: ReplayApplication, camera: Camera, held_out: Callable[[Frame], bool], *, follows: bool
 ) -> Sequence[Operator]:
-    """The operators between the source and the reconstruction, in order.
+    """Return the operators between source and reconstruction, in order.
 
-    follows: whether a session is followed, whose frames have their poses and their depth already, as training was given them.
+    Args:
+        graph: graph of the replay.
+        camera: camera of the frames.
+        held_out: returns True for frames excluded from training.
+        follows: a recorded session is replayed, whose frames already carry poses and depth.
     """
     settings = graph.settings
-    # What shows a finished model learns nothing from depth.
+    # A graph that only displays a finished model does not use depth.
     learns = graph.stage == "replay"
     depth = DepthOp(
         graph, name="depth", choice="recorded" if follows else settings.depth, camera=camera, held_out=held_out,
@@ -37,6 +41,6 @@ def replay_analysis(
 
 
 def lacking_depth(settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig) -> str | None:
-    """Return a note for a source whose frames have no depth to learn from; None where they have it."""
+    """Return a note if the source's frames have no usable recorded depth; None otherwise."""
     poses = {"pose"} if settings.poses == "estimated" else set()
     return without_depth(settings.depth, source.fields | poses, config)

@@ -1,4 +1,4 @@
-"""What a run has reached, whichever way it ended."""
+"""Outcome of a run, complete or not."""
 
 from __future__ import annotations
 
@@ -17,53 +17,61 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class RunSettings:
-    """The settings that a report states; all of them together with the source decide what a deterministic run gives."""
+    """Settings stated in the report. With the source they determine the result of a deterministic
+    run.
+    """
 
     device: str
     engine: str
     field: str
-    """The deformation field in use, never `auto`."""
+    """Deformation field in use, never `auto`."""
     renderer: str
     seed: int
     scale: float
     steps_per_frame: int | None
-    """Optimiser steps per frame; None where training is not done frame by frame."""
+    """Optimiser steps per frame; None if training is not done frame by frame."""
     heldout: bool
-    """Whether the protocol's held-out frames were kept from training and are scored apart."""
+    """True if the protocol's held-out frames are excluded from training and scored separately."""
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended, what it wrote, and the parts that its operators contributed (see `operators.outcome`)."""
+    """Ending and outputs of a run, and the parts contributed by its operators (see
+    `operators.outcome`).
+    """
 
     command: str
     settings: RunSettings
     started_at: datetime
     wall_s: float
-    """From the start of the run to the end of its graph; saving and baselines are not in it."""
+    """Duration from the start of the run to the end of its graph, in seconds, without saving and
+    baselines.
+    """
     stop_reason: str
-    """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or what failed."""
+    """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the error
+    message.
+    """
     interrupted: bool
     dropped: int
-    """Messages that edges of the graph dropped."""
+    """Number of messages dropped by the edges of the graph."""
     dropped_by_edge: dict[str, int]
-    """Those edges that dropped any."""
+    """Dropped messages by edge, for edges that dropped any."""
     latency: dict[str, DurationSummary]
-    """Per path of the graph."""
+    """Latency by path through the graph."""
     latency_quantiles_ms: dict[str, list[float]]
     operators: dict[str, DurationSummary]
     parts: Mapping[type, object]
     notes: tuple[str, ...]
     outputs: dict[str, Path]
-    """What was written, by name."""
+    """Paths of written files and folders, by name."""
     peak_memory_bytes: int
 
     def find(self, kind: type[Part]) -> Part | None:
-        """The part of this type; None where no operator contributed one."""
+        """Return the part of this class; None if no operator contributed it."""
         return cast("Part | None", self.parts.get(kind))
 
 
 def peak_memory_bytes() -> int:
-    """Largest resident size of this process so far."""
+    """Return the peak resident memory of this process, in bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

@@ -1,4 +1,4 @@
-"""One run from its start to its outcome, whatever its graph is made of."""
+"""Execution of one run of a graph, from its start to its outcome."""
 
 from __future__ import annotations
 
@@ -21,26 +21,24 @@ PERCENTILES = tuple(k / 100 for k in range(101))
 
 @dataclass(frozen=True)
 class Start:
-    """When a run began: for people, and for measuring."""
+    """Start time of a run, as a date and for measuring durations."""
 
     at: datetime
     s: float
-    """By `perf_counter`."""
+    """Seconds by `perf_counter`."""
 
     @staticmethod
     def now() -> Start:
-        """This moment."""
         return Start(datetime.now(UTC), perf_counter())
 
 
 class Session:
-    """A graph with a source and sinks, run once: `start`, `run`, `end`, `outcome`, or `execute` for all four.
+    """Runs a graph once: `start`, `run`, `end` and `outcome`, or `execute` for all four.
 
-    The graph brings its source, its sinks, its clock (that of its scheduler) and the budget of its training. The session knows none of
-    these: whatever operator, or the graph itself, is a `Contributor` adds its part of the outcome, and `finish` adds what is made after
-    the graph has ended (a saved model, baselines). Replay, offline reconstruction and live are sessions.
-
-    Every part is attempted, whatever fails before it, so that a run that ends early leaves all that it had reached.
+    The graph defines source, sinks, clock and training budget. Every operator, and the graph
+    itself, may contribute to the outcome (`Contributor`). The `finish` steps add results computed
+    after the graph has ended, such as a saved model or baselines. Each step is attempted even if an
+    earlier one failed, so that a run that ends early keeps its results.
     """
 
     def __init__(
@@ -55,20 +53,31 @@ class Session:
         stop_requested: Callable[[], bool] = lambda: False,
         started: Start | None = None,
     ) -> None:
-        """command: what the run is called in reports. finish: called in order by `end`. notes: sentences for the report.
-        started: when work on the run began, if that was before the session's start."""
+        """Set the parameters of the run.
+
+        Args:
+            graph: the graph to run.
+            settings: settings stated in the report.
+            command: name of the run in reports.
+            engine: engine that runs the graph.
+            finish: steps that `end` calls in order.
+            notes: sentences for the report.
+            stop_requested: returns True after a stop request.
+            started: start of the run if work began before the session; None for the call of
+                `start`.
+        """
         self.graph, self.settings, self.command, self.engine = graph, settings, command, engine
         self.finish, self.stop_requested = tuple(finish), stop_requested
         self.notes = list(notes)
         self.reached = OutcomeBuilder()
-        """What is known about the outcome so far."""
+        """Outcome collected so far."""
         self.failure: Exception | None = None
-        """What went wrong first."""
+        """First error of the run; None if there was none."""
         self.wall_s = 0.0
         self.started = started
 
     def execute(self) -> RunOutcome:
-        """All four. Raises RunFailed, with the outcome, when any part failed; the other parts are done first."""
+        """Run all four phases. Raises RunFailed, with the outcome, after all phases if one failed."""
         self.start()
         self.run()
         self.end()
@@ -78,27 +87,31 @@ class Session:
         return outcome
 
     def start(self) -> None:
-        """Begin to measure; the graph will refuse operators whose contributions are in conflict before any of them starts."""
+        """Start the timer and register a check that rejects conflicting contributions before the
+        run.
+        """
         self.started = self.started or Start.now()
         self.graph.checks.append(lambda: self._collect(OutcomeBuilder()))
 
     def run(self) -> None:
-        """Run the graph to its end. An error on purpose is kept in `failure`; a KeyboardInterrupt passes."""
+        """Run the graph to its end. Errors of this program are kept in `failure`; KeyboardInterrupt
+        propagates.
+        """
         assert self.started is not None, "start() comes first"
-        # The caller's random numbers are not ours to move.
+        # Preserve the state of the caller's random generators.
         with seeded(self.settings.seed, self.settings.device):
             self._attempt(lambda: run(self.graph, self.engine))
         self.wall_s = perf_counter() - self.started.s
 
     def end(self) -> None:
-        """Collect what the operators contribute, then do what is left to be done."""
+        """Collect the contributions of the operators, then perform the `finish` steps."""
         for contributor in self._contributors():
             self._attempt(lambda contributor=contributor: contributor.contribute(self.reached))  # type: ignore[misc]
         for step in self.finish:
             self._attempt(lambda step=step: step(self))  # type: ignore[misc]
 
     def outcome(self) -> RunOutcome:
-        """What the run has reached."""
+        """Return the outcome of the run."""
         assert self.started is not None
         graph = self.graph
         tracker = graph.track()
@@ -123,7 +136,7 @@ class Session:
         )
 
     def _ending(self) -> tuple[str, bool]:
-        """Why the run ended, and whether it was interrupted."""
+        """Return the reason for the run's end, and True if it was interrupted."""
         source = self.reached.find(SourceResult)
         at_end = source is not None and source.reached_end
         interrupted = self.stop_requested() and not at_end
@@ -144,7 +157,9 @@ class Session:
             contributor.contribute(outcome)
 
     def _attempt(self, action: Callable[[], object]) -> None:
-        """Do one part of the run; its error is kept for the end, so that the other parts are still done."""
+        """Perform one step of the run. An error is kept in `failure`, so that later steps still
+        run.
+        """
         try:
             action()
         except (CoreError, OperatorsError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Replaying a recorded session as it was: its frames as training was given them, its calls, its settings."""
+"""Faithful replay of a recorded session with its prepared frames, calls and settings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FollowedSession:
-    """A session whose schedule is followed."""
+    """A recorded session whose schedule is replayed."""
 
     reader: SessionReader
     source: SessionSource
@@ -39,7 +39,7 @@ class FollowedSession:
     device: str
 
     def new_reconstructor(self) -> LiveReconstructor:
-        """One as the session had it, warmed up like that one."""
+        """Create a reconstructor with the session's settings, warmed up identically."""
         with seeded(self.made.seed, self.device):
             reconstructor = LiveReconstructor(
                 self.config,
@@ -53,7 +53,7 @@ class FollowedSession:
         return reconstructor
 
     def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:
-        """The operator that trains."""
+        """Create the training operator, which follows the schedule."""
         return ScheduledReconstructOp(
             graph,
             name=name,
@@ -63,14 +63,19 @@ class FollowedSession:
         )
 
     def compare_op(self, graph: Application, name: str) -> CompareShownOp:
-        """The operator that says whether the pictures are the same."""
+        """Create the operator that compares the pictures with the recorded ones."""
         return CompareShownOp(graph, name=name, shown=self.reader.digests)
 
 
 def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSession | None:
-    """The session, where `settings.recording` is one that can be replayed as it was; None: it is a recording like any other.
+    """Return the recorded session if its schedule can be replayed; None for a plain recording.
 
-    Why a session cannot be followed is added to `notes`. Raises InvalidSetting for a schedule with settings that this version does not take.
+    Args:
+        settings: settings of the replay.
+        notes: receives the reason if the schedule of a session is not followed.
+
+    Raises:
+        InvalidSetting: the schedule has settings that this version does not support.
     """
     path = Path(settings.recording)
     if settings.ignore_schedule or not is_session(path):

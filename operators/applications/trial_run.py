@@ -1,4 +1,6 @@
-"""A short run of a live graph on made-up pictures: what takes long the first time in any of its threads has been done before the stream."""
+"""Short run of a live graph on synthetic pictures, so that one-time initialisation precedes the
+stream.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ TRIAL_INTERVAL_S = 0.02
 
 
 class MadeUpTissue(ThreadedSource):
-    """A few pictures of something red and uneven that moves, as large as those of `like`."""
+    """A few moving synthetic tissue pictures, of the size of `like`."""
 
     def __init__(self, like: SourceDescription) -> None:
         super().__init__(ahead=1)
@@ -33,7 +35,7 @@ class MadeUpTissue(ThreadedSource):
         )
 
     def frames(self) -> Iterator[Frame]:
-        """The pictures, at their times."""
+        """Yield the pictures in real time."""
         camera = self.description.camera
         picture = made_up_tissue(camera.height_px, camera.width_px)
         for seq in range(TRIAL_FRAMES):
@@ -49,7 +51,7 @@ class MadeUpTissue(ThreadedSource):
 
 
 def made_up_tissue(height_px: int, width_px: int) -> NDArray[np.uint8]:
-    """RGB uint8 [H, W, 3]: smooth random patches in reds."""
+    """Return a synthetic tissue picture of smooth red patches, uint8 RGB [H, W, 3]."""
     random = np.random.default_rng(0)
     patches = random.uniform(0.4, 1.0, (24, 30)).astype(np.float32)
     light = cv2.resize(patches, (width_px, height_px), interpolation=cv2.INTER_CUBIC)
@@ -59,15 +61,15 @@ def made_up_tissue(height_px: int, width_px: int) -> NDArray[np.uint8]:
 def trial_run(
     settings: LiveSettings, source: FrameSource, new_graph: Callable[[FrameSource, LiveSettings], Application]
 ) -> None:
-    """Run the graph that `new_graph` makes on made-up pictures.
+    """Run the graph made by `new_graph` on synthetic pictures.
 
-    Raises as a run does, OperatorFailed for instance: what fails here would fail on the stream.
+    Raises the errors of a run, such as OperatorFailed, before the stream is touched.
     """
     run_on_trial(settings, lambda inside: new_graph(MadeUpTissue(source.description), inside))
 
 
 def run_on_trial(settings: LiveSettings, new_graph: Callable[[LiveSettings], Application]) -> None:
-    """Run a live graph without recording, and keep no file of it. Raises the errors of a run."""
+    """Run a live graph without recording, in a temporary folder. Raises the errors of a run."""
     with TemporaryDirectory(prefix="intrasplat-trial-") as folder:
         inside = replace(settings, out=Path(folder), record=None, out_of_body="off", seconds=None, max_frames=None)
         with seeded(settings.seed, settings.device):

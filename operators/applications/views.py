@@ -1,4 +1,6 @@
-"""From where a model is shown: its own camera, one that goes round it, two eyes, or a path from a file."""
+"""Camera paths for rendering a model: its own camera, an orbit, a stereo pair, or a path from a
+file.
+"""
 
 from __future__ import annotations
 
@@ -18,23 +20,25 @@ from gsplat_core.transfers import HostCopy
 
 VIEWS = ("recorded", "orbit", "stereo")
 ROUND_S = 4.0
-"""How long an orbit takes to come round."""
+"""Duration of one orbit, in seconds."""
 AZIMUTH_DEG, ELEVATION_DEG = 25.0, 15.0
-"""How far an orbit leads aside; a scope has seen tissue from one side, and behind it nothing."""
+"""Largest angles of an orbit. They are small because a scope observes tissue from one side only."""
 EYES_APART = 0.06
-"""Distance between two eyes over the distance of what they look at, unless it is given; that of a 4.4 mm scope 74 mm before the tissue."""
+"""Default stereo baseline divided by the scene's distance: 4.4 mm at 74 mm."""
 COVERED = 0.5
-"""Opacity from which on a depth is one of the scene's."""
+"""Minimum opacity of a pixel whose depth is used."""
 
 
 @dataclass(frozen=True)
 class ViewWish:
-    """From where a model is to be shown. Raises InvalidSetting."""
+    """Requested view. Raises InvalidSetting for an invalid baseline."""
 
     name: str = "recorded"
-    """`recorded` (the model's own camera), `orbit`, `stereo` (two eyes side by side), or the file of a camera path (`gsplat_core.io.camera_path`)."""
+    """`recorded` (the model's own camera), `orbit`, `stereo` (side by side), or a camera path file
+    (`gsplat_core.io.camera_path`).
+    """
     baseline: float | None = None
-    """Distance between the eyes of `stereo`, in the model's unit; None: a share of the scene's distance."""
+    """Baseline of `stereo` in the model's unit; None: a share of the scene's distance."""
 
     def __post_init__(self) -> None:
         if self.baseline is not None and (self.name != "stereo" or not 0 < self.baseline < math.inf):
@@ -53,20 +57,31 @@ RECORDED = ViewWish()
 
 @dataclass(frozen=True)
 class View:
-    """Cameras of a video. `cameras(time_s)` are those whose pictures stand side by side at a time, of one size."""
+    """Cameras of a video. `cameras(time_s)` returns the cameras of the pictures side by side, all
+    of one size.
+    """
 
     name: str
     window_s: tuple[float, float]
-    """The model's times that are shown."""
+    """Displayed part of the model's time, in seconds."""
     cameras: Callable[[float], tuple[Camera, ...]]
     is_virtual: bool
-    """No camera was there: what was never seen is marked."""
+    """True if no camera recorded this view, so that unobserved areas are marked."""
     across: int = 1
-    """Pictures side by side."""
+    """Number of pictures side by side."""
 
 
 def view_of(model: Model, camera: Camera, wish: ViewWish) -> View:
-    """The cameras that are wished for. `camera` is the model's own, of the pictures' size. Raises InvalidSetting."""
+    """Return the cameras of a requested view.
+
+    Args:
+        model: the model.
+        camera: the model's own camera at the size of the pictures.
+        wish: the requested view.
+
+    Raises:
+        InvalidSetting: unknown view, unreadable path, or a path outside of the model's time window.
+    """
     name, baseline = wish.name, wish.baseline
     if name == "recorded":
         return View(name, model.time_window_s, lambda time_s: (camera,), is_virtual=False)
@@ -83,13 +98,18 @@ def view_of(model: Model, camera: Camera, wish: ViewWish) -> View:
 
 
 def on_orbit(camera: Camera, distance: float, turns: float) -> Camera:
-    """The camera after so many turns on a closed curve round what lies `distance` in front of `camera`, which it starts from."""
+    """Return the camera after `turns` orbits around the point at `distance` in front of `camera`.
+
+    The orbit is a closed curve that begins at `camera`.
+    """
     phase = 2 * math.pi * turns
     return Orbit(AZIMUTH_DEG * math.sin(phase), ELEVATION_DEG * math.sin(2 * phase)).camera(camera, distance)
 
 
 def typical_depth(model: Model, camera: Camera) -> float:
-    """Median depth of the scene at the model's start. Raises InvalidSetting where `camera` sees nothing of it."""
+    """Return the median depth at the model's start. Raises InvalidSetting if `camera` sees no part
+    of the scene.
+    """
     output = model.render(model.time_window_s[0], camera)
     depth, alpha = HostCopy(output.depth).numpy(), HostCopy(output.alpha).numpy()
     known = depth[(alpha >= COVERED) & (depth > 0)]

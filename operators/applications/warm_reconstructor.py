@@ -1,4 +1,4 @@
-"""A reconstructor that has done everything once before its first frame."""
+"""Warm-up of a reconstructor before its first frame."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from gsplat_core.training.live import LiveReconstructor
 
 WARM_FRAMES = 4
 WARM_STEPS = {"cpu": 3, "cuda": 40}
-"""Optimiser steps on each picture before the first frame."""
+"""Optimiser steps on each warm-up picture."""
 EYES_APART = 0.07
-"""Of the scene's distance, where nothing is known of the stream's eyes yet."""
+"""Stereo baseline of the warm-up as a share of the scene's distance."""
 
 
 def warm_reconstructor(
@@ -27,28 +27,35 @@ def warm_reconstructor(
     *,
     stereo: bool = False,
 ) -> None:
-    """Train on noise and forget it; `draw` is given each picture and its model. stereo: as in a stream that has pictures of a right eye.
+    """Train on noise and reset the model, so that all one-time initialisation is done.
 
-    Replay of a recorded session does the same: a GPU's tile lists, which noise has made longer, decide which steps are taken again.
+    A replay of a recorded session performs the same warm-up. On a GPU, noise enlarges the tile
+    lists, whose capacity determines which steps are repeated.
+
+    Args:
+        reconstructor: the new reconstructor.
+        draw: called with each warm-up frame and its model.
+        stereo: include pictures of a right eye.
     """
     image = noise(reconstructor.camera)
     height, width = image.shape[:2]
     tissue = np.ones((height, width), np.uint8)
-    tissue[height // 2 :, : width // 2] = 0  # a scene starts in another way where tools hide some of it
+    tissue[height // 2 :, : width // 2] = 0  # initialisation differs if tools hide part of the scene
     depth = np.full((height, width), reconstructor.config.default_depth_mm, np.float32)
     drawn: list[object] = []
-    for frames in (WARM_FRAMES, 1):  # the second scene takes over the memory of the first one, as the stream's does
+    for frames in (WARM_FRAMES, 1):  # the second scene reuses the memory of the first, as in the stream
         for seq in range(frames):
             frame = Frame(seq, seq * 33_000_000, image, mask=tissue)
             if stereo:
                 right = reconstructor.camera.right_eye(EYES_APART * reconstructor.config.default_depth_mm)
                 frame = frame.with_fields(right_image=image, right_camera=right)
-            # Budgets in time, so that the length of a step is known.
+            # A time budget makes the reconstructor measure the duration of a step.
             reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[reconstructor.device.type]))
-            # All of them are held: every snapshot and piece of page-locked memory that a run needs is made.
+            # All models are held, so that every snapshot slot and pinned buffer of a run is
+            # allocated.
             model = reconstructor.publish()
             drawn.append((model, draw(frame, model)))
-            # Steps that look at depth are captured by themselves.
+            # Steps with depth are captured as a separate graph.
             reconstructor.take_depth(frame.with_fields(depth=depth, depth_origin=DepthOrigin.STEREO))
             reconstructor.rehearse(2)
             reconstructor.grow(frame)
@@ -57,5 +64,5 @@ def warm_reconstructor(
 
 
 def noise(camera: Camera) -> NDArray[np.uint8]:
-    """A picture of the camera's size that is like no other."""
+    """Return a picture of uniform noise of the camera's size, uint8 RGB [H, W, 3]."""
     return np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)

@@ -1,7 +1,9 @@
-"""Working size of a live run on a CPU: the largest at which this machine shows each frame before the next one comes.
+"""Measured working size of a live run on a CPU: the largest at which each frame is displayed before
+the next.
 
-Nothing about the machine is assumed. The live graph is run on made-up pictures, one at a time, with the fewest steps that a frame gets, and the
-time from a frame's arrival to its picture is measured. That run is also the trial run (`trial_run`) of the size that is chosen.
+The live graph runs on synthetic pictures, one at a time, with the minimum number of steps per
+frame. The latency from a frame's arrival to its picture is measured. The measurement doubles as the
+trial run (`trial_run`).
 """
 
 from __future__ import annotations
@@ -25,37 +27,39 @@ from operators.sources.source import SourceDescription
 from operators.sources.threaded import ThreadedSource
 
 SCALE_STEPS = 16
-"""Sizes are multiples of this fraction of the stream's width and height."""
+"""Number of size steps: scales are multiples of its reciprocal."""
 MIN_SIDE_PX = 64
-"""No smaller size is chosen."""
+"""Minimum side of a working size, in pixels."""
 FIRST_PIXELS = 320 * 256
-"""Size that is measured first, where the pictures are larger."""
+"""Number of pixels of the first measurement, for larger streams."""
 SHARE_OF_INTERVAL = 0.9
-"""Largest share of the time between two frames that a frame may take."""
+"""Largest share of the frame interval that a frame may take."""
 MOST_MEASUREMENTS = 4
 STARTING_FRAMES, TIMED_FRAMES = 3, 9
-"""Frames of one measurement: those that start the model, which are not counted, and those that are."""
+"""Frames per measurement: first those that initialise the model, which are not counted, then those
+timed.
+"""
 GIVEN_UP_S = 2.0
-"""A frame that takes longer than this ends the measurement; it counts as this long."""
+"""Timeout of a frame in seconds. It ends the measurement and counts as the frame's latency."""
 
 
 @dataclass(frozen=True)
 class WorkingSize:
-    """A size that was chosen, and what it was chosen by."""
+    """Chosen working size and its measurement."""
 
     scale: float
     width_px: int
     height_px: int
     frame_s: float
-    """Measured time from a frame's arrival to its picture, at this size."""
+    """Latency from a frame's arrival to its picture at this size, in seconds."""
     interval_s: float
-    """Time between two frames of the stream."""
+    """Frame interval of the stream, in seconds."""
     full_size: tuple[int, int]
-    """Width and height of the stream's pictures."""
+    """Width and height of the stream's pictures, in pixels."""
 
     @property
     def sentence(self) -> str:
-        """The choice and its reason, for the report."""
+        """Choice and reason as a sentence for the report."""
         size, full = f"{self.width_px}x{self.height_px}", "{}x{}".format(*self.full_size)
         of = f"all {size} pixels" if self.scale == 1 else f"{size} of {full} pixels"
         took, between = f"{1e3 * self.frame_s:.0f} ms", f"{1e3 * self.interval_s:.0f} ms"
@@ -69,12 +73,13 @@ class WorkingSize:
 def choose_working_size(
     about: SourceDescription, measure: Callable[[float], float], share: float = SHARE_OF_INTERVAL
 ) -> WorkingSize:
-    """Choose the largest size whose frames take at most `share` of the time between two frames.
+    """Choose the largest size whose frames take at most `share` of the frame interval.
 
     Args:
-        about: the stream at its full size.
-        measure: returns the seconds that a frame takes at a scale; called for at most `MOST_MEASUREMENTS` of them.
-        share: of the time between two frames.
+        about: description of the stream at full size.
+        measure: returns the latency of a frame in seconds at a scale; called at most
+            `MOST_MEASUREMENTS` times.
+        share: share of the frame interval that a frame may take.
     """
     interval_s = 1 / about.fps
     smallest = min(SCALE_STEPS, math.ceil(SCALE_STEPS * MIN_SIDE_PX / min(about.width_px, about.height_px)))
@@ -98,36 +103,41 @@ def choose_working_size(
 
 
 def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
-    """Estimate the largest step whose frames take `allowed_s`: a frame takes a fixed time and a time for each of its pixels."""
+    """Estimate the largest size step whose frames take `allowed_s`, from a fixed cost and a cost
+    per pixel.
+    """
     near = sorted(measured, key=lambda step: abs(measured[step] - allowed_s))[:2]
     if len(near) == 1:
         (only,) = near
         squared = only**2 * allowed_s / measured[only]
         if measured[only] <= allowed_s:
-            # Where most of the time is fixed, this is far too small; a second size a quarter larger shows what a pixel costs.
+            # With mostly fixed cost this underestimates. Measuring a size a quarter larger gives
+            # the cost per pixel.
             squared = max(squared, (only + max(1, only // 4)) ** 2)
     else:
         (a, b), (s, t) = near, (measured[near[0]], measured[near[1]])
         per_pixel = (t - s) / (b**2 - a**2)
-        # Without a slope, as beside other load, the time is taken to be proportional.
+        # Without a positive slope, for example under other load, assume proportional cost.
         squared = a**2 + (allowed_s - s) / per_pixel if per_pixel > 0 else a**2 * allowed_s / s
     return math.floor(math.sqrt(max(0.0, squared)))
 
 
 class PacedTissue(ThreadedSource):
-    """Made-up pictures, each given when the one before it has been shown; measures how long that took."""
+    """Source of synthetic pictures, each emitted after the display of the previous one. Measures
+    their latency.
+    """
 
     def __init__(self, like: SourceDescription) -> None:
         super().__init__(ahead=1)
         self.description = replace(like, name="trial run", frame_count=None, digest=None, notes=())
         self.took_s: dict[int, float] = {}
-        """Seconds from each frame's arrival to its picture, by the frame's number."""
+        """Latency of each frame in seconds, by sequence number."""
         self._shown = threading.Event()
         self._given: tuple[int, int] | None = None
-        """Number and time of arrival of the newest frame."""
+        """Sequence number and arrival time in nanoseconds of the newest frame."""
 
     def frames(self) -> Iterator[Frame]:
-        """The pictures, at the stream's times."""
+        """Yield the pictures with the stream's timestamps, waiting for the display of each."""
         camera, fps = self.description.camera, self.description.fps
         picture = made_up_tissue(camera.height_px, camera.width_px)
         for seq in range(STARTING_FRAMES + TIMED_FRAMES):
@@ -141,14 +151,14 @@ class PacedTissue(ThreadedSource):
                     return
 
     def shown(self, picture: ShownPicture) -> None:
-        """Take a picture that is on the screen."""
+        """Record the display of a picture."""
         if picture.new and self._given is not None and picture.rendered.frame.seq == self._given[0]:
             self.took_s[self._given[0]] = (picture.shown_ns - self._given[1]) * 1e-9
             self._shown.set()
 
     @property
     def frame_s(self) -> float:
-        """Median time of a frame, without those that start the model; `GIVEN_UP_S` where none was shown."""
+        """Median latency of a timed frame in seconds; `GIVEN_UP_S` if no frame was displayed."""
         timed = [took_s for seq, took_s in self.took_s.items() if seq >= STARTING_FRAMES]
         return statistics.median(timed or [GIVEN_UP_S])
 
@@ -156,9 +166,16 @@ class PacedTissue(ThreadedSource):
 def measured_frame_s(
     settings: LiveSettings, about: SourceDescription, new_graph: Callable[[PacedTissue, LiveSettings], Application]
 ) -> float:
-    """Run the graph that `new_graph` makes on paced pictures of the size of `about`; returns the median time of a frame in seconds.
+    """Run the graph made by `new_graph` on paced pictures and return the median latency of a frame
+    in seconds.
 
-    Raises as a run does.
+    Args:
+        settings: settings of the live run; the number of steps is set to the minimum.
+        about: description of the stream at the size to be measured.
+        new_graph: creates the graph for the pictures and settings.
+
+    Raises:
+        RunFailed: as for a run.
     """
     clock = settings.chosen_clock
     fewest = clock.at_least_steps or 1

@@ -1,1 +1,3 @@
-"""Streaming operators for what the video of a real endoscope does: one stage for each fault, one operator that runs any of them in order."""
+"""Streaming operators that handle faults of real endoscopic video: one stage per fault, run in
+sequence.
+"""

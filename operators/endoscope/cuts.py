@@ -1,4 +1,4 @@
-"""Stage: where another scene begins."""
+"""Stages that detect cuts and number the scenes."""
 
 from __future__ import annotations
 
@@ -13,16 +13,21 @@ IN_DOUBT = "cut in doubt"
 
 @dataclass(frozen=True)
 class CutCounts(StageCounts):
-    """New scenes by reason (cut, returned, resized, frame rate), and frames that were withheld until the next one told."""
+    """New scenes by reason (cut, returned, resized, frame rate), and frames withheld as possible
+    cuts.
+    """
 
 
 @dataclass(frozen=True)
 class SceneCounts(StageCounts):
-    """Frames whose scene was counted; `CutCounts` has why scenes began."""
+    """Number of frames that were given a scene number; `CutCounts` has the reasons for new scenes."""
 
 
 class SceneNumberStage(Stage):
-    """Sets `Frame.scene`: how many scenes have begun before. It comes after everything that sets `Frame.new_scene`, and sees every frame."""
+    """Sets `Frame.scene`, the number of scenes before the current one.
+
+    It must run on every frame, after all stages that set `Frame.new_scene`.
+    """
 
     counts_type = SceneCounts
 
@@ -36,9 +41,10 @@ class SceneNumberStage(Stage):
 
 
 class CutStage(Stage):
-    """Sets `Frame.new_scene`, which a withheld or damaged frame never has; they say nothing about the scene.
+    """Sets `Frame.new_scene` at cuts, never on a withheld or damaged frame.
 
-    It comes after everything that withholds pictures. A frame that may be a cut is withheld; the one after it tells.
+    It must run after all stages that withhold pictures. A frame that may be a cut is withheld until
+    the next frame decides.
     """
 
     counts_type = CutCounts

@@ -1,4 +1,4 @@
-"""Stage: exposure and white balance."""
+"""Stage that estimates exposure and white balance."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from operators.endoscope.stage import Stage, StageCounts, tissue_of
 
 @dataclass(frozen=True)
 class ExposureCounts(StageCounts):
-    """Frames whose exposure differs from the scene's own, and those in which it was changing."""
+    """Frames whose exposure differs from that of their scene, and frames in which it was changing."""
 
 
 class ExposureStage(Stage):
-    """Sets `Frame.exposure`. A new scene has its own colours; withheld and damaged frames keep the exposure of the one before.
+    """Sets `Frame.exposure` relative to the start of the scene.
 
-    It comes after the tool mask, the masks of the loss and the cuts.
+    Withheld and damaged frames keep the previous exposure. The stage must run after the tool mask,
+    the loss masks and the cuts.
     """
 
     counts_type = ExposureCounts

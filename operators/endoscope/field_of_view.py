@@ -1,4 +1,4 @@
-"""Stage: the field of view."""
+"""Stage that detects the circular field of view."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ class FieldOfViewCounts(StageCounts):
 
 
 class FieldOfViewStage(Stage):
-    """Leaves out of the loss what lies outside of the field of view. Withheld and damaged frames have the field of the one before."""
+    """Excludes pixels outside of the field of view from the loss. Withheld and damaged frames keep
+    the previous field.
+    """
 
     counts_type = FieldOfViewCounts
 

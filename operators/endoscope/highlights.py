@@ -1,4 +1,4 @@
-"""Stage: specular highlights."""
+"""Stage that detects specular highlights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ class HighlightCounts(StageCounts):
 
 
 class HighlightStage(Stage):
-    """Leaves specular highlights out of what lasts: they are fitted where they are shown, and not rehearsed."""
+    """Excludes specular highlights from rehearsal: a frame's own training fits them, later
+    rehearsal does not.
+    """
 
     counts_type = HighlightCounts
 

@@ -1,4 +1,4 @@
-"""Stage: interlaced video."""
+"""Stage that de-interlaces video."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ class InterlacingCounts(StageCounts):
 
 
 class InterlacingStage(Stage):
-    """Takes the combs out of interlaced video, of both eyes, which changes `Frame.image`. Progressive video is passed on as it is.
+    """Removes combing artefacts from interlaced video of both eyes, which changes `Frame.image`.
 
-    It comes before everything that looks at sharpness or is trained on.
+    Progressive video is passed unchanged. The stage must run before stages that measure sharpness
+    and before training.
     """
 
     counts_type = InterlacingCounts

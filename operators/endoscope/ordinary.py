@@ -1,4 +1,4 @@
-"""Stages that all look at frames that are not ordinary, and take turns with the others."""
+"""Stages that examine every unusual frame, but only take turns on ordinary frames to save time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class OrdinaryFrames:
-    """How many frames all stages looked at, and how many were ordinary."""
+    """Numbers of frames examined by all stages, and of ordinary frames."""
 
     looked: int
     ordinary: int
 
 
 class OrdinaryStream:
-    """What two operators know about the frame that they see one after the other: whether it is ordinary, and whose turn it is then."""
+    """State shared by two operators in sequence: the current frame's class and the stages due on
+    it.
+    """
 
     def __init__(self) -> None:
         self.pictures = OrdinaryPictures()
@@ -31,19 +33,19 @@ class OrdinaryStream:
         self.reset()
 
     def join(self, stages: int) -> range:
-        """The numbers under which so many stages take turns with the others."""
+        """Register `stages` further stages. Return their member numbers for `looks`."""
         first, self._members = self._members, self._members + stages
         return range(first, self._members)
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Clear the state, at the start of a stream."""
         self.pictures.reset()
         self.frame_is_ordinary = False
         self._turns = Turns(self._members, self.pictures.settings.look_every_s)
         self._due: frozenset[int] = frozenset()
 
     def begin(self, ordinary: bool, pts_ns: int) -> None:
-        """The next frame: where it is not ordinary all stages look at it."""
+        """Start the next frame. On an ordinary frame only the due stages run, otherwise all."""
         self.frame_is_ordinary = ordinary
         if ordinary:
             self._due = self._turns.due(pts_ns)
@@ -51,13 +53,15 @@ class OrdinaryStream:
             self._turns.all_looked(pts_ns)
 
     def looks(self, member: int) -> bool:
-        """Whether the stage of that number looks at the frame."""
+        """Return True if the stage with this member number runs on the current frame."""
         return not self.frame_is_ordinary or member in self._due
 
 
 class PictureStagesOp(StageOp):
-    """Runs its first stage on each frame, the others on those that are not ordinary. At an ordinary one they look in turn, and what they found before
-    holds on. Once one of them has found something that ends that, all that come after look as well, and at the next frame every one.
+    """Runs its first stage on each frame, and the other stages on unusual frames or in turn.
+
+    On an ordinary frame a skipped stage carries its previous result over. When a stage finds
+    something unusual, all later stages run on the frame, and all stages run on the next one.
 
     Inputs:
         frame: `Frame`.
@@ -66,8 +70,9 @@ class PictureStagesOp(StageOp):
         frame: `Frame` with more fields.
 
     Params:
-        stages: those that need the picture alone; the first compares each picture with the one before.
-        stream: shared with the `TissueStagesOp` that comes after.
+        stages: stages that need the picture alone; the first compares each picture with the
+            previous one.
+        stream: state shared with the following `TissueStagesOp`.
     """
 
     def __init__(
@@ -76,7 +81,9 @@ class PictureStagesOp(StageOp):
         self.stream = stream
         self._members = stream.join(len(stages) - 1)
         self._settled = False
-        """Whether the frame before leaves the next one the choice to be ordinary: used as it came, in a scene that had begun before."""
+        """True if the previous frame allows the next to be ordinary: it was unchanged and did not
+        begin a scene.
+        """
         self._counts = [0, 0]
         super().__init__(fragment, *args, stages=stages, **kwargs)
 
@@ -105,13 +112,15 @@ class PictureStagesOp(StageOp):
 
 
 def _settled(frame: Frame, came: Frame) -> bool:
-    """Whether the stages have left the frame as it came, but for pixels that are left out."""
+    """Return True if the stages changed nothing but the masks, and did not withhold the frame or
+    begin a scene.
+    """
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
     return unchanged and frame.withheld is None and frame.new_scene is None and frame.status is not FrameStatus.DAMAGED
 
 
 class TissueStagesOp(StageOp):
-    """Runs `always` on each frame, and `stages` on those that are not ordinary; at an ordinary one they look in turn.
+    """Runs some stages on each frame, and others on unusual frames or in turn.
 
     Inputs:
         frame: `Frame`.
@@ -120,9 +129,9 @@ class TissueStagesOp(StageOp):
         frame: `Frame` with more fields.
 
     Params:
-        always: stages for every frame.
-        stages: stages for frames that are not ordinary.
-        stream: of the `PictureStagesOp` that comes before.
+        always: stages that run on every frame.
+        stages: stages that run on unusual or withheld frames, and in turn on ordinary ones.
+        stream: state shared with the preceding `PictureStagesOp`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Stage: pictures that are none or not new, times that are none, masks and depth that cannot be."""
+"""Stages that reject invalid or repeated pictures, timestamps, masks and depth maps."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from operators.endoscope.stage import Stage, StageCounts
 
 @dataclass(frozen=True)
 class SequenceCounts(StageCounts):
-    """Frames that were withheld (black, one colour, noise, duplicate, frozen, torn, out of order), and clock jumps and gaps."""
+    """Withheld frames by reason (black, one colour, noise, duplicate, frozen, torn, out of order),
+    and clock jumps and gaps.
+    """
 
 
 class SequenceStage(Stage):
-    """Withholds pictures that are black, of one colour, noise, the same again, torn or late, and takes jumps out of the clock.
+    """Withholds pictures that are black, uniform, noise, repeated, torn or late, and removes clock
+    jumps.
 
-    It comes first. `Frame.pts_ns` is changed from the first jump of the clock on; a late frame gets the time of the newest one.
+    It must run first. After a clock jump `Frame.pts_ns` is shifted. A late frame gets the newest
+    timestamp.
     """
 
     counts_type = SequenceCounts
@@ -37,7 +41,7 @@ class SequenceStage(Stage):
         if timing.pts_ns != frame.pts_ns:
             frame = frame.with_fields(pts_ns=timing.pts_ns)
         if timing.finding == OUT_OF_ORDER:
-            # It is not looked at: the next frame follows the one before it.
+            # A late picture is not compared with its neighbours, which are consecutive.
             return self.withhold(frame, OUT_OF_ORDER)
         if timing.finding is not None:
             self.found[timing.finding] += 1
@@ -49,13 +53,14 @@ class SequenceStage(Stage):
 
 @dataclass(frozen=True)
 class MaskAndDepthCounts(StageCounts):
-    """Frames that were withheld for their mask, and those whose depth was repaired or left out."""
+    """Frames withheld for their mask, and frames whose depth was repaired or removed."""
 
 
 class MaskAndDepthStage(Stage):
-    """Withholds frames whose tool mask leaves no tissue or was lost, and takes out depth that is none.
+    """Withholds frames whose tool mask shows no tissue or was lost, and removes invalid depth.
 
-    It comes after what sets `Frame.mask`. A frame without depth that can be used is trained on without it.
+    It must run after the stage that sets `Frame.mask`. A frame without valid depth is trained on
+    without it.
     """
 
     counts_type = MaskAndDepthCounts

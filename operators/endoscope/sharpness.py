@@ -1,4 +1,4 @@
-"""Stage: blur and smoke."""
+"""Stage that detects blur and smoke."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from operators.endoscope.stage import Stage, StageCounts, tissue_of
 
 @dataclass(frozen=True)
 class SharpnessCounts(StageCounts):
-    """Count of the frames withheld for blur and for smoke."""
+    """Frames withheld for blur and for smoke."""
 
 
 class SharpnessStage(Stage):
-    """Withholds frames that are blurred or full of smoke. Each scene has its own usual; withheld and damaged frames are not looked at.
+    """Withholds frames with blur or smoke, relative to the usual sharpness of the scene.
 
-    It comes after `CutStage`: blur and smoke are compared with the scene's own usual.
+    Withheld and damaged frames are skipped. The stage must run after `CutStage`.
     """
 
     counts_type = SharpnessCounts

@@ -1,4 +1,4 @@
-"""Stages that look at a frame and add what they found, and the operator that runs some of them one after another."""
+"""Stages that annotate frames, and the operator that runs them in sequence."""
 
 from __future__ import annotations
 
@@ -18,24 +18,27 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class StageCounts:
-    """What a stage did in a run. Each stage has a class of its own, so that an outcome can have all of them."""
+    """Statistics of a stage in one run. Each stage has its own class, so that an outcome holds all
+    of them.
+    """
 
     frames: int
-    """How many frames it saw."""
+    """Number of frames the stage ran on."""
     found: Mapping[str, int] = field(default_factory=dict)
-    """How many frames had what, by reason."""
+    """Number of frames with a finding, by reason."""
 
     @property
     def name(self) -> str:
-        """The stage's name in reports: that of the class without its ending."""
+        """Name of the stage in reports: the class name without `Counts`, in lower case."""
         return type(self).__name__.removesuffix("Counts").lower()
 
 
 class Stage(ABC):
-    """Adds fields to one frame after another; keeps no more state than it needs for that.
+    """Annotates the frames of one stream in order.
 
-    A subclass sets `counts_type`, makes its state in `reset` and works in `annotate`. It never raises for what a picture shows. What it adds to every
-    frame it adds in `carried`, too, where it is among those that look at some of the frames only.
+    A subclass sets `counts_type`, creates its state in `reset` and implements `annotate`, which
+    must not raise for any picture content. A stage that does not run on every frame must add its
+    lasting results to the skipped frames in `carried`.
     """
 
     counts_type: ClassVar[type[StageCounts]] = StageCounts
@@ -46,39 +49,41 @@ class Stage(ABC):
         self.reset()
 
     def reset(self) -> None:  # noqa: B027 - not every stage keeps something
-        """Forget the stream."""
+        """Clear the state, at the start of a stream."""
 
     @abstractmethod
     def annotate(self, frame: Frame) -> Frame:
-        """The frame with what was found on it."""
+        """Return the frame with the findings added."""
 
     def carried(self, frame: Frame) -> Frame:
-        """The frame with what holds on from the last one that was looked at, without a look at this one."""
+        """Return a skipped frame with the lasting results of the last annotated frame."""
         return frame
 
     def apply(self, frame: Frame) -> Frame:
-        """`annotate`, counted."""
+        """Annotate and count the frame."""
         self.frames += 1
         return self.annotate(frame)
 
     def withhold(self, frame: Frame, reason: str) -> Frame:
-        """The frame kept from training for this reason, which is counted; a reason that it has already stays."""
+        """Return the frame marked as excluded from training, and count the reason. An earlier
+        reason is kept.
+        """
         self.found[reason] += 1
         return frame if frame.withheld is not None else frame.with_fields(withheld=reason)
 
     def counts(self) -> StageCounts:
-        """What was done since the start."""
+        """Return the statistics since the start of the run."""
         return self.counts_type(self.frames, {what: count for what, count in sorted(self.found.items()) if count})
 
     def start(self) -> None:
-        """Begin a run."""
+        """Reset the statistics and the state, at the start of a run."""
         self.frames = 0
         self.found.clear()
         self.reset()
 
 
 class StageOp(Operator):
-    """Runs stages one after another on each frame; withheld frames go through as well.
+    """Runs stages in sequence on each frame, including withheld ones.
 
     Inputs:
         frame: `Frame`.
@@ -87,7 +92,8 @@ class StageOp(Operator):
         frame: `Frame` with more fields.
 
     Params:
-        stages: in the order in which they see a frame. The operator owns them: give every operator stages of its own.
+        stages: stages in order of execution. They have state and must not be shared between
+            operators.
     """
 
     def __init__(self, fragment: Any, *args: Any, stages: Sequence[Stage], **kwargs: Any) -> None:
@@ -115,13 +121,15 @@ class StageOp(Operator):
 
 
 def tissue_of(frame: Frame) -> NDArray[np.uint8] | None:
-    """[H, W], 0 where the frame shows no tissue or its pixels do not count; None where all do."""
+    """Return the mask of tissue whose pixels count, uint8 [H, W], 0 = excluded; None if all pixels
+    do.
+    """
     if frame.mask is None or frame.loss_mask is None:
         return frame.mask if frame.loss_mask is None else frame.loss_mask
     return np.minimum(frame.mask, frame.loss_mask)
 
 
 def left_out(frame: Frame, kept: NDArray[np.uint8]) -> Frame:
-    """The frame with those pixels left out of the loss, too, where `kept` [H, W] is 0."""
+    """Return the frame with the pixels excluded from the loss at which `kept` [H, W] is 0."""
     together = kept if frame.loss_mask is None else np.minimum(frame.loss_mask, kept)
     return frame.with_fields(loss_mask=together)

@@ -1,4 +1,4 @@
-"""The stages by name, and the order in which a live stream runs them."""
+"""Registry of the stages, in the order in which a live stream runs them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PICTURE_STAGES: dict[str, Callable[[], Stage]] = {
     "highlights": HighlightStage,
     "sharpness": SharpnessStage,
 }
-"""What needs the picture alone; before the tool mask."""
+"""Stages that need only the picture and run before the tool mask."""
 TISSUE_STAGES: dict[str, Callable[[], Stage]] = {
     "mask and depth": MaskAndDepthStage,
     "exposure": ExposureStage,
 }
-"""What needs to know where tissue is; after the tool mask."""
+"""Stages that need the tool mask."""
 
 
 def new_stages(stages: dict[str, Callable[[], Stage]], without: Sequence[str] = ()) -> list[Stage]:
-    """New stages in their order, less those named in `without`."""
+    """Create the stages in order, except those named in `without`."""
     return [make() for name, make in stages.items() if name not in without]

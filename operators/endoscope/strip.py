@@ -1,4 +1,4 @@
-"""Stage: a recorder's strips and burnt-in text."""
+"""Stage that detects a recorder's status bars and burnt-in text."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from operators.endoscope.stage import Stage, StageCounts, left_out
 
 @dataclass(frozen=True)
 class StripCounts(StageCounts):
-    """Frames with a strip or text."""
+    """Frames with a status bar or text."""
 
 
 class StripStage(Stage):
-    """Leaves strips and text at the borders out of the loss. Withheld and damaged frames have those of the one before."""
+    """Excludes status bars and text at the borders from the loss. Withheld and damaged frames keep
+    the previous mask.
+    """
 
     counts_type = StripCounts
 

@@ -1,7 +1,7 @@
-"""The operator graph, with the Python surface of NVIDIA's Holoscan SDK.
+"""Operator graph with the Python interface of NVIDIA's Holoscan SDK.
 
-Operators written for it run on our own schedulers and on the Holoscan SDK. Nothing here imports the SDK until
-`run(app, engine="holoscan")`.
+Operators written for the SDK run on the schedulers of this package and on the SDK. The SDK is
+imported only by `run(app, engine="holoscan")`.
 """
 
 from operators.graph.application import Application, Fragment

@@ -1,4 +1,4 @@
-"""Fragments and applications: composing operators and running them."""
+"""Fragments and applications, which compose operators and run them."""
 
 from __future__ import annotations
 
@@ -20,17 +20,22 @@ if TYPE_CHECKING:
 
 
 class Fragment:
-    """A graph of operators. Derive from Application, add operators and flows in `compose`, then `run`.
+    """A graph of operators. Derive from Application, add operators and flows in `compose`, then
+    call `run`.
 
-    `name` is for logs; `track` enables flow tracking from the start.
+    Args:
+        name: name for logs.
+        track: enable flow tracking from the start.
     """
 
     def __init__(self, *, name: str = "", track: bool = False) -> None:
         self.name = name or type(self).__name__
         self.result: RunResult | None = None
-        """How the last run ended; None before and while running."""
+        """Result of the last run; None before the first run and during a run."""
         self.checks: list[Callable[[], None]] = []
-        """Called by every run once it is composed, before any operator starts; what they raise refuses the run."""
+        """Functions called after composition and before any operator starts. An exception cancels
+        the run.
+        """
         self._tracker = FlowTracker() if track else None
         self._scheduler: Scheduler = GreedyScheduler(self)
         self._operators: dict[str, Operator] = {}
@@ -41,11 +46,13 @@ class Fragment:
         self._stop_asked = False
 
     def compose(self) -> None:
-        """Add operators and flows; called by every run, so each run has fresh operators."""
+        """Add operators and flows. Called by every run, so that each run has new operators."""
         raise NotImplementedError(f"{type(self).__name__} has no compose method")
 
     def add_operator(self, operator: Operator) -> None:
-        """Add an operator; add_flow does it too. Raises GraphInvalid when another one has the name."""
+        """Add an operator; `add_flow` does so implicitly. Raises GraphInvalid if another operator
+        has the name.
+        """
         if self._operators.setdefault(operator.name, operator) is not operator:
             raise GraphInvalid(f"two operators are named {operator.name!r}; taken are {sorted(self._operators)}")
 
@@ -58,10 +65,17 @@ class Fragment:
         policy: QueuePolicy | str | None = None,
         capacity: int | None = None,
     ) -> None:
-        """Connect outputs of `upstream` to inputs of `downstream`, given as {("output", "input"), ...}.
+        """Connect outputs of `upstream` to inputs of `downstream`.
 
-        The pairs may be left out when each side has one port. `policy` and `capacity` override what the input
-        declares. Raises GraphInvalid for unknown ports.
+        Args:
+            upstream: producing operator.
+            downstream: consuming operator.
+            port_pairs: {("output", "input"), ...}; optional if each side has one port.
+            policy: queue policy; None for that of the input port.
+            capacity: queue capacity in messages; None for that of the input port.
+
+        Raises:
+            GraphInvalid: unknown ports or an invalid capacity.
         """
         self.add_operator(upstream)
         self.add_operator(downstream)
@@ -78,7 +92,7 @@ class Fragment:
                 f"add_flow({upstream.name}, {downstream.name}): capacity must be at least 1, got {capacity}"
             )
         chosen = None if policy is None else queue_policy(policy)
-        # The pairs are a set on Holoscan, whose order differs from run to run.
+        # On Holoscan the pairs are a set, whose order differs between runs.
         for output, port in sorted(port_pairs):
             if output not in outputs:
                 raise GraphInvalid(f"operator {upstream.name!r} has no output {output!r}; it has {sorted(outputs)}")
@@ -87,33 +101,41 @@ class Fragment:
             self._flows.append(Flow(upstream, output, downstream, port, chosen, capacity))
 
     def scheduler(self, scheduler: Scheduler | None = None) -> Scheduler:
-        """Choose the scheduler of the next runs (a GreedyScheduler by default), or ask for it."""
+        """Set the scheduler of the next runs, if given, and return the current one (default:
+        GreedyScheduler).
+        """
         if scheduler is not None:
             self._scheduler = scheduler
         return self._scheduler
 
     def track(self) -> FlowTracker:
-        """Enable flow tracking; the tracker can be read while running and begins anew with every run."""
+        """Enable flow tracking and return the tracker. It is readable during a run and reset by
+        every run.
+        """
         if self._tracker is None:
             self._tracker = FlowTracker()
         return self._tracker
 
     def run(self) -> RunResult:
-        """Compose and run until every operator is done or stop_execution is called.
+        """Compose the graph and run it until all operators have finished or `stop_execution` is
+        called.
 
-        Raises GraphInvalid before anything runs; OperatorFailed and GraphDeadlock once every operator is stopped.
-        `result` says how it ended in every case.
+        `result` holds the ending in every case.
+
+        Raises:
+            GraphInvalid: before any operator starts.
+            OperatorFailed, GraphDeadlock: after all operators have stopped.
         """
         self._claim()
         return self._run_claimed(self._scheduler)
 
     def run_on(self, scheduler: Scheduler) -> RunResult:
-        """`run`, with another scheduler this once."""
+        """Run once with another scheduler; otherwise as `run`."""
         self._claim()
         return self._run_claimed(scheduler)
 
     def run_async(self) -> Future[RunResult]:
-        """`run` in a thread of its own."""
+        """Run in a new thread; otherwise as `run`."""
         self._claim()
         executor = ThreadPoolExecutor(1, thread_name_prefix=self.name)
         future = executor.submit(self._run_claimed, self._scheduler)
@@ -121,7 +143,9 @@ class Fragment:
         return future
 
     def stop_execution(self, operator: Operator | None = None) -> None:
-        """Stop the run under way (or only one operator of it); from any thread, also from compute. Else no effect."""
+        """Stop the current run, or only one operator. Thread-safe, also within compute; no effect
+        without a run.
+        """
         if operator is not None:
             operator.stop_execution()
             return
@@ -133,21 +157,21 @@ class Fragment:
 
     @property
     def operators(self) -> tuple[Operator, ...]:
-        """The operators of the run under way or of the last one, in the order of composition."""
+        """Operators of the current or last run, in the order of composition."""
         return tuple(self._operators.values())
 
     def edge_stats(self) -> tuple[EdgeStats, ...]:
-        """Counts per edge of the run under way or of the last one; from any thread."""
+        """Return the message counts of each edge in the current or last run. Thread-safe."""
         graph = self._graph
         return () if graph is None else graph.edge_stats()
 
     def compute_counts(self) -> dict[str, int]:
-        """Computes per operator of the run under way or of the last one; from any thread."""
+        """Return the number of compute calls by operator in the current or last run. Thread-safe."""
         graph = self._graph
         return {} if graph is None else {task.name: task.computes for task in graph.tasks}
 
     def faults(self) -> tuple[Fault, ...]:
-        """The last 1000 faults of the run under way or of the last one; from any thread."""
+        """Return the last 1000 faults of the current or last run. Thread-safe."""
         graph = self._graph
         return () if graph is None else tuple(graph.faults)
 
@@ -180,4 +204,4 @@ class Fragment:
 
 
 class Application(Fragment):
-    """A graph that runs by itself."""
+    """A graph that can be run on its own."""

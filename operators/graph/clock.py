@@ -1,4 +1,4 @@
-"""What time it is for a scheduler: real, or as given by the recording."""
+"""Clocks of the schedulers: real time, or simulated time for recordings."""
 
 from __future__ import annotations
 
@@ -7,58 +7,59 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Time since the run began."""
+    """Time since the start of the run."""
 
     def timestamp(self) -> int:
-        """Nanoseconds."""
+        """Return the time in nanoseconds."""
 
     def time(self) -> float:
-        """Seconds."""
+        """Return the time in seconds."""
 
     def reset(self) -> None:
-        """Begin again at 0."""
+        """Restart at 0."""
 
 
 class RealtimeClock:
-    """The machine's monotonic clock."""
+    """Real time by the machine's monotonic clock."""
 
     def __init__(self) -> None:
         self._origin_ns = time.monotonic_ns()
 
     def timestamp(self) -> int:
-        """Nanoseconds since the run began."""
+        """Return the nanoseconds since the start of the run."""
         return time.monotonic_ns() - self._origin_ns
 
     def time(self) -> float:
-        """Seconds since the run began."""
+        """Return the seconds since the start of the run."""
         return self.timestamp() * 1e-9
 
     def reset(self) -> None:
-        """Begin again at 0."""
+        """Restart at 0."""
         self._origin_ns = time.monotonic_ns()
 
 
 class ManualClock:
-    """Time that stands still while any operator can compute and then jumps to when the next one is due.
+    """Simulated time, which advances only when no operator can compute, to the time of the next one
+    due.
 
-    An hour of a 30 Hz stream replays as fast as its operators compute, with the same result each time.
+    A replay therefore takes only as long as its operators compute, and its result is deterministic.
     """
 
     def __init__(self) -> None:
         self._now_ns = 0
 
     def timestamp(self) -> int:
-        """Nanoseconds since the run began."""
+        """Return the nanoseconds since the start of the run."""
         return self._now_ns
 
     def time(self) -> float:
-        """Seconds since the run began."""
+        """Return the seconds since the start of the run."""
         return self._now_ns * 1e-9
 
     def reset(self) -> None:
-        """Begin again at 0."""
+        """Restart at 0."""
         self._now_ns = 0
 
     def advance_to(self, target_ns: int) -> None:
-        """Jump forward; a time in the past changes nothing."""
+        """Advance to `target_ns` nanoseconds; a time in the past has no effect."""
         self._now_ns = max(self._now_ns, target_ns)

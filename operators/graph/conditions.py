@@ -1,6 +1,7 @@
-"""When an operator may compute, besides what its ports say. All conditions of an operator must agree.
+"""Scheduling conditions of operators. An operator computes only if its ports and all conditions
+allow it.
 
-A condition of your own derives from `Condition` and answers `check`; it runs on every engine.
+Custom conditions derive from `Condition` and implement `check`. They run on every engine.
 """
 
 from __future__ import annotations
@@ -12,28 +13,28 @@ from typing import Any
 
 
 class SchedulingStatus(IntEnum):
-    """What a condition says; the greatest wins."""
+    """Answer of a condition. Of several answers the greatest applies."""
 
     READY = 0
     WAIT_TIME = 1
     """Ready at a known time."""
     WAIT = 2
-    """Ready when another operator has done something."""
+    """Ready after another operator has changed an edge."""
     WAIT_EVENT = 3
-    """Ready when something outside the graph has happened; keeps the graph alive."""
+    """Ready after an event outside of the graph; keeps the graph alive."""
     NEVER = 4
-    """Done for this run."""
+    """Finished for this run."""
 
 
 Verdict = tuple[SchedulingStatus, int]
-"""A status and, for WAIT_TIME, the time in nanoseconds of the scheduler's clock."""
+"""Status, and for WAIT_TIME the time when ready, in nanoseconds of the scheduler's clock."""
 
 _READY: Verdict = (SchedulingStatus.READY, 0)
 _NEVER: Verdict = (SchedulingStatus.NEVER, 0)
 
 
 class Condition:
-    """Decides when an operator may compute. The fragment comes first, as on Holoscan."""
+    """Condition for an operator to compute. The fragment is the first argument, as on Holoscan."""
 
     def __init__(self, fragment: Any, *, name: str = "") -> None:
         self.fragment = fragment
@@ -41,21 +42,23 @@ class Condition:
         self._wake: Callable[[], None] | None = None
 
     def check(self, timestamp: int) -> Verdict:
-        """May the operator compute at this time (ns)? Called often, under the scheduler's lock: be quick."""
+        """Return the status at `timestamp` (ns). Called often under the scheduler's lock, so it
+        must be fast.
+        """
         raise NotImplementedError
 
     def on_execute(self, timestamp: int) -> None:
-        """The operator computed; `timestamp` (ns) is when it was found ready."""
+        """Update the state after a compute that was found ready at `timestamp` (ns)."""
 
     def wake_scheduler(self) -> None:
-        """Have the scheduler ask again; call it after a change from outside `compute`."""
+        """Make the scheduler check the conditions again, after a change from outside of `compute`."""
         wake = self._wake
         if wake is not None:
             wake()
 
 
 class CountCondition(Condition):
-    """Compute `count` times, then be done."""
+    """Allows `count` computes, then finishes the operator."""
 
     def __init__(self, fragment: Any, count: int, *, name: str = "") -> None:
         super().__init__(fragment, name=name)
@@ -64,27 +67,29 @@ class CountCondition(Condition):
         self.count = count
 
     def check(self, timestamp: int) -> Verdict:
-        """READY while computes are left."""
+        """Return READY while computes are left."""
         return _READY if self.count > 0 else _NEVER
 
     def on_execute(self, timestamp: int) -> None:
-        """One less is left."""
+        """Decrease the remaining count."""
         self.count -= 1
 
 
 class PeriodicConditionPolicy(Enum):
-    """What happens to ticks that came too late, for a period of 100 ms."""
+    """Treatment of missed ticks. The examples use a period of 100 ms."""
 
     CATCH_UP_MISSED_TICKS = 0
-    """After ticks at 0 and 250 ms the next are due at 200 and 300: several in a row."""
+    """After ticks at 0 and 250 ms, the next are due at 200 and 300 ms, so missed ticks are made up
+    for.
+    """
     MIN_TIME_BETWEEN_TICKS = 1
-    """After ticks at 0 and 101 ms the next is due at 201."""
+    """After ticks at 0 and 101 ms, the next is due at 201 ms."""
     NO_CATCH_UP_MISSED_TICKS = 2
-    """After ticks at 0 and 250 ms the next is due at 300."""
+    """After ticks at 0 and 250 ms, the next is due at 300 ms."""
 
 
 class PeriodicCondition(Condition):
-    """Compute at most once per period (an int in nanoseconds, or a timedelta); the first time at once."""
+    """Allows one compute per period (int in nanoseconds, or timedelta), the first immediately."""
 
     def __init__(
         self,
@@ -104,12 +109,12 @@ class PeriodicCondition(Condition):
         self._due_ns: int | None = None
 
     def check(self, timestamp: int) -> Verdict:
-        """READY once the time has come."""
+        """Return READY once the next tick is due."""
         due = self._due_ns
         return _READY if due is None or timestamp >= due else (SchedulingStatus.WAIT_TIME, due)
 
     def on_execute(self, timestamp: int) -> None:
-        """Appoint the next tick."""
+        """Set the time of the next tick."""
         period, due = self.recess_period_ns, self._due_ns
         if due is None or self.policy is PeriodicConditionPolicy.MIN_TIME_BETWEEN_TICKS:
             self._due_ns = timestamp + period
@@ -120,39 +125,41 @@ class PeriodicCondition(Condition):
 
 
 class BooleanCondition(Condition):
-    """Compute until `disable_tick`, which is final, as on Holoscan; to pause, use AsynchronousCondition."""
+    """Allows computes until `disable_tick`, which is final, as on Holoscan. AsynchronousCondition
+    can pause.
+    """
 
     def __init__(self, fragment: Any, enable_tick: bool = True, *, name: str = "") -> None:
         super().__init__(fragment, name=name)
         self._enabled = enable_tick
 
     def check(self, timestamp: int) -> Verdict:
-        """READY while enabled."""
+        """Return READY while enabled."""
         return _READY if self._enabled else _NEVER
 
     def check_tick_enabled(self) -> bool:
-        """Whether the operator still ticks."""
+        """Return True until `disable_tick` is called."""
         return self._enabled
 
     def disable_tick(self) -> None:
-        """The operator is done; from any thread."""
+        """Finish the operator. Thread-safe."""
         self._enabled = False
         self.wake_scheduler()
 
 
 class AsynchronousEventState(Enum):
-    """Where an outside event stands."""
+    """State of an external event."""
 
     READY = 0
-    """Nothing is awaited: compute."""
+    """No event pending: the operator may compute."""
     WAIT = 1
-    """Not now. Does not keep the graph alive."""
+    """The operator must not compute. Does not keep the graph alive."""
     EVENT_WAITING = 2
-    """An event is awaited; the graph stays alive for it."""
+    """Event pending: the operator must not compute, and the graph stays alive."""
     EVENT_DONE = 3
-    """The event has happened: compute."""
+    """The event has occurred: the operator may compute."""
     EVENT_NEVER = 4
-    """No event will come: the operator is done."""
+    """No further event: the operator is finished."""
 
 
 _EVENT_VERDICTS: dict[AsynchronousEventState, Verdict] = {
@@ -165,7 +172,9 @@ _EVENT_VERDICTS: dict[AsynchronousEventState, Verdict] = {
 
 
 class AsynchronousCondition(Condition):
-    """Compute when something outside the graph says so: set `event_state` from any thread, each change wakes."""
+    """Allows computes according to an external event. Set `event_state` from any thread to wake the
+    scheduler.
+    """
 
     def __init__(self, fragment: Any, *, name: str = "") -> None:
         super().__init__(fragment, name=name)
@@ -173,7 +182,7 @@ class AsynchronousCondition(Condition):
 
     @property
     def event_state(self) -> AsynchronousEventState:
-        """Where the event stands."""
+        """State of the event."""
         return self._state
 
     @event_state.setter
@@ -182,12 +191,14 @@ class AsynchronousCondition(Condition):
         self.wake_scheduler()
 
     def check(self, timestamp: int) -> Verdict:
-        """What the state says."""
+        """Return the status for the event's state."""
         return _EVENT_VERDICTS[self._state]
 
 
 class MessageAvailableCondition(Condition):
-    """The condition of an input port given as an operator's argument, as on Holoscan: `receiver` is the port."""
+    """Condition of an input port passed as an operator argument, as on Holoscan. `receiver` names
+    the port.
+    """
 
     def __init__(self, fragment: Any, *, receiver: str, min_size: int = 1, name: str = "") -> None:
         super().__init__(fragment, name=name)
@@ -195,9 +206,10 @@ class MessageAvailableCondition(Condition):
 
 
 class MessageOrTimeoutCondition(Condition):
-    """Compute when any of the operator's inputs has a message, and at the latest `timeout_ns` after the last compute.
+    """Allows a compute when an input has a message, or `timeout_ns` nanoseconds after the last
+    compute.
 
-    For an operator whose inputs have no condition of their own (`ConditionType.NONE`) and that has something to do without messages, too.
+    For operators whose inputs have `ConditionType.NONE` and that also act without messages.
     """
 
     def __init__(self, fragment: Any, timeout_ns: int, *, name: str = "") -> None:
@@ -209,22 +221,24 @@ class MessageOrTimeoutCondition(Condition):
         self._due_ns = 0
 
     def watch(self, edges: Iterable[Sized]) -> None:
-        """The operator's input edges; called by the graph when they are known."""
+        """Set the operator's input edges; called by the graph when it is built."""
         self._edges = tuple(edges)
 
     def check(self, timestamp: int) -> Verdict:
-        """READY when there is a message or the time has come."""
+        """Return READY if a message is queued or the timeout has elapsed."""
         if timestamp >= self._due_ns or any(len(edge) for edge in self._edges):
             return _READY
         return SchedulingStatus.WAIT_TIME, self._due_ns
 
     def on_execute(self, timestamp: int) -> None:
-        """The timeout begins anew."""
+        """Restart the timeout."""
         self._due_ns = timestamp + self.timeout_ns
 
 
 class DownstreamMessageAffordableCondition(Condition):
-    """The condition of an output port given as an operator's argument, as on Holoscan: `transmitter` is the port."""
+    """Condition of an output port passed as an operator argument, as on Holoscan. `transmitter`
+    names the port.
+    """
 
     def __init__(self, fragment: Any, *, transmitter: str, min_size: int = 1, name: str = "") -> None:
         super().__init__(fragment, name=name)

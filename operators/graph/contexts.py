@@ -1,4 +1,4 @@
-"""What an operator sees during compute: its inputs, its outputs and its surroundings."""
+"""Access of an operator to its inputs, outputs and environment during compute."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class InputContext:
-    """The inputs of an operator during compute."""
+    """Inputs of an operator during compute."""
 
     __slots__ = ("_ports", "_single", "_task")
 
@@ -26,9 +26,10 @@ class InputContext:
         self._single = {name: edges[0] for name, (port, edges) in self._ports.items() if edges and not port.batched}
 
     def receive(self, name: str, *, kind: str = "") -> Any:
-        """The oldest message's value, or None when there is none.
+        """Return the oldest message's value, or None if no message is queued.
 
-        A port of size n > 1 gives a tuple of everything queued, one of ANY_SIZE a tuple with one entry per connection.
+        A port of size n > 1 returns a tuple of all queued values. A port of `ANY_SIZE` returns a
+        tuple with one entry per connection.
         """
         edge = self._single.get(name)
         if edge is not None:
@@ -43,7 +44,7 @@ class InputContext:
         return self._receive_batch(name)
 
     def queued(self, name: str) -> int:
-        """How many messages wait at an input that has one connection; 0 for one that is not connected."""
+        """Return the number of queued messages at an input with one connection; 0 if not connected."""
         edge = self._single.get(name)
         return 0 if edge is None else len(edge)
 
@@ -74,7 +75,7 @@ class InputContext:
 
 
 class OutputContext:
-    """The outputs of an operator during compute."""
+    """Outputs of an operator during compute."""
 
     __slots__ = ("_ports", "_task")
 
@@ -84,8 +85,18 @@ class OutputContext:
         self._ports = {name: (task.outputs.get(name, []), runtime_type(port.type)) for name, port in ports.items()}
 
     def emit(self, data: Any, name: str = "", emitter_name: str = "", acq_timestamp: int = -1) -> None:
-        """Send a value, with the operator's metadata, along every edge of the output; `name` may be left out when
-        there is one. Raises PortError (no such output, wrong type) and QueueFull."""
+        """Emit a value with the operator's metadata along every edge of an output.
+
+        Args:
+            data: the value.
+            name: output port; optional if the operator has only one.
+            emitter_name: ignored; for compatibility with Holoscan.
+            acq_timestamp: ignored; for compatibility with Holoscan.
+
+        Raises:
+            PortError: unknown output or wrong type.
+            QueueFull: a blocking edge is full.
+        """
         task = self._task
         try:
             edges, declared = self._ports[name]
@@ -108,7 +119,7 @@ class OutputContext:
 
 
 class ExecutionContext:
-    """What an operator may know of its surroundings during compute."""
+    """Environment of an operator during compute."""
 
     __slots__ = ("_task", "input", "output")
 
@@ -119,17 +130,19 @@ class ExecutionContext:
 
     @property
     def clock(self) -> Clock:
-        """The scheduler's clock: `timestamp()` in ns, `time()` in s, from the beginning of the run."""
+        """Clock of the scheduler, from the start of the run: `timestamp()` in ns, `time()` in s."""
         return self._task.graph.clock
 
     def find_operator(self, name: str = "") -> Operator | None:
-        """An operator of the graph by name; without a name, this one."""
+        """Return an operator of the graph by name, or this operator without a name. None if
+        unknown.
+        """
         task = self._task.graph.tasks_by_name.get(name or self._task.name)
         return None if task is None else task.operator
 
 
 def runtime_type(declared: Any) -> Any:
-    """The part of a port's type that isinstance can check; None for anything."""
+    """Return the part of a port's type that isinstance can check; None if any value is allowed."""
     if declared in (None, Any, object):
         return None
     return getattr(declared, "__origin__", declared)

@@ -1,4 +1,4 @@
-"""Which engine runs an application."""
+"""Selection of the engine that runs an application."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ Engine = Literal["embedded", "holoscan"]
 
 
 def run(app: Fragment, engine: Engine = "embedded") -> RunResult:
-    """Run an application on our own schedulers (`embedded`) or on the Holoscan SDK (`holoscan`).
+    """Run an application on the embedded schedulers or on the Holoscan SDK. Results and counts are
+    the same.
 
-    Results, errors and counts are the same. Raises what Fragment.run raises; EngineMissing without the SDK and
-    EngineUnsupported for what it cannot do.
+    Args:
+        app: the application.
+        engine: `embedded` or `holoscan`.
+
+    Raises:
+        EngineMissing: the SDK is not installed or cannot be loaded.
+        EngineUnsupported: the SDK cannot run the graph faithfully.
+        GraphError: as `Fragment.run` raises it.
     """
     if engine == "embedded":
         return app.run()

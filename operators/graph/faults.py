@@ -1,4 +1,4 @@
-"""What the graph does when an operator raises."""
+"""Fault policies: reactions of the graph to an exception in an operator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from operators.errors import OperatorFailed
 
 
 class FaultAction(Enum):
-    """The answer to one fault."""
+    """Reaction to one fault."""
 
     STOP_GRAPH = "stop_graph"
     RESTART = "restart"
@@ -18,13 +18,15 @@ class FaultAction(Enum):
 
 @dataclass(frozen=True)
 class FaultPolicy:
-    """An operator's answer to its own exceptions. What it was working on when it raised is lost, and counted as a fault."""
+    """Reaction of an operator to its own exceptions. Messages in work at that time are lost and
+    counted as a fault.
+    """
 
     action: FaultAction = FaultAction.STOP_GRAPH
     restarts: int = 0
-    """How often `stop` and `start` are called to go on."""
+    """Maximum number of restarts, each by `stop` and `start`."""
     afterwards: FaultAction = FaultAction.STOP_GRAPH
-    """The answer once the restarts are used up."""
+    """Reaction after the last restart."""
 
     def __post_init__(self) -> None:
         if self.restarts < 0 or (self.action is FaultAction.RESTART) != (self.restarts > 0):
@@ -34,25 +36,25 @@ class FaultPolicy:
 
     @classmethod
     def restart(cls, restarts: int, afterwards: FaultAction = FaultAction.STOP_GRAPH) -> FaultPolicy:
-        """Restart the operator up to `restarts` times."""
+        """Return a policy that restarts the operator up to `restarts` times."""
         return cls(FaultAction.RESTART, restarts, afterwards)
 
     def action_after(self, restarts_done: int) -> FaultAction:
-        """The answer to the next fault."""
+        """Return the reaction to the next fault after `restarts_done` restarts."""
         if self.action is not FaultAction.RESTART:
             return self.action
         return FaultAction.RESTART if restarts_done < self.restarts else self.afterwards
 
 
 STOP_GRAPH = FaultPolicy()
-"""The graph stops and run() raises (the default)."""
+"""Stop the graph; `run()` raises (default)."""
 DISABLE_BRANCH = FaultPolicy(FaultAction.DISABLE_BRANCH)
-"""The operator is done, what only it feeds finishes, the rest goes on."""
+"""Finish the operator and all operators fed only by it. The rest of the graph continues."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One exception of an operator and what was done about it."""
+    """An exception of an operator and the reaction to it."""
 
     error: OperatorFailed
     action: FaultAction

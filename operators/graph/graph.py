@@ -1,4 +1,6 @@
-"""Composition made ready to run: checks of the connections, topological order, start and stop of the operators."""
+"""Executable graph: checks of connections and types, topological order, start and stop of
+operators.
+"""
 
 from __future__ import annotations
 
@@ -29,50 +31,52 @@ _FAULTS_KEPT = 1000
 
 
 class Scheduler(Protocol):
-    """Decides which operator computes when."""
+    """Decides the order of the operators' compute calls."""
 
     clock: Clock
 
     def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> Edge:
-        """An edge that fits the scheduler's threads."""
+        """Create an edge suited to the scheduler's threads."""
 
     def execute(self, graph: Graph) -> None:
-        """Run started operators until all are finished, the graph is stopping, or nothing can go on."""
+        """Run the started operators until all have finished, the graph stops, or no operator can
+        compute.
+        """
 
     def wake(self) -> None:
-        """Something changed from outside: look again. From any thread."""
+        """Make the scheduler check all operators again after an external change. Thread-safe."""
 
 
 class StopReason(Enum):
-    """Why a run ended."""
+    """Reason for the end of a run."""
 
     FINISHED = "finished"
-    """Every operator was done."""
+    """All operators finished."""
     STOPPED = "stopped"
-    """stop_execution or an interrupt."""
+    """`stop_execution` or an interrupt."""
     FAILED = "failed"
-    """An operator raised."""
+    """An operator raised an exception."""
     DEADLOCK = "deadlock"
-    """Nothing could go on."""
+    """No operator could compute."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended."""
+    """Ending and counts of a run."""
 
     reason: StopReason
     wall_s: float
     computes: dict[str, int]
-    """Computes per operator."""
+    """Number of compute calls by operator."""
     edges: tuple[EdgeStats, ...]
     faults: tuple[Fault, ...]
-    """The last 1000."""
+    """The last 1000 faults."""
     error: BaseException | None = None
 
 
 @dataclass(frozen=True)
 class Flow:
-    """A connection as composed; None leaves the choice to the input port."""
+    """A composed connection; a policy or capacity of None selects that of the input port."""
 
     producer: Operator
     output: str
@@ -83,7 +87,7 @@ class Flow:
 
 
 class Graph:
-    """The operators and edges of one run."""
+    """Operators and edges of one run."""
 
     def __init__(
         self, operators: Iterable[Operator], flows: list[Flow], scheduler: Scheduler, tracker: FlowTracker | None
@@ -133,7 +137,9 @@ class Graph:
         self.ends.append((producer, edge, consumer))
 
     def run(self) -> RunResult:
-        """Initialize, start, compute, stop. Raises OperatorFailed, GraphDeadlock, or the interrupt that ended it."""
+        """Initialise, start, run and stop the operators. Errors and interrupts are kept in the
+        result.
+        """
         began = perf_counter()
         interrupt: BaseException | None = None
         self.clock.reset()
@@ -141,10 +147,10 @@ class Graph:
             self._start()
             if not self.stopping:
                 self.scheduler.execute(self)
-        except BaseException as error:  # noqa: BLE001 - raised again once every operator is stopped
+        except BaseException as error:  # noqa: BLE001 - raised again after all operators have stopped
             interrupt = error
         self.stopping = True
-        # Not while it still computes: an operator is never entered by two threads.
+        # A stuck operator is not stopped, because its thread is still inside of compute.
         stuck = interrupt.operators if isinstance(interrupt, OperatorStuck) else ()
         for task in reversed(self.tasks):
             if task.name not in stuck:
@@ -177,12 +183,14 @@ class Graph:
         return RunResult(reason, wall_s, computes, self.edge_stats(), tuple(self.faults), error)
 
     def stop(self) -> None:
-        """Every operator finishes its present compute and no more; from any thread."""
+        """Let every operator finish its current compute and no more. Thread-safe."""
         self.stopping = True
         self.scheduler.wake()
 
     def fail(self, failure: OperatorFailed) -> None:
-        """Stop because of an operator; the first failure is the one that run() raises."""
+        """Stop because of a failed operator. `run()` raises the first failure; later ones are
+        logged.
+        """
         if self.failure is None:
             self.failure = failure
         else:
@@ -190,13 +198,15 @@ class Graph:
         self.stop()
 
     def record_fault(self, failure: OperatorFailed, action: FaultAction) -> None:
-        """Keep a fault for the result."""
+        """Record a fault for the result."""
         self.faults.append(Fault(failure, action))
         if action is not FaultAction.STOP_GRAPH:
             logger.warning("%s; %s", failure, action.value, exc_info=_traceback_of(failure))
 
     def settle(self, now_ns: int) -> bool:
-        """Finish what is done, and again what is done because of it. Whether all operators are finished."""
+        """Finish all operators that can do no more, repeatedly, as each may finish others. Return
+        True if all are.
+        """
         again = True
         while again:
             again = False
@@ -207,17 +217,19 @@ class Graph:
         return all(task.finished for task in self.tasks)
 
     def declare_deadlock(self, now_ns: int) -> None:
-        """Nothing can go on: keep who waits on what, and stop."""
+        """Record the operators' unmet conditions as a deadlock, and stop."""
         self.deadlock = GraphDeadlock({task.name: task.waits_for(now_ns) for task in self.tasks if not task.finished})
         self.stop()
 
     def edge_stats(self) -> tuple[EdgeStats, ...]:
-        """Counts of all edges; from any thread."""
+        """Return the message counts of all edges. Thread-safe."""
         return tuple(edge.stats() for _, edge, _ in self.ends)
 
 
 def accepts(taken: Any, given: Any) -> bool:
-    """Whether an input that takes one type may be fed by an output that gives another; None and Any fit anything."""
+    """Return True if an output's type `given` fits an input's type `taken`; None and Any fit all
+    types.
+    """
     if taken in (None, Any, object) or given in (None, Any):
         return True
     if get_origin(given) in (Union, types.UnionType):
@@ -232,7 +244,7 @@ def _named(declared: Any) -> str:
 
 
 def _check_unconnected(tasks: Iterable[OperatorTask]) -> None:
-    """Every port is connected, or says that it need not be. Lists all that are not."""
+    """Raise GraphInvalid listing all ports that are not connected and not optional."""
     loose = []
     for task in tasks:
         spec = task.operator.spec
@@ -249,7 +261,9 @@ def _check_unconnected(tasks: Iterable[OperatorTask]) -> None:
 
 
 def _topological(tasks: list[OperatorTask], arrows: list[tuple[OperatorTask, OperatorTask]]) -> list[OperatorTask]:
-    """Producers before consumers, else in the order of composition; a loop is entered where it was composed first."""
+    """Sort producers before consumers, otherwise in composition order. A cycle starts at its first
+    composed operator.
+    """
     ordered: list[OperatorTask] = []
     left = tasks.copy()
     while left:
@@ -261,5 +275,7 @@ def _topological(tasks: list[OperatorTask], arrows: list[tuple[OperatorTask, Ope
 
 
 def _traceback_of(failure: OperatorFailed) -> BaseException | None:
-    """Return the cause of a failure for the log. A cause that the user can change is a sentence, which needs no traceback."""
+    """Return the cause of a failure for the log; None for a UserError, whose message needs no
+    traceback.
+    """
     return None if isinstance(failure.__cause__, UserError) else failure.__cause__

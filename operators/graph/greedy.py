@@ -1,4 +1,4 @@
-"""The single-threaded scheduler: deterministic, and the one that replays."""
+"""Single-threaded deterministic scheduler, used for replay."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class GreedyScheduler:
-    """Runs in rounds: each operator, in topological order, computes once per round if it may.
+    """Runs in rounds: each operator computes at most once per round, in topological order.
 
-    Everything happens in the thread that calls run(). The order of computes depends only on the graph and on what
-    the operators do, so with a ManualClock a replay has the same result each time.
+    All operators run in the thread that calls `run()`. The order of computes depends only on the
+    graph and on its operators, so that with a ManualClock a replay is deterministic.
     """
 
     def __init__(self, fragment: Any = None, *, clock: Clock | None = None, name: str = "greedy_scheduler") -> None:
@@ -28,15 +28,15 @@ class GreedyScheduler:
         self._woken = threading.Event()
 
     def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> Edge:
-        """One thread: no locks."""
+        """Create an edge without locks, as the scheduler has one thread."""
         return Edge(name, capacity, policy)
 
     def wake(self) -> None:
-        """Look again; from any thread."""
+        """Make the scheduler check all operators again. Thread-safe."""
         self._woken.set()
 
     def execute(self, graph: Graph) -> None:
-        """Compute round by round."""
+        """Run rounds until all operators have finished, the graph stops, or a deadlock occurs."""
         ready, wait_time, never = SchedulingStatus.READY, SchedulingStatus.WAIT_TIME, SchedulingStatus.NEVER
         wait_event = SchedulingStatus.WAIT_EVENT
         timestamp = self.clock.timestamp
@@ -68,7 +68,9 @@ class GreedyScheduler:
                 return
 
     def _await(self, due_ns: int | None, event_awaited: bool) -> bool:
-        """Nobody could compute: wait for the time or the event. False when neither is to come."""
+        """Wait for the next due time or event. Return False if neither is pending, which is a
+        deadlock.
+        """
         if self._woken.is_set():
             self._woken.clear()
         elif due_ns is not None:

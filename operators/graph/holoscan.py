@@ -1,21 +1,23 @@
-"""The same graph on the Holoscan SDK: its schedulers decide who computes, its connections carry the messages.
+"""Execution of a graph on the Holoscan SDK: the SDK schedules operators and transports messages.
 
-Each operator becomes a bridge, each edge a pair of ports of its own, so that the edges of a fan-out keep their own
-capacity and policy. A message travels as the opaque `Message`, which the SDK never converts. The rest (faults, stop
-reasons, counts, tracking) is `OperatorTask` and `Graph`, as on the embedded engine.
+Each operator becomes a `Bridge`, and each edge a pair of ports, so that every edge of a fan-out
+keeps its own capacity and policy. A message travels as the opaque `Message`, which the SDK does not
+convert. Faults, stop reasons, counts and tracking are handled by `OperatorTask` and `Graph`, as on
+the embedded engine.
 
-Hazards of the SDK (4.6) and what is done about them:
-- Its MultiThreadScheduler stops early at random: our threads map to its EventBasedScheduler, and a run that ends
-  while an operator could go on raises EngineError.
-- `stop_execution` does not wake a graph that waits for an event: stopping goes through the gates.
-- Its greedy scheduler sleeps through events until the next time at which an operator is due: no due time is more than 10 ms away.
-- Its schedulers give up before they have seen what a check or a thread just changed: they wait half a second first.
-- An exception in compute can end a run silently: none ever reaches the SDK.
-- It takes over SIGINT and SIGTERM, for good: the handlers are put back once it runs.
-- Its EventBasedScheduler may check an operator in one thread while it stops it in another, starts it again, and fails:
-  there a finished operator waits for ever, which does not keep the run from ending.
-- It checks an operator that computes: such a check decides nothing.
-- It drops without counting: edges keep the policy themselves, and the SDK's queues never overflow.
+Workarounds for problems of the SDK (4.6):
+
+- Its MultiThreadScheduler may stop early. Threaded runs use its EventBasedScheduler, and a run that
+  ends while an operator could compute raises EngineError.
+- `stop_execution` does not wake a graph that waits for an event. The gates perform the stop.
+- Its greedy scheduler sleeps through events until the next due time. Due times are limited to 10 ms.
+- Its schedulers declare a deadlock before they have seen the latest change. They wait 0.5 s first.
+- An exception in compute can end a run silently. No exception is passed to the SDK.
+- It replaces the SIGINT and SIGTERM handlers permanently. The handlers are restored after the start.
+- Its EventBasedScheduler may check an operator in one thread while stopping it in another, and fail.
+  With it a finished operator waits forever, which does not keep the run from ending.
+- It checks an operator while that operator computes. Such a check decides nothing.
+- It drops messages without counting. Edges apply the policy, and the SDK's queues never overflow.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ _GIVE_UP_MS = 500
 
 
 class Gate(_Condition):
-    """What the operator's conditions and outputs say, as one condition of the SDK."""
+    """Conditions and outputs of an operator, combined as one condition of the SDK."""
 
     def __init__(self, fragment: Any, task: OperatorTask, scheduler: HoloscanScheduler) -> None:
         self.task, self.scheduler = task, scheduler
@@ -59,7 +61,7 @@ class Gate(_Condition):
         super().__init__(fragment, name=f"{task.name}_gate")
 
     def check(self, timestamp: int) -> tuple[Any, int | None]:
-        """May the operator compute, as far as the SDK cannot tell from its queues?"""
+        """Return the scheduling status as far as the SDK cannot derive it from its queues."""
         if not self.checked:
             self.checked = True
             self.scheduler.restore_signals()
@@ -67,7 +69,7 @@ class Gate(_Condition):
         status, due_ns = task.consent(now_ns)
         if task.finished or task.graph.stopping or self._finishes(status):
             status = self.scheduler.done
-        elif self.computing or not self._sees_room():  # after each compute the SDK checks again
+        elif self.computing or not self._sees_room():  # the SDK checks again after each compute
             status = SchedulingStatus.WAIT
         elif status is SchedulingStatus.WAIT_TIME:
             manual = isinstance(self.scheduler.clock, ManualClock)
@@ -76,8 +78,8 @@ class Gate(_Condition):
         return _STATUS[status], None
 
     def _finishes(self, status: SchedulingStatus) -> bool:
-        """Finish the task if it can do nothing more."""
-        with self._turn:  # an operator that computes has taken its last message, but not sent its last one
+        """Finish the task if it can do no more, and return True if so."""
+        with self._turn:  # a computing operator has taken its last message but may not have emitted its result
             if self.computing or not (status is SchedulingStatus.NEVER or self.task.exhausted()):
                 return False
             self.task.finish()
@@ -85,7 +87,7 @@ class Gate(_Condition):
         return True
 
     def begins(self) -> bool:
-        """Whether the operator may compute; until `computing` is taken back, it does not finish."""
+        """Return True if the operator may compute. It cannot finish until `computing` is reset."""
         with self._turn:
             self.computing = not (self.task.finished or self.task.graph.stopping)
             return self.computing
@@ -94,18 +96,22 @@ class Gate(_Condition):
         if self.task.has_room():
             return True
         self.waits_for_room = True
-        return self.task.has_room()  # again: a message taken before `waits_for_room` was set wakes no one
+        return (
+            self.task.has_room()
+        )  # check again: a message taken before `waits_for_room` was set does not wake this gate
 
     def room_made(self) -> None:
-        """Have the SDK check the operator again if it waits for room. The SDK does so by itself when it hands out a message, but
-        then the edge still counts it."""
+        """Make the SDK check the operator again if it waits for space in an output queue.
+
+        The SDK also checks when it delivers a message, but at that time the edge still counts it.
+        """
         if self.waits_for_room:
             self.waits_for_room = False
             self.notify_scheduler()
 
 
 class Bridge(_Operator):
-    """One of our operators as an operator of the SDK."""
+    """Adapter that presents an operator task as an operator of the SDK."""
 
     def __init__(self, fragment: Any, task: OperatorTask, gate: Gate) -> None:
         self.task, self.gate = task, gate
@@ -114,7 +120,9 @@ class Bridge(_Operator):
         super().__init__(fragment, gate, name=task.name)
 
     def setup(self, spec: Any) -> None:
-        """One port per edge. min_size is always given: the SDK's default would batch."""
+        """Declare one port per edge. `min_size` is always given, because the SDK's default batches
+        messages.
+        """
         kind = _PortCondition.MESSAGE_AVAILABLE
         for edge in self.in_edges:
             port = spec.input(edge.port).connector(_QUEUE, capacity=edge.capacity)
@@ -123,12 +131,13 @@ class Bridge(_Operator):
         kind = _PortCondition.DOWNSTREAM_MESSAGE_AFFORDABLE
         for edge in self.out_edges:
             port = spec.output(edge.port).connector(_QUEUE, capacity=edge.capacity)
-            # One of several edges may close while it is full; the SDK would wait for it for ever, the gate does not.
+            # One of several edges may close while full. The SDK would wait for it forever, so the
+            # gate decides.
             room = self.task.leaves_room(edge) if len(self.out_edges) == 1 else 0
             _ = port.condition(kind, min_size=room) if room else port.condition(_PortCondition.NONE)
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        """Execute the task; nothing is raised into the SDK."""
+        """Execute the task. No exception is passed to the SDK."""
         if not self.gate.begins():
             return
         for edge in self.in_edges:
@@ -145,7 +154,7 @@ class Bridge(_Operator):
 
 
 class HoloscanScheduler:
-    """Runs a graph on the SDK's scheduler that answers to one of ours."""
+    """Runs a graph on the SDK scheduler that corresponds to an embedded scheduler."""
 
     def __init__(self, scheduler: Scheduler) -> None:
         if not isinstance(scheduler, GreedyScheduler | MultiThreadScheduler):
@@ -161,37 +170,41 @@ class HoloscanScheduler:
         self._edge_count = 0
 
     def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> CarriedEdge:
-        """An edge with a port name of its own."""
+        """Create an edge with a unique port name."""
         edge = CarriedEdge(name, capacity, policy, self._lock)
         self._edge_count += 1
         edge.port = f"edge{self._edge_count}"
         return edge
 
     def wake(self) -> None:
-        """Have the SDK check every operator again; from any thread."""
+        """Make the SDK check every operator again. Thread-safe."""
         for gate in self._gates:
-            if gate.checked:  # before, the SDK does not know it
+            if gate.checked:  # unknown to the SDK before its first check
                 gate.notify_scheduler()
 
     def now_ns(self, timestamp: int) -> int:
-        """Our time at a time of the SDK; a manual clock follows the SDK's."""
+        """Convert the SDK's time to the time of the graph's clock. A manual clock is advanced to
+        the SDK's time.
+        """
         if isinstance(self.clock, ManualClock):
             self.clock.advance_to(timestamp)
         return self.clock.timestamp()
 
     def execute(self, graph: Graph) -> None:
-        """Run the SDK in a thread of its own, so that Ctrl-C reaches the thread that waits here."""
+        """Run the SDK in a separate thread, so that Ctrl-C reaches the calling thread."""
         begin = threading.Event()
         thread = threading.Thread(target=self._run, args=(graph, begin), name="holoscan", daemon=True)
         try:
             thread.start()
             begin.set()
-            interruptible_wait(self._over)  # not join: interrupted, it takes the thread for ended (Python 3.11)
+            interruptible_wait(
+                self._over
+            )  # not join: after an interrupt, join considers the thread ended (Python 3.11)
         finally:
             stopped, begun = graph.stopping, begin.is_set()
             graph.stop()
             begin.set()
-            if begun:  # otherwise an interrupt came before, and there may be no thread
+            if begun:  # otherwise an interrupt came first, and the thread may not exist
                 interruptible_wait(self._over)
         if self.error is not None:
             raise self.error
@@ -214,7 +227,7 @@ class HoloscanScheduler:
             self._over.set()
 
     def _application(self, graph: Graph) -> Any:
-        """The graph as an application of the SDK."""
+        """Create the SDK application of the graph."""
         outer, tasks = self, graph.tasks
         edges = cast("list[CarriedEdge]", [edge for _, edge, _ in graph.ends])
 

@@ -1,4 +1,4 @@
-"""Waiting so that Ctrl-C is noticed."""
+"""Waiting that remains interruptible by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ _LOOK_S = 0.25
 
 
 def interruptible_wait(event: threading.Event, timeout_s: float | None = None) -> bool:
-    """`event.wait`, in steps. Raises KeyboardInterrupt within one of them.
+    """Wait for an event in short steps. Raises KeyboardInterrupt within one step after Ctrl-C.
 
-    Python looks for signals and then blocks; one that comes in between, or in another thread, is seen when it looks again.
+    A single long wait would not notice a signal that arrives just before it blocks or in another
+    thread.
     """
     due_s = None if timeout_s is None else time.monotonic() + timeout_s
     while True:

@@ -1,4 +1,4 @@
-"""Metadata travels with messages; this is how the metadata of several messages of one compute come together."""
+"""Merging of the metadata of several messages that one compute receives."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from operators.errors import MetadataConflict
 
 
 class MetadataPolicy(Enum):
-    """What happens to a key that is already there."""
+    """Treatment of a metadata key that is already present."""
 
     UPDATE = "update"
-    """The message received last wins (the default)."""
+    """The last received message wins (default)."""
     REJECT = "reject"
-    """The message received first wins."""
+    """The first received message wins."""
     RAISE = "raise"
-    """Equal values are fine, different ones are an error: joins stay aligned."""
-    INPLACE_UPDATE = "update"  # noqa: PIE796 - Holoscan's other name
+    """Equal values are accepted and different ones raise MetadataConflict, to detect misaligned
+    joins.
+    """
+    INPLACE_UPDATE = "update"  # noqa: PIE796 - alias of the Holoscan SDK
 
 
 def merge_metadata(into: dict[str, Any], received: dict[str, Any], policy: MetadataPolicy) -> None:
-    """Merge `received` into `into`. Raises MetadataConflict under RAISE."""
+    """Merge `received` into `into`. Raises MetadataConflict under `RAISE`."""
     if policy is MetadataPolicy.UPDATE:
         into.update(received)
         return
@@ -32,6 +34,6 @@ def merge_metadata(into: dict[str, Any], received: dict[str, Any], policy: Metad
 
 
 def _same_scalar(one: Any, other: Any) -> bool:
-    """Equality of plain values; arrays compare by identity, which the caller has done."""
+    """Compare plain values. Arrays compare by identity, which the caller has already checked."""
     plain = (str, bytes, int, float, bool, tuple)
     return isinstance(one, plain) and isinstance(other, plain) and one == other

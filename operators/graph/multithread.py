@@ -1,4 +1,4 @@
-"""The multi-threaded scheduler: a thread per operator, woken by what happens on its edges; nothing polls."""
+"""Multi-threaded scheduler with one thread per operator, woken by changes on the operator's edges."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class MultiThreadScheduler:
-    """Operators compute side by side. An operator itself computes in one thread, one compute at a time.
+    """Runs operators in parallel, each in its own thread with one compute at a time.
 
-    When the graph stops, operators get `stop_timeout_s` to return from compute; else run() raises OperatorStuck
-    naming them (their threads are daemons and do not keep the process alive).
+    When the graph stops, operators have `stop_timeout_s` seconds to return from compute. Otherwise
+    `run()` raises OperatorStuck. The threads are daemons and do not keep the process alive.
     """
 
     def __init__(
@@ -38,7 +38,8 @@ class MultiThreadScheduler:
         self.clock: Clock = clock or RealtimeClock()
         self.name = name
         self.stop_timeout_s = stop_timeout_s
-        # Reentrant: a condition may be changed, and so wake us, while it is being checked.
+        # Reentrant, because a condition may be changed, and so call `wake`, while it is being
+        # checked.
         self._lock = threading.RLock()
         self._over = threading.Event()
         self._wakers: dict[OperatorTask, threading.Condition] = {}
@@ -46,11 +47,11 @@ class MultiThreadScheduler:
         self._interrupt: BaseException | None = None
 
     def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> LockedEdge:
-        """An edge that wakes the operators at its ends."""
+        """Create an edge that wakes the operators at both ends."""
         return LockedEdge(name, capacity, policy, self._lock)
 
     def wake(self) -> None:
-        """Every operator looks again; from any thread."""
+        """Make every operator check again. Thread-safe."""
         with self._lock:
             for task in tuple(self._asleep):
                 self._rouse(task)
@@ -83,14 +84,14 @@ class MultiThreadScheduler:
             raise self._interrupt
 
     def _work(self, graph: Graph, task: OperatorTask, prepared: threading.Barrier) -> None:
-        """The life of one operator's thread."""
+        """Main function of an operator's thread."""
         try:
             task.prepare_thread()
             prepared.wait()
             while (now_ns := self._await_ready(graph, task)) is not None:
                 task.tick(now_ns)
         except threading.BrokenBarrierError:
-            pass  # the run was interrupted before all threads were there
+            pass  # the run was interrupted before all threads had started
         except BaseException as error:  # noqa: BLE001 - carried to the thread that called run()
             self._interrupt = self._interrupt or error
             graph.stop()
@@ -98,7 +99,9 @@ class MultiThreadScheduler:
             self._over.set()
 
     def _await_ready(self, graph: Graph, task: OperatorTask) -> int | None:
-        """The time at which the operator was found ready, or None when its thread is to end."""
+        """Wait until the operator is ready. Return the time of the check; None if the thread is to
+        end.
+        """
         with self._lock:
             while not graph.stopping:
                 now_ns = self.clock.timestamp() if task.conditions else 0
@@ -120,13 +123,15 @@ class MultiThreadScheduler:
             return None
 
     def _rouse(self, task: OperatorTask) -> None:
-        """Wake one operator if it sleeps; under the lock."""
-        # Removed here and not by its own thread: until that runs, `_check_deadlock` would count it as asleep.
+        """Wake the thread of an operator if it sleeps. Requires the lock."""
+        # Removed here, because until its thread runs `_check_deadlock` would count it as asleep.
         if self._asleep.pop(task, None) is not None:
             self._wakers[task].notify()
 
     def _check_deadlock(self, graph: Graph) -> None:
-        """Under the lock: everyone sleeps and neither a time nor an event will wake anyone."""
+        """Declare a deadlock if all operators wait for each other, without a due time or event.
+        Requires the lock.
+        """
         live = [task for task in graph.tasks if not task.finished]
         if live and all(self._asleep.get(task) is SchedulingStatus.WAIT for task in live):
             graph.declare_deadlock(self.clock.timestamp())
@@ -135,7 +140,7 @@ class MultiThreadScheduler:
     def _join(self, threads: list[threading.Thread]) -> None:
         deadline_ns = self.clock.timestamp() + int(self.stop_timeout_s * 1e9)
         for thread in threads:
-            if not thread.is_alive():  # or never started, because an interrupt came before
+            if not thread.is_alive():  # also never started, after an early interrupt
                 continue
             thread.join(max(0, deadline_ns - self.clock.timestamp()) * 1e-9)
         stuck = [thread.name for thread in threads if thread.is_alive()]

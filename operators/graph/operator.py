@@ -1,4 +1,4 @@
-"""The base class of streaming operators."""
+"""Base class of streaming operators."""
 
 from __future__ import annotations
 
@@ -16,11 +16,17 @@ if TYPE_CHECKING:
 
 
 class Operator:
-    """One step of a graph, written once for every engine.
+    """One step of a graph, independent of the engine.
 
-    A subclass declares ports and parameters in `setup` and works in `compute`. Per run: `initialize`, `start`,
-    n times `compute`, `stop`; an operator that was started is always stopped. Positional arguments are conditions,
-    keyword arguments are parameters; `name` must be unique in the fragment, `fault_policy` overrides the class's.
+    A subclass declares ports and parameters in `setup` and works in `compute`. Each run calls
+    `initialize`, `start`, `compute` n times, and `stop`. Every started operator is stopped.
+
+    Args:
+        fragment: the graph.
+        args: conditions.
+        name: unique name in the fragment.
+        fault_policy: overrides the policy of the class.
+        kwargs: values of the declared parameters.
     """
 
     fault_policy: FaultPolicy = STOP_GRAPH
@@ -40,7 +46,9 @@ class Operator:
         if fault_policy is not None:
             self.fault_policy = fault_policy
         self.metadata: dict[str, Any] = {}
-        """In compute: what came with the messages; it goes out with what is emitted."""
+        """Merged metadata of the messages received in the current compute; attached to emitted
+        messages.
+        """
         self.conditions: list[Condition] = []
         self.spec = OperatorSpec(self.name)
         self.setup(self.spec)
@@ -51,27 +59,30 @@ class Operator:
         self._wake: Any = None
 
     def setup(self, spec: OperatorSpec) -> None:
-        """Declare ports and parameters; called once, by the constructor."""
+        """Declare ports and parameters; called once by the constructor."""
 
     def initialize(self) -> None:
-        """Called once per run, before any operator starts; parameters are set."""
+        """Prepare a run; called before any operator starts, with parameters set."""
 
     def start(self) -> None:
-        """Acquire what compute needs; called again after `stop` by a restart."""
+        """Acquire resources for `compute`. A restart calls it again after `stop`."""
 
     def prepare_thread(self) -> None:
-        """Called after `start` by the thread that is going to compute, before any operator computes: for what a library does once in every
-        thread and takes long over. The Holoscan SDK, whose threads are its own, does not call it."""
+        """Perform slow per-thread initialisation of libraries.
+
+        Called after `start` in the thread that computes, before any operator computes. The Holoscan
+        SDK does not call it, because it owns its threads.
+        """
 
     def compute(self, op_input: InputContext, op_output: OutputContext, context: ExecutionContext) -> None:
-        """Do one step: receive, work, emit."""
+        """Perform one step: receive, process and emit."""
         raise NotImplementedError(f"operator {self.name!r} ({type(self).__name__}) has no compute method")
 
     def stop(self) -> None:
-        """Release what `start` acquired."""
+        """Release the resources acquired by `start`."""
 
     def stop_execution(self) -> None:
-        """This operator is done once its present compute returns; the rest drains. From any thread."""
+        """Finish this operator after its current compute; downstream operators drain. Thread-safe."""
         self._finish = True
         if self._wake is not None:
             self._wake()

@@ -1,4 +1,6 @@
-"""Edges: bounded queues between an output and an input, which count what they drop."""
+"""Edges of the graph: bounded queues between an output and an input, with counts of dropped
+messages.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from operators.graph.tracking import Trail
 
 
 class Message:
-    """A value in a queue, with its metadata (None when empty) and, when flow is tracked, the path it came by."""
+    """A queued value with its metadata (None if empty) and, with flow tracking, the path it took."""
 
     __slots__ = ("metadata", "trail", "value")
 
@@ -25,19 +27,20 @@ class Message:
 
 @dataclass(frozen=True)
 class EdgeStats:
-    """Counts of one edge: sent = received + queued + sum of dropped."""
+    """Message counts of one edge: sent = received + queued + sum of dropped."""
 
     edge: str
-    """`producer.output -> consumer.input`."""
+    """Name: `producer.output -> consumer.input`."""
     sent: int
     received: int
     queued: int
     dropped: dict[str, int]
-    """By reason: `drop_oldest`, `drop_new`, `closed` (the consumer was done)."""
+    """Dropped messages by reason: `drop_oldest`, `drop_new`, `closed` (the consumer had finished).
+    """
 
 
 class Edge:
-    """One producer, one consumer, one queue. Not locked: see `LockedEdge`."""
+    """Queue between one producer and one consumer. Not thread-safe (see `LockedEdge`)."""
 
     def __init__(self, name: str, capacity: int, policy: QueuePolicy) -> None:
         self.name = name
@@ -48,15 +51,15 @@ class Edge:
         self.received = 0
         self.dropped: dict[str, int] = {}
         self.ended = False
-        """The producer is done."""
+        """True once the producer has finished."""
         self.closed = False
-        """The consumer is done."""
+        """True once the consumer has finished."""
 
     def __len__(self) -> int:
         return len(self.queue)
 
     def push(self, message: Message) -> None:
-        """Append by policy. Raises QueueFull for a blocking edge without room."""
+        """Append a message according to the policy. Raises QueueFull if a blocking edge is full."""
         self.sent += 1
         if self.closed:
             self._drop("closed")
@@ -78,7 +81,7 @@ class Edge:
         queue.append(message)
 
     def pop(self) -> Message | None:
-        """Take the oldest message; None when empty."""
+        """Remove and return the oldest message; None if empty."""
         queue = self.queue
         if not queue:
             return None
@@ -86,7 +89,7 @@ class Edge:
         return queue.popleft()
 
     def close(self) -> None:
-        """The consumer is done: what is queued and what will come is dropped as `closed`."""
+        """Mark the consumer as finished; queued and later messages are dropped as `closed`."""
         self.closed = True
         if self.queue:
             self._drop("closed", len(self.queue))
@@ -96,12 +99,14 @@ class Edge:
         self.dropped[reason] = self.dropped.get(reason, 0) + count
 
     def stats(self) -> EdgeStats:
-        """The counts now; from any thread (then off by one while a message moves)."""
+        """Return the current counts. Thread-safe, but off by one while a message is being moved."""
         return EdgeStats(self.name, self.sent, self.received, len(self), self.dropped.copy())
 
 
 class LockedEdge(Edge):
-    """An edge between threads: moves under the scheduler's lock and wakes the operator on the other side."""
+    """Edge between threads. Works under the scheduler's lock and wakes the operator at the other
+    end.
+    """
 
     def __init__(self, name: str, capacity: int, policy: QueuePolicy, lock: Any) -> None:
         super().__init__(name, capacity, policy)
@@ -110,13 +115,13 @@ class LockedEdge(Edge):
         self.wake_consumer: Callable[[], None] = _nobody
 
     def push(self, message: Message) -> None:
-        """As Edge.push."""
+        """See `Edge.push`."""
         with self._lock:
             super().push(message)
             self.wake_consumer()
 
     def pop(self) -> Message | None:
-        """As Edge.pop."""
+        """See `Edge.pop`."""
         with self._lock:
             message = super().pop()
             self.wake_producer()
@@ -124,10 +129,11 @@ class LockedEdge(Edge):
 
 
 class CarriedEdge(LockedEdge):
-    """An edge whose messages another engine carries, between `sender.emit` and `receiver.receive` of one compute.
+    """Edge whose messages another engine transports, from `sender.emit` to `receiver.receive`.
 
-    The queue here mirrors the engine's, counts and applies the policy. When `drop_oldest` makes room, no further
-    message is sent: the one under way stands for what is then the oldest. So the engine's queue never overflows.
+    The queue mirrors the engine's queue, counts and applies the policy. When `drop_oldest` replaces
+    a message, nothing is sent: the message in flight represents the then oldest one. The engine's
+    queue therefore never overflows.
     """
 
     port = ""
@@ -136,7 +142,7 @@ class CarriedEdge(LockedEdge):
     receiver: Any = None
 
     def push(self, message: Message) -> None:
-        """As Edge.push."""
+        """See `Edge.push`."""
         with self._lock:
             length = len(self.queue)
             super().push(message)
@@ -145,7 +151,9 @@ class CarriedEdge(LockedEdge):
             self.sender.emit(message, self.port)
 
     def pop(self) -> Message | None:
-        """As Edge.pop. Raises EngineError when the engine delivers out of order."""
+        """Receive from the engine and return the oldest message. Raises EngineError for wrong
+        order.
+        """
         carried = self.receiver.receive(self.port)
         if carried is None:
             return None
@@ -156,4 +164,4 @@ class CarriedEdge(LockedEdge):
 
 
 def _nobody() -> None:
-    """No operator waits yet."""
+    """Placeholder until the scheduler sets the wake functions."""

@@ -1,4 +1,4 @@
-"""Loading the Holoscan SDK from pip, without LD_LIBRARY_PATH."""
+"""Import of the Holoscan SDK installed by pip, without LD_LIBRARY_PATH."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ _ADVICE = "install it with: pip install 'intrasplat[holoscan]'"
 
 
 def load_sdk() -> Any:
-    """The SDK's modules `core`, `schedulers` and `resources`. Raises EngineMissing, which says what is not there."""
+    """Return the SDK's modules `core`, `schedulers` and `resources`. Raises EngineMissing naming
+    the missing part.
+    """
     if importlib.util.find_spec("holoscan") is None:
         raise EngineMissing(f"the Holoscan SDK is not installed; {_ADVICE}")
     _preload_cudart()
     try:
         with warnings.catch_warnings():
-            # It asks for a 32 MB stack, which nothing here needs.
+            # The SDK warns about a stack below 32 MB, which is not needed here.
             warnings.filterwarnings("ignore", message="Current stack size", category=RuntimeWarning)
             core, schedulers, resources, logger = (
                 importlib.import_module(f"holoscan.{name}") for name in ("core", "schedulers", "resources", "logger")
@@ -39,9 +41,9 @@ def load_sdk() -> Any:
 
 
 def keep_signals() -> Callable[[], None]:
-    """Note the handlers of SIGINT and SIGTERM; the function returned puts them back, from any thread.
+    """Save the handlers of SIGINT and SIGTERM. Return a thread-safe function that restores them.
 
-    A run of the SDK installs its own and leaves them: from then on the process ignores SIGTERM.
+    A run of the SDK replaces the handlers permanently, after which the process ignores SIGTERM.
     """
     get, put = ctypes.pythonapi.PyOS_getsig, ctypes.pythonapi.PyOS_setsig
     get.restype = put.restype = ctypes.c_void_p
@@ -56,7 +58,7 @@ def keep_signals() -> Callable[[], None]:
 
 
 def _preload_cudart() -> None:
-    """Load the CUDA runtime for all libraries of the process; the SDK is linked against it even on the CPU."""
+    """Load the CUDA runtime globally; the SDK is linked against it even for CPU graphs."""
     try:
         ctypes.CDLL(_CUDART, ctypes.RTLD_GLOBAL)
         return

@@ -1,4 +1,4 @@
-"""What an operator declares in `setup`: ports, their conditions and queues, parameters."""
+"""Declarations of an operator in `setup`: ports with conditions and queues, and parameters."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from operators.errors import GraphInvalid
 
 
 class ConditionType(Enum):
-    """What a port asks of its queue before the operator computes."""
+    """Requirement of a port on its queue before the operator computes."""
 
     NONE = "none"
-    """Nothing: compute goes on with an empty input, or with a full output."""
+    """No requirement: the operator computes with an empty input or a full output."""
     MESSAGE_AVAILABLE = "message_available"
-    """An input has `min_size` messages (the default of inputs)."""
+    """The input has `min_size` messages (default of inputs)."""
     DOWNSTREAM_MESSAGE_AFFORDABLE = "downstream_message_affordable"
-    """Every blocking edge of an output has room for `min_size` messages (the default of outputs)."""
+    """Every blocking edge of the output has space for `min_size` messages (default of outputs)."""
 
 
 class QueuePolicy(Enum):
-    """What an edge does with a message when it is full."""
+    """Treatment of a message when an edge is full."""
 
     BLOCK = "block"
-    """Nothing is lost: upstream does not compute until there is room. Emitting more than fits raises QueueFull."""
+    """The producer does not compute until there is space. Emitting more raises QueueFull."""
     DROP_OLDEST = "drop_oldest"
-    """The newest wins: the oldest message gives way and is counted."""
+    """The oldest message is dropped and counted."""
     DROP_NEW = "drop_new"
-    """The message is not taken and is counted."""
-    # Holoscan's names for the same.
+    """The new message is dropped and counted."""
+    # Aliases of the Holoscan SDK.
     FAULT = "block"  # noqa: PIE796
     POP = "drop_oldest"  # noqa: PIE796
     REJECT = "drop_new"  # noqa: PIE796
 
 
 class ConnectorType(Enum):
-    """How an edge holds its messages; both are the same bounded queue."""
+    """Holoscan's names for queue types; both are the same bounded queue here."""
 
     DEFAULT = "default"
     DOUBLE_BUFFER = "double_buffer"
@@ -46,10 +46,12 @@ _Connector = ConnectorType
 
 
 class IOSpec:
-    """One port. `condition` and `connector` return the port, so that they chain."""
+    """One port. `condition` and `connector` return the port for chaining."""
 
     ANY_SIZE: ClassVar[int] = -1
-    """Size of an input that takes any number of connections; `receive` returns a tuple, one entry per connection."""
+    """Size of an input with any number of connections; `receive` returns a tuple with one entry per
+    connection.
+    """
     ConnectorType = ConnectorType
     QueuePolicy = QueuePolicy
 
@@ -61,12 +63,20 @@ class IOSpec:
         self.condition_type = (
             ConditionType.MESSAGE_AVAILABLE if is_input else ConditionType.DOWNSTREAM_MESSAGE_AFFORDABLE
         )
-        # Holoscan's default: a port of size n hands over n messages at once.
+        # Default of the Holoscan SDK: a port of size n delivers n messages at once.
         self.min_size = max(1, size) if is_input else 1
         self.capacity = max(1, size)
 
     def condition(self, kind: ConditionType, *, min_size: int = 1) -> IOSpec:
-        """Replace the port's condition."""
+        """Replace the port's condition.
+
+        Args:
+            kind: the condition; must suit the direction of the port.
+            min_size: number of required messages or spaces.
+
+        Raises:
+            GraphInvalid: unsuitable condition or invalid size.
+        """
         own = ConditionType.MESSAGE_AVAILABLE if self.is_input else ConditionType.DOWNSTREAM_MESSAGE_AFFORDABLE
         if kind not in (own, ConditionType.NONE):
             raise GraphInvalid(f"port {self.name!r}: condition {kind.name} does not fit, use {own.name} or NONE")
@@ -76,7 +86,16 @@ class IOSpec:
         return self
 
     def connector(self, kind: _Connector, *, capacity: int | None = None, policy: PolicyLike = None) -> IOSpec:
-        """Set the capacity and the policy of the edges into this input."""
+        """Set the queue of the edges into this input.
+
+        Args:
+            kind: ignored; for compatibility with Holoscan.
+            capacity: capacity in messages; None to keep it.
+            policy: policy of a full queue; None to keep it.
+
+        Raises:
+            GraphInvalid: the port is an output, or a value is invalid.
+        """
         if not self.is_input:
             raise GraphInvalid(f"port {self.name!r}: a queue belongs to the input it feeds, or to add_flow(capacity=)")
         if capacity is not None:
@@ -89,7 +108,7 @@ class IOSpec:
 
     @property
     def batched(self) -> bool:
-        """Whether `receive` returns a tuple."""
+        """True if `receive` returns a tuple."""
         return self.size != 1
 
 
@@ -99,11 +118,11 @@ class _Required:
 
 
 REQUIRED = _Required()
-"""Default of a parameter that has none."""
+"""Default of a required parameter."""
 
 
 class OperatorSpec:
-    """Collects what `setup` declares. Names are unique per direction."""
+    """Collects the declarations of `setup`. Names are unique per direction."""
 
     def __init__(self, owner: str = "operator") -> None:
         self.owner = owner
@@ -122,8 +141,13 @@ class OperatorSpec:
     ) -> IOSpec:
         """Declare an input.
 
-        `type` is the Python type (or union) it takes, checked against the output it is connected to when the graph
-        is built. An `optional` input may stay unconnected; `receive` then returns None.
+        Args:
+            name: unique name of the input.
+            size: number of messages per `receive`, or `IOSpec.ANY_SIZE`.
+            policy: policy of a full queue; None for `BLOCK`.
+            type: accepted type or union, checked against the connected output when the graph is
+                built.
+            optional: the input may stay unconnected; `receive` then returns None.
         """
         return self._add(
             self.inputs, name, IOSpec(name, is_input=True, size=size, policy=policy, type=type, optional=optional)
@@ -138,12 +162,18 @@ class OperatorSpec:
         type: Any = None,
         optional: bool = False,
     ) -> IOSpec:
-        """Declare an output. An `optional` output may stay unconnected; what is emitted there goes nowhere."""
+        """Declare an output. An `optional` output may stay unconnected; its messages are discarded."""
         port = IOSpec(name, is_input=False, size=size, policy=policy, type=type, optional=optional)
         return self._add(self.outputs, name, port)
 
     def param(self, name: str, default_value: Any = REQUIRED, **_described: Any) -> None:
-        """Declare a parameter; it becomes an attribute of the operator. Headline and description are for readers."""
+        """Declare a parameter, which becomes an attribute of the operator.
+
+        Args:
+            name: unique name of the parameter.
+            default_value: default; without one the parameter is required.
+            _described: headline and description for readers of the code; ignored.
+        """
         if name in self.params:
             raise GraphInvalid(f"{self.owner}: parameter {name!r} is declared twice")
         self.params[name] = default_value
@@ -156,7 +186,9 @@ class OperatorSpec:
 
 
 def queue_policy(policy: PolicyLike) -> QueuePolicy:
-    """The policy by member or value; None is BLOCK."""
+    """Return the policy for a member or value; None gives BLOCK. Raises GraphInvalid for unknown
+    values.
+    """
     if policy is None:
         return QueuePolicy.BLOCK
     try:

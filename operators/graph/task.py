@@ -1,4 +1,4 @@
-"""One operator of a running graph: what the schedulers of every engine poll and execute."""
+"""Execution state of one operator, used by the schedulers of all engines."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _READY, _WAIT, _NEVER = (READY, 0), (WAIT, 0), (NEVER, 0)
 
 
 class OperatorTask:
-    """An operator with its edges, its conditions and its state in this run."""
+    """An operator with its edges, conditions and counters in one run."""
 
     def __init__(self, operator: Operator, graph: Graph, tracker: FlowTracker | None) -> None:
         self.operator = operator
@@ -33,7 +33,7 @@ class OperatorTask:
         self.inputs: dict[str, list[Edge]] = {}
         self.outputs: dict[str, list[Edge]] = {}
         self.received: list[Message] = []
-        """Messages of the compute under way."""
+        """Messages received in the current compute."""
         self.computes = 0
         self.restarts = 0
         self.faults = 0
@@ -44,7 +44,7 @@ class OperatorTask:
         self._began_ns = 0
 
     def connect(self) -> None:
-        """Call once, when all edges are known."""
+        """Derive the gating edges from the ports; called once when all edges exist."""
         spec = self.operator.spec
         self.in_edges = [edge for edges in self.inputs.values() for edge in edges]
         self.out_edges = [edge for edges in self.outputs.values() for edge in edges]
@@ -65,29 +65,33 @@ class OperatorTask:
         self._durations = None if self.tracker is None else self.tracker.operator(self.name)
 
     def gates(self, edge: Edge) -> int:
-        """How many messages this input edge must hold before compute; 0 for any."""
+        """Return the number of messages that this input edge must hold before compute; 0 if it does
+        not gate.
+        """
         return next((need for _, gating, need in self._needs if gating is edge), 0)
 
     def leaves_room(self, edge: Edge) -> int:
-        """How many messages must fit into this output edge before compute; 0 for any."""
+        """Return the number of messages that must fit into this output edge before compute; 0 if it
+        does not gate.
+        """
         return next((edge.capacity - most for _, gating, most in self._rooms if gating is edge), 0)
 
     def has_messages(self) -> bool:
-        """Whether every input that gates has its messages."""
+        """Return True if every gating input has its messages."""
         for queue, _, need in self._needs:  # noqa: SIM110 - all() of a generator costs more than the rest of a poll
             if len(queue) < need:
                 return False
         return True
 
     def has_room(self) -> bool:
-        """Whether every output that gates has room."""
+        """Return True if every gating output has space."""
         for queue, edge, most in self._rooms:  # noqa: SIM110
             if len(queue) > most and not edge.closed:
                 return False
         return True
 
     def consent(self, now_ns: int) -> tuple[SchedulingStatus, int]:
-        """What the operator's own conditions say together; with WAIT_TIME, until when."""
+        """Return the combined status of the operator's conditions, with the due time for WAIT_TIME."""
         status, due_ns = READY, 0
         for condition in self.conditions:
             verdict, at_ns = condition.check(now_ns)
@@ -98,7 +102,7 @@ class OperatorTask:
         return status, due_ns
 
     def poll(self, now_ns: int) -> tuple[SchedulingStatus, int]:
-        """May the operator compute now? With WAIT_TIME, when."""
+        """Return the status of the operator, with the due time in nanoseconds for WAIT_TIME."""
         status, due_ns = self.consent(now_ns) if self.conditions else _READY
         if status is NEVER or self.exhausted():
             return _NEVER
@@ -107,14 +111,18 @@ class OperatorTask:
         return status, due_ns
 
     def exhausted(self) -> bool:
-        """Whether the operator has nothing more to do: it was stopped, its inputs have ended, or all consumers of its outputs have."""
+        """Return True if the operator can do no more.
+
+        It was stopped, its inputs have ended, or all consumers of its outputs have finished.
+        """
         if self.operator._finish:
             return True
         for queue, edge, need in self._needs:
             if edge.ended and len(queue) < need:
                 return True
         if self.in_edges and not self._needs:
-            # Inputs that do not gate: done when all of them have run dry.
+            # Without gating inputs the operator is finished when all inputs have ended and are
+            # empty.
             for edge in self.in_edges:
                 if not edge.ended or edge.queue:
                     break
@@ -126,7 +134,7 @@ class OperatorTask:
         return bool(self.out_edges)
 
     def finish(self) -> None:
-        """Be done: mark the edges as ended, so that the operators at their other ends see it."""
+        """Finish the operator and mark its edges, so that its neighbours notice."""
         self.finished = True
         for edge in self.out_edges:
             edge.ended = True
@@ -134,7 +142,7 @@ class OperatorTask:
             edge.close()
 
     def waits_for(self, now_ns: int) -> str:
-        """What keeps the operator from computing, for a message."""
+        """Return the operator's unmet conditions as text for an error message."""
         reasons = [
             f"condition {condition.name} ({status.name})"
             for condition in self.conditions
@@ -149,7 +157,10 @@ class OperatorTask:
         return " and ".join(reasons) or "nothing"
 
     def execute(self) -> None:
-        """One compute, with metadata, tracking and the fault policy. Lets only KeyboardInterrupt and its like out."""
+        """Run one compute with metadata, tracking and the fault policy.
+
+        Only KeyboardInterrupt and other non-Exception errors propagate.
+        """
         operator, context = self.operator, self.context
         operator.metadata = {}
         tracker = self.tracker
@@ -168,13 +179,13 @@ class OperatorTask:
         self.received.clear()
 
     def tick(self, now_ns: int) -> None:
-        """execute, and let the conditions know."""
+        """Run one compute and notify the conditions; `now_ns` is the time of the check."""
         self.execute()
         for condition in self.conditions:
             condition.on_execute(now_ns)
 
     def trail(self, tracker: FlowTracker) -> Trail:
-        """Where what is emitted now comes from."""
+        """Return the trail of messages emitted in the current compute."""
         if self._trail is None or self._trail_length != len(self.received):
             self._trail_length = len(self.received)
             if self.received:
@@ -192,14 +203,14 @@ class OperatorTask:
             self._answer(error, "start")
 
     def prepare_thread(self) -> None:
-        """Let the operator prepare the calling thread; what it raises fails the graph."""
+        """Prepare the calling thread for the operator; an exception fails the graph."""
         try:
             self.operator.prepare_thread()
-        except Exception as error:  # noqa: BLE001 - told to the thread that called run()
+        except Exception as error:  # noqa: BLE001 - reported to the thread that called run()
             self.graph.fail(OperatorFailed(self.name, "prepare_thread", error))
 
     def stop(self) -> None:
-        """Stop the operator if it is started; what it raises fails the graph."""
+        """Stop the operator if it is started; an exception fails the graph."""
         if not self.started:
             return
         self.started = False
@@ -209,7 +220,7 @@ class OperatorTask:
             self.graph.fail(OperatorFailed(self.name, "stop", error))
 
     def _answer(self, error: Exception, phase: str) -> None:
-        """Do what the fault policy says."""
+        """Apply the fault policy to an exception raised in `phase`."""
         self.faults += 1
         failure = OperatorFailed(self.name, phase, error, self._seq() if phase == "compute" else None)
         action = self.operator.fault_policy.action_after(self.restarts)
@@ -225,7 +236,9 @@ class OperatorTask:
                 self.start()
 
     def _seq(self) -> int | None:
-        """The frame under work: `seq` in the metadata, or an attribute of a received message."""
+        """Return the number of the frame in work, from the metadata or a received message; None if
+        unknown.
+        """
         found = [self.operator.metadata.get("seq")]
         found += [getattr(message.value, "seq", None) for message in self.received]
         return next((seq for seq in found if isinstance(seq, int)), None)

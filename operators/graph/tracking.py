@@ -1,7 +1,7 @@
-"""Flow tracking: how long messages take from root to leaf and operators to compute, readable while running.
+"""Flow tracking: latency from root to leaf and compute durations, readable during a run.
 
-Memory is bounded: durations go into histograms of fixed size, and there are at most as many as paths and operators.
-Each histogram has one writer (an operator computes in one thread at a time), so nothing is locked.
+Memory is bounded: durations are kept in histograms of fixed size, one per path and operator. Each
+histogram has one writer, because an operator computes in one thread at a time. No locks are needed.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from time import perf_counter_ns
 _SUB_BITS = 5
 _LONGEST_NS = (1 << 44) - 1  # 4.9 h
 _MAX_TRAILS = 64
-"""Paths followed per message: a chain of k diamonds has 2^k of them."""
+"""Maximum number of tracked paths per message; a chain of k diamonds has 2^k paths."""
 
 
 @dataclass(frozen=True)
 class DurationSummary:
-    """Percentiles in milliseconds, at most 3.2 % above the true ones; `max_ms` is exact."""
+    """Percentiles in milliseconds, at most 3.2 % above the true values; `max_ms` is exact."""
 
     count: int
     p50_ms: float
@@ -39,31 +39,42 @@ class Histogram:
         self._max_ns = self._sum_ns = 0
 
     def record(self, duration_ns: int) -> None:
-        """Count one duration; beyond 4.9 h it counts as 4.9 h."""
+        """Count one duration in nanoseconds; it is limited to 4.9 h."""
         if duration_ns > self._max_ns:
             self._max_ns = duration_ns
         self._sum_ns += max(duration_ns, 0)
         self._counts[_bucket(min(max(duration_ns, 0), _LONGEST_NS))] += 1
 
     def summary(self) -> DurationSummary:
-        """The percentiles so far; from any thread."""
+        """Return the percentiles so far. Thread-safe."""
         p50_ms, p95_ms, p99_ms = self.quantiles_ms((0.50, 0.95, 0.99))
         return DurationSummary(sum(self._counts), p50_ms, p95_ms, p99_ms, self._max_ns * 1e-6)
 
     @property
     def sum_ns(self) -> int:
-        """All durations together."""
+        """Sum of all durations in nanoseconds."""
         return self._sum_ns
 
     def between(self, bounds_ns: Sequence[int]) -> list[int]:
-        """How many durations lie up to each of these bounds (ascending) and above the one before it, and how many above the last; a bucket that a
-        bound cuts counts as below it. From any thread."""
+        """Return the number of durations between consecutive bounds. Thread-safe.
+
+        Args:
+            bounds_ns: ascending upper bounds in nanoseconds. A bucket that contains a bound counts
+                as below it.
+
+        Returns:
+            One count per bound, and the count above the last one.
+        """
         counts = self._counts.copy()
         ends = [0, *(_bucket(min(bound_ns, _LONGEST_NS)) + 1 for bound_ns in bounds_ns), len(counts)]
         return [sum(counts[begin:end]) for begin, end in itertools.pairwise(ends)]
 
     def quantiles_ms(self, fractions: Sequence[float]) -> list[float]:
-        """The durations that these shares (ascending, 0..1) of all do not exceed, in milliseconds; from any thread."""
+        """Return quantiles in milliseconds. Thread-safe.
+
+        Args:
+            fractions: ascending quantile levels, 0..1.
+        """
         max_ns = self._max_ns
         counts = self._counts.copy()
         total = sum(counts)
@@ -77,7 +88,9 @@ class Histogram:
 
 
 def _rank(fraction: float, total: int) -> int:
-    """How many of `total` values a share of them is, rounded up; 0.07 of 100 is 7, though its product in floats is a little more."""
+    """Return the rank of a quantile among `total` values, rounded up with a tolerance for float
+    errors.
+    """
     return math.ceil(fraction * total - 1e-9 * total)
 
 
@@ -92,7 +105,7 @@ def _bucket_end(bucket: int) -> int:
 
 
 class PathNode:
-    """One operator on a path from a root; the nodes of all paths form a tree, so that a path is one reference."""
+    """An operator on a path from a root. The nodes form a tree, so that a path is one reference."""
 
     __slots__ = ("_children", "latency", "names")
 
@@ -102,7 +115,9 @@ class PathNode:
         self._children: dict[str, PathNode] = {}
 
     def child(self, name: str) -> PathNode | None:
-        """The path one operator longer; None in a loop, which is not followed round."""
+        """Return the path extended by one operator; None if the operator is already on it (a
+        cycle).
+        """
         node = self._children.get(name)
         if node is None and name not in self.names:
             node = self._children[name] = PathNode((*self.names, name))
@@ -110,14 +125,15 @@ class PathNode:
 
 
 Trail = tuple[tuple[PathNode, int], ...]
-"""The paths by which a message has come, each with the time at which its root began to compute."""
+"""Paths that a message took, each with the start time of its root's compute in nanoseconds."""
 
 
 class FlowTracker:
-    """Latency of every root→leaf path and durations of every operator's compute.
+    """Latencies of all root-to-leaf paths and compute durations of all operators.
 
-    A path begins when a compute that received nothing emits, and ends when an operator without connected outputs
-    returns from the compute that received the message. Times are of the machine's clock, also in replay.
+    A path begins when a compute without received messages emits. It ends when an operator without
+    connected outputs returns from the compute that received the message. Times are real times of
+    the machine's clock, also in a replay.
     """
 
     def __init__(self) -> None:
@@ -126,42 +142,46 @@ class FlowTracker:
         self._computes: dict[str, Histogram] = {}
 
     def reset(self) -> None:
-        """Forget everything; run() begins so."""
+        """Clear all data; called at the start of a run."""
         self._roots, self._paths, self._computes = {}, {}, {}
 
     def paths(self) -> dict[str, Histogram]:
-        """Per path, its latencies; from any thread."""
+        """Return the latency histogram of each path. Thread-safe."""
         return self._paths.copy()
 
     def operators(self) -> dict[str, Histogram]:
-        """Per operator, the durations of its computes; from any thread."""
+        """Return the histogram of compute durations of each operator. Thread-safe."""
         return self._computes.copy()
 
     def latency(self) -> dict[str, DurationSummary]:
-        """Per path, named `source,depth,display`; from any thread."""
+        """Return the latency by path, for example `source,depth,display`. Thread-safe."""
         return {path: histogram.summary() for path, histogram in self._paths.copy().items()}
 
     def latency_quantiles_ms(self, fractions: Sequence[float]) -> dict[str, list[float]]:
-        """Per path, the latencies at these shares (ascending, 0..1): the distribution as a curve; from any thread."""
+        """Return the latency quantiles in milliseconds by path, at ascending levels 0..1.
+        Thread-safe.
+        """
         return {path: histogram.quantiles_ms(fractions) for path, histogram in self._paths.copy().items()}
 
     def compute(self) -> dict[str, DurationSummary]:
-        """Per operator, by name; from any thread."""
+        """Return the compute durations by operator. Thread-safe."""
         return {name: histogram.summary() for name, histogram in self._computes.copy().items()}
 
     def operator(self, name: str) -> Histogram:
-        """Where an operator's compute durations go."""
+        """Return the histogram for an operator's compute durations, created on first use."""
         return self._computes.setdefault(name, Histogram())
 
     def begin(self, operator: str, began_ns: int) -> Trail:
-        """The trail of what a root emits."""
+        """Return the trail of a message emitted by a root."""
         root = self._roots.get(operator)
         if root is None:
             root = self._roots[operator] = PathNode((operator,))
         return ((root, began_ns),)
 
     def extend(self, operator: str, trails: list[Trail]) -> Trail:
-        """The trail of what an operator emits after it received messages with these trails; the oldest per path."""
+        """Return the trail of a message emitted after receiving messages with `trails`; keeps the
+        oldest time per path.
+        """
         merged: dict[PathNode, int] = {}
         for trail in trails:
             for node, began_ns in trail:
@@ -171,7 +191,7 @@ class FlowTracker:
         return tuple(merged.items())
 
     def finish(self, operator: str, trails: list[Trail]) -> None:
-        """A leaf has computed: its messages have arrived."""
+        """Record the latencies of messages that a leaf has processed."""
         now_ns = perf_counter_ns()
         for trail in trails:
             for node, began_ns in trail:
