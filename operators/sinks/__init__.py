@@ -1,1 +1,1 @@
-"""Where frames end: videos, pictures, functions."""
+"""Sinks of frames: videos, images, recordings and callbacks."""

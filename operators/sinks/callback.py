@@ -1,4 +1,4 @@
-"""A function as the end of a branch."""
+"""Sink that calls a function."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from operators.graph import Operator, OperatorSpec
 
 
 class CallbackSinkOp(Operator):
-    """Calls a function with each message, on the graph's thread; what it raises stops the graph.
+    """Calls a function with each message, in the operator's thread. Its exceptions fail the
+    operator.
 
     Inputs:
-        message: anything.
+        message: any value.
 
     Params:
-        callback: takes the message.
+        callback: called with the message.
     """
 
     def __init__(self, fragment: Any, *args: Any, callback: Callable[[Any], None], **kwargs: Any) -> None:

@@ -1,4 +1,4 @@
-"""Pictures on disk, lossless."""
+"""Lossless images on disk."""
 
 from __future__ import annotations
 
@@ -15,9 +15,16 @@ from operators.storage import StorageReserve, write_whole
 
 
 def write_png(path: Path, image: NDArray[Any], reserve: StorageReserve | None = None) -> None:
-    """Write an RGB [H, W, 3] or a one-channel image [H, W], uint8 or uint16, as PNG, whole or not at all.
+    """Write a PNG file atomically.
 
-    Raises StorageFull or OutputError where it cannot be written, InvalidInput for an array that PNG cannot hold.
+    Args:
+        path: the file.
+        image: uint8 or uint16, RGB [H, W, 3] or one channel [H, W].
+        reserve: free disk space to be kept; None for no check.
+
+    Raises:
+        InvalidInput: the array has another shape or type.
+        StorageFull, OutputError: the file cannot be written.
     """
     pictured = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     if not pictured or image.dtype not in (np.uint8, np.uint16):

@@ -1,4 +1,4 @@
-"""A few frames kept for the report, evenly spread over a stream whose length is not known."""
+"""Selection of key frames for the report, evenly spread over a stream of unknown length."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from operators.sinks.registry import SinkOptions
 
 @dataclass(frozen=True)
 class KeyframesResult:
-    """A few frames of a run, for people."""
+    """Key frames of a run."""
 
     keyframes: tuple[ScoredFrame, ...]
-    """In order; `right_image` and `depth` of their raw frames are left out."""
+    """Frames in temporal order, without `right_image` and `depth` of the raw frames."""
     worst_seq: int | None
-    """The frame with the lowest tissue PSNR."""
+    """Sequence number of the frame with the lowest tissue PSNR."""
 
 
 class KeyframesOp(Operator):
-    """Keeps at most `2 * count` frames: every k-th, with k doubled whenever they become too many; and the worst one.
+    """Keeps every k-th frame, at most `2 * count`, doubling k when full, and also the worst frame.
 
-    So memory is bounded on a stream without end, and a stream that is cut short still has its frames evenly spread.
+    Memory is bounded for an endless stream, and the frames are evenly spread whenever the stream
+    ends.
 
     Inputs:
         scored: `ScoredFrame`.
 
     Params:
-        count: how many frames `keyframes` returns at most, the worst one among them.
+        count: maximum number of frames in `keyframes`, including the worst one.
     """
 
     count: int
@@ -72,7 +73,7 @@ class KeyframesOp(Operator):
 
     @property
     def keyframes(self) -> list[ScoredFrame]:
-        """At most `count` frames in order: the first, the last, the worst and some between."""
+        """At most `count` frames in order: the first, the last, the worst and some in between."""
         if self._last is None:
             return []
         chosen = {f.rendered.frame.seq: f for f in (self._kept[0], self._last, self._worst) if f is not None}
@@ -85,16 +86,20 @@ class KeyframesOp(Operator):
 
     @property
     def worst_seq(self) -> int | None:
-        """The frame with the lowest tissue PSNR."""
+        """Sequence number of the frame with the lowest tissue PSNR; None before the first scored
+        frame.
+        """
         return None if self._worst is None else self._worst.rendered.frame.seq
 
 
 def _without_inputs(scored: ScoredFrame) -> ScoredFrame:
-    """The same without those planes of the raw frame that no picture of the report shows: they are half of its memory."""
+    """Return the frame without raw planes that the report does not show, which are half of its
+    memory.
+    """
     frame = scored.rendered.frame.with_fields(right_image=None, depth=None)
     return replace(scored, rendered=replace(scored.rendered, frame=frame))
 
 
 def keyframes_sink(fragment: Any, name: str, options: SinkOptions) -> KeyframesOp:
-    """The pictures of the run's report."""
+    """Create the key frame sink for the run's report."""
     return KeyframesOp(fragment, name=name)

@@ -1,4 +1,4 @@
-"""Pictures for people: a frame beside its reconstruction, the error between them, depth as colour."""
+"""Pictures for reports: raw frame and reconstruction side by side, error map and depth map."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from operators.messages import RenderedFrame
 from operators.remembered import marked
 
 MINIMUM_PANE_WIDTH_PX = 320
-"""A smaller recording is enlarged by a whole factor, so that its caption fits."""
+"""Minimum width of a pane. Smaller pictures are enlarged by an integer factor to fit the caption.
+"""
 CAPTION_HEIGHT_PX = 26
 ERROR_FULL_SCALE = 32
-"""Mean absolute difference of RGB, of 255, that is drawn at the bright end of the error colours."""
+"""Mean absolute RGB difference (0..255) at the bright end of the error colours."""
 
 _BACKGROUND = (17, 20, 24)
 _TEXT = (232, 236, 240)
@@ -21,7 +22,16 @@ _HELD_OUT = (255, 196, 87)
 
 
 def fitted(picture: NDArray[np.uint8], height_px: int, width_px: int) -> NDArray[np.uint8]:
-    """The picture [H, W, 3] at another size, as large as it goes without being stretched, on the background's colour."""
+    """Resize a picture without distortion to fit into a frame of background colour.
+
+    Args:
+        picture: uint8 RGB [h, w, 3].
+        height_px: height of the result.
+        width_px: width of the result.
+
+    Returns:
+        uint8 RGB [height_px, width_px, 3].
+    """
     factor = min(height_px / picture.shape[0], width_px / picture.shape[1])
     height, width = (max(1, round(side * factor)) for side in picture.shape[:2])
     canvas = np.empty((height_px, width_px, 3), np.uint8)
@@ -33,13 +43,21 @@ def fitted(picture: NDArray[np.uint8], height_px: int, width_px: int) -> NDArray
 
 
 def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """Raw | reconstruction, RGB uint8, with frame number, time and model version in a caption above, never on the tissue; tissue that the
-    frame does not show, behind a tool say, is marked as remembered."""
+    """Draw raw frame and reconstruction side by side, with remembered tissue marked.
+
+    The caption above the pictures has frame number, time and model version.
+
+    Args:
+        rendered: the frame and its reconstruction.
+
+    Returns:
+        uint8 RGB [H, W, 3].
+    """
     frame = rendered.frame
     zoom = -(-MINIMUM_PANE_WIDTH_PX // frame.width_px) if frame.width_px < MINIMUM_PANE_WIDTH_PX else 1
     middle = zoom * frame.width_px
     canvas = np.empty((CAPTION_HEIGHT_PX + zoom * frame.height_px, 2 * middle, 3), np.uint8)
-    # OpenCV fills much faster than NumPy repeats a colour.
+    # OpenCV fills faster than NumPy broadcasts a colour.
     cv2.rectangle(canvas, (0, 0), (2 * middle, CAPTION_HEIGHT_PX - 1), _BACKGROUND, cv2.FILLED)
     for pane, image in (
         (canvas[CAPTION_HEIGHT_PX:, :middle], frame.image),
@@ -60,7 +78,10 @@ def _caption(canvas: NDArray[np.uint8], x: int, text: str, colour: tuple[int, in
 
 
 def error_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """Absolute difference to the raw frame as colour (dark = equal), RGB uint8 [H, W, 3]; tool pixels, which do not count, are grey."""
+    """Draw the absolute difference to the raw frame in colours (dark = equal), uint8 RGB [H, W, 3].
+
+    Tool pixels, which are not scored, are grey.
+    """
     difference = np.abs(rendered.image.astype(np.int16) - rendered.frame.image).mean(axis=2)
     level = np.clip(difference * (255 / ERROR_FULL_SCALE), 0, 255).astype(np.uint8)
     colours = _coloured(level, cv2.COLORMAP_INFERNO)
@@ -70,13 +91,17 @@ def error_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
 
 
 def depth_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """Depth as colour (bright = near) between its 2nd and 98th percentile, RGB uint8 [H, W, 3]; unknown is grey."""
+    """Draw depth in colours (bright = near) from its 2nd to its 98th percentile, uint8 RGB [H, W,
+    3].
+
+    Unknown depth is grey.
+    """
     depth = rendered.depth
     known = (depth > 0) & np.isfinite(depth) & (rendered.alpha > 0.5)
     colours = np.full((*depth.shape, 3), (70, 74, 80), np.uint8)
     if known.any():
         near, far = np.percentile(depth[known], (2, 98))
-        # A flat scene has no range of its own: without this floor its rounding noise would be drawn as relief.
+        # Minimum range, so that rounding noise of a flat scene is not drawn as relief.
         span = max(float(far - near), 1e-3 * float(far))
         level = np.clip(0.5 + ((near + far) / 2 - np.where(known, depth, far)) / span, 0, 1)
         colours[known] = _coloured((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[known]
@@ -84,7 +109,7 @@ def depth_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
 
 
 def depth_range(rendered: RenderedFrame) -> tuple[float, float] | None:
-    """The depths that `depth_map` draws brightest and darkest; None where nothing is known."""
+    """Return the depths at the bright and dark end of `depth_map`; None if no depth is known."""
     known = rendered.depth[(rendered.depth > 0) & np.isfinite(rendered.depth) & (rendered.alpha > 0.5)]
     if known.size == 0:
         return None

@@ -1,4 +1,4 @@
-"""What a recording of a session has become, and what of it a reader of the results must know."""
+"""State of a session recording, and its notes for the report."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from operators.storage import mebibytes
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording has become so far."""
+    """State of a session recording."""
 
     folder: Path
     frames: int = 0
-    """Frames that came in and were written."""
+    """Number of written input frames."""
     shown: int = 0
-    """Shown pictures that were written."""
+    """Number of written displayed pictures."""
     lost: Mapping[str, int] | None = None
-    """What was not written, by kind and reason: `frame: the disk is too slow`."""
+    """Items that were not written, by kind and reason, for example `frame: the disk is too slow`.
+    """
     bytes: int = 0
-    """What it takes on the disk."""
+    """Size on disk in bytes."""
     deleted_segments: int = 0
-    """Older segments that were removed to keep within the bounds."""
+    """Number of older segments deleted to stay within the size and duration limits."""
     deleted_sessions: int = 0
-    """Earlier sessions that were removed for the same reason."""
+    """Number of earlier sessions deleted for the same reason."""
     ended: str | None = None
-    """Why it ended before the session did; None: it did not."""
+    """Reason for an early end of the recording; None if there was none."""
 
 
 def stated(recorded: Recorded) -> list[str]:
-    """What a reader of the results must know about a recording."""
+    """Return the notes on a recording for the report."""
     said = [
         f"{count} times the recording in {recorded.folder} lost something ({what})"
         for what, count in sorted((recorded.lost or {}).items())

@@ -1,9 +1,10 @@
-"""The operators that record a session: what came in, what training was given of it, and what was shown. `SessionRecorder` writes, in a
-thread of its own.
+"""Operators that pass frames, analysis results and displayed pictures to a `SessionRecorder`.
 
-    source → out_of_body → recorded_frames → analysis … → recorded_preparation → reconstruct → … → display → recorded_pictures
+    source → out_of_body → recorded_frames → analysis … → recorded_preparation → reconstruct
+                                               … → display → recorded_pictures
 
-`recorded_frames` stands behind the out-of-body gate, so that nothing that the gate holds back is written.
+The recorder writes in its own thread. `recorded_frames` follows the out-of-body gate, so that
+withheld pictures are never written.
 """
 
 from __future__ import annotations
@@ -23,22 +24,23 @@ from operators.storage import mebibytes
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """What was recorded of a session."""
+    """Recording of a run."""
 
     recorded: Recorded
 
 
 class RecordFramesOp(Operator):
-    """Hands each frame to the recorder and passes it on as it is; never waits. Opens the recorder, and closes it when the graph stops.
+    """Passes each frame unchanged and queues it for recording without blocking. Opens and closes
+    the recorder.
 
     Inputs:
-        frame: `Frame`, behind the out-of-body gate.
+        frame: `Frame`, after the out-of-body gate.
 
     Outputs:
-        frame: the same.
+        frame: the same `Frame`.
 
     Params:
-        recorder: begun by `start()`, finished by `stop()`.
+        recorder: opened by `start()`, closed by `stop()`.
     """
 
     def __init__(self, fragment: Any, *args: Any, recorder: SessionRecorder, **kwargs: Any) -> None:
@@ -65,20 +67,21 @@ class RecordFramesOp(Operator):
         recorded = self.recorder.recorded
         outcome.add(RecordingResult(recorded))
         if recorded.frames:
-            # As a note, and not as an output: it lies outside of what the run publishes, and grows there while the run goes on.
+            # A note rather than an output, because the recording is outside of the published
+            # results and grows during the run.
             outcome.note(f"{recorded.frames} frames were recorded in {recorded.folder} ({mebibytes(recorded.bytes)})")
         for sentence in stated(recorded):
             outcome.note(sentence)
 
 
 class RecordPreparationOp(Operator):
-    """Hands each frame to the recorder as training is about to get it, and passes it on as it is; never waits.
+    """Passes each prepared frame unchanged and queues it for recording without blocking.
 
     Inputs:
-        frame: `Frame`, behind everything that adds to it.
+        frame: `Frame`, after the complete analysis.
 
     Outputs:
-        frame: the same.
+        frame: the same `Frame`.
 
     Params:
         recorder: opened by `RecordFramesOp`.
@@ -99,7 +102,7 @@ class RecordPreparationOp(Operator):
 
 
 class RecordPicturesOp(Operator):
-    """Hands each shown picture to the recorder; never waits.
+    """Queues each displayed picture for recording without blocking.
 
     Inputs:
         shown: `ShownPicture`.

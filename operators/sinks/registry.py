@@ -1,4 +1,4 @@
-"""Sinks by name: where a run's frames may go besides its figures."""
+"""Registry of sinks for the frames of a run."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ from operators.storage import StorageReserve
 
 @dataclass(frozen=True)
 class SinkOptions:
-    """What a sink may need to know about the run."""
+    """Parameters of the run for creating a sink."""
 
     out: Path
-    """The run's output folder."""
+    """Output folder of the run."""
     source: SourceDescription
     reserve: StorageReserve
-    """Room that must stay free on the disk."""
+    """Free disk space to be kept."""
 
 
 SinkFactory = Callable[[Any, str, SinkOptions], Operator]
-"""From the fragment, the operator's name and the options to an operator with one input, which takes `RenderedFrame` or `ScoredFrame`."""
+"""Creates a sink from the fragment, the operator's name and the options. Its input takes
+`RenderedFrame` or `ScoredFrame`.
+"""
 
 SINKS: Registry[SinkFactory] = Registry(
     "sink",
@@ -40,7 +42,9 @@ SINKS: Registry[SinkFactory] = Registry(
 
 
 def input_of(sink: Operator) -> tuple[str, type]:
-    """The name of a sink's input and what it takes. Raises InvalidInput for an operator that is no such sink."""
+    """Return name and type of a sink's input. Raises InvalidInput if the operator is not a valid
+    sink.
+    """
     ports = [(port.name, port.type) for port in sink.spec.inputs.values()]
     if len(ports) != 1 or ports[0][1] not in (RenderedFrame, ScoredFrame):
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""Records a session beside the graph: a thread of its own writes, and whoever hands something over never waits."""
+"""Recorder of a session, which writes in a background thread so that producers never block."""
 
 from __future__ import annotations
 
@@ -26,17 +26,19 @@ from operators.sinks.recorded import Recorded
 from operators.storage import StorageReserve, storage_errors
 
 QUEUE_BYTES = 256 * 2**20
-"""Pictures that may wait to be written: about three seconds of 640x512 at 30 frames/s."""
+"""Capacity of the queue in bytes of pictures: about three seconds of 640x512 at 30 frames/s."""
 SHOWN_SHARE = 0.5
-"""When the queue is so full, shown pictures are lost: they can be computed again, what came in cannot."""
+"""Fill level of the queue at which displayed pictures are dropped. They can be recomputed, input
+frames cannot.
+"""
 MOST_LINES = 100_000
-"""Lines without pictures that may wait; a disk that takes none of them for so long is given up."""
+"""Maximum number of queued items. If it is reached, the disk is considered unresponsive."""
 MOST_ARRIVED = 64
-"""Frames that came in and may still be prepared for training."""
+"""Maximum number of input frames awaiting their preparation for training."""
 CLOSE_S = 10.0
-"""How long `close` waits while nothing more of what is in the queue is written."""
+"""Time in seconds without progress after which `close` stops waiting."""
 MOST_CLOSE_S = 60.0
-"""How long it waits at most."""
+"""Maximum waiting time of `close`, in seconds."""
 _SLOW = "writing is too slow"
 _UNFIT = "no recording can hold it"
 What = Literal["frame", "prepared", "shown", "depth"]
@@ -44,29 +46,33 @@ What = Literal["frame", "prepared", "shown", "depth"]
 
 @dataclass(frozen=True)
 class _Part:
-    """Something to write."""
+    """An item in the queue."""
 
     write: Callable[[SessionWriter], None]
     what: What | None = None
-    """None: a line without pictures."""
+    """Kind of picture data; None for a line without pictures."""
     seq: int = 0
     bytes: int = 0
-    """Of its pictures."""
+    """Size of the pictures in bytes."""
     share: float = 1.0
-    """Share of the queue beyond which it is lost."""
+    """Fill level of the queue above which the item is dropped."""
 
     def lost(self, why: str) -> LostLine | None:
-        """The line that says so; None where there is nothing to say."""
+        """Return the schedule line that records the loss; None for a line without pictures or an
+        invalid number.
+        """
         if self.what is None or not 0 <= self.seq <= MOST_NS:
             return None
         return LostLine(seq=self.seq, what=self.what, why=why)
 
 
 class SessionRecorder:
-    """Takes frames, schedule lines and shown pictures from any thread, in the order in which they are to be read.
+    """Records frames, schedule lines and displayed pictures, from any thread, in the order of the
+    calls.
 
-    `open` first, `close` at the end. A disk that is full or does not answer ends the recording, never the session: `recorded.ended` says why.
-    What raises otherwise is a bug and is raised by `close`.
+    Call `open` first and `close` at the end. A full or unresponsive disk ends the recording but not
+    the session; `recorded.ended` has the reason. Any other exception in the thread is raised by
+    `close`.
     """
 
     def __init__(
@@ -78,7 +84,15 @@ class SessionRecorder:
         reserve: StorageReserve | None = None,
         queue_bytes: int = QUEUE_BYTES,
     ) -> None:
-        """folder: of the recording alone; made by `open`. reserve: room that must stay free on the disk."""
+        """Set the parameters without touching the disk.
+
+        Args:
+            folder: folder for this recording alone; created by `open`.
+            info: description of the session.
+            options: limits and format of the recording.
+            reserve: free disk space to be kept; None for no check.
+            queue_bytes: capacity of the queue, in bytes of pictures.
+        """
         self.folder, self.info, self.options = folder, info, options or WriterOptions()
         self._reserve = reserve or StorageReserve(folder, lambda: 0)
         self._queue_bytes = queue_bytes
@@ -93,11 +107,16 @@ class SessionRecorder:
         self._failure: BaseException | None = None
         self._bytes = 0
         self._deleted = 0, 0
-        """Segments and earlier sessions."""
+        """Numbers of deleted segments and of deleted earlier sessions."""
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Begin the recording. Raises OutputError where the folder does not take it, or holds one already; it is then left as it was."""
+        """Create the folder and start the thread.
+
+        Raises:
+            OutputError: the folder cannot be used or already holds a recording; it is left
+                unchanged.
+        """
         if (self.folder / SESSION_FILE).exists():
             raise OutputError(f"{self.folder} already holds a recording; choose another folder")
         made = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
@@ -114,7 +133,7 @@ class SessionRecorder:
         self._thread.start()
 
     def frame(self, frame: Frame) -> None:
-        """A frame that came in."""
+        """Queue an input frame."""
         part = _Part(lambda writer: writer.frame(frame), "frame", frame.seq, _bytes(frame))
         with self._changed:
             if self._put(part):
@@ -123,12 +142,12 @@ class SessionRecorder:
                     self._arrived.popitem(last=False)
 
     def prepared(self, frame: Frame) -> None:
-        """The same frame as it is given to training. Frames before it are not awaited any more."""
+        """Queue a frame with its analysis results, and stop awaiting those of earlier frames."""
         with self._changed:
             arrived = self._arrived.get(frame.seq)
             while self._arrived and next(iter(self._arrived)) <= frame.seq:
                 self._arrived.popitem(last=False)
-            # Without `arrived` it is lost, and never written.
+            # Without `arrived` the item is counted as lost and never written.
             part = _Part(
                 lambda writer: writer.prepared(frame, arrived or frame), "prepared", frame.seq, _bytes(frame, arrived)
             )
@@ -138,25 +157,25 @@ class SessionRecorder:
                 self._put(part)
 
     def line(self, line: ScheduleLine) -> None:
-        """What was trained."""
+        """Queue a schedule line."""
         with self._changed:
             self._put(_Part(lambda writer: writer.line(line)))
 
     def depth(self, frame: Frame) -> None:
-        """A frame that was trained on before, with the depth that training was given of it now: in its place among the lines of what was trained."""
+        """Queue the late depth of an earlier frame, in its position among the schedule lines."""
         size = sum(plane.nbytes for plane in (frame.depth, frame.depth_confidence) if plane is not None)
         with self._changed:
             self._put(_Part(lambda writer: writer.late_depth(frame), "depth", frame.seq, size))
 
     def shown(self, shown: Shown) -> None:
-        """A picture that was shown."""
+        """Queue a displayed picture."""
         size = shown.rendered.nbytes if shown.new else 0
         with self._changed:
             self._put(_Part(lambda writer: writer.shown(shown), "shown", shown.frame.seq, size, SHOWN_SHARE))
 
     @property
     def recorded(self) -> Recorded:
-        """What the recording has become so far; from any thread."""
+        """Current state of the recording. Thread-safe."""
         with self._changed:
             return Recorded(
                 self.folder, self._written["frame"], self._written["shown"], dict(self._lost), self._bytes, *self._deleted,
@@ -164,9 +183,13 @@ class SessionRecorder:
             )  # fmt: skip
 
     def close(self, why: str = "the session ended") -> None:
-        """Write what is in the queue and finish the files; without effect when it is not open.
+        """Write the queue and finish the files. No effect if the recorder is not open.
 
-        Waits while it is being written, but at most `MOST_CLOSE_S`. Raises what went wrong in the thread, unless it was the disk.
+        Waits at most `MOST_CLOSE_S` seconds. Raises the exception of the thread unless the disk
+        caused it.
+
+        Args:
+            why: reason for the end, stored in the recording.
         """
         thread, self._thread = self._thread, None
         if thread is None:
@@ -189,7 +212,7 @@ class SessionRecorder:
             raise failure
 
     def _put(self, part: _Part) -> bool:
-        """With the lock held: hand something to the thread, if there is room; False where it is lost."""
+        """Queue an item. Return False if it is dropped. Requires the lock."""
         if self._ended is not None or self._closing:
             self._lost[f"{part.what or 'line'}: the recording has ended"] += 1
             return False
@@ -205,21 +228,21 @@ class SessionRecorder:
         return True
 
     def _lose(self, part: _Part, why: str) -> None:
-        """With the lock held: count what is lost, and have it written that it is."""
+        """Count a dropped item and queue a line that records the loss. Requires the lock."""
         self._lost[f"{part.what}: {why}"] += 1
         line = part.lost(why)
         if line is not None:
             self._put(_Part(lambda writer: writer.line(line)))
 
     def _end(self, why: str) -> None:
-        """With the lock held: nothing more is recorded."""
+        """End the recording and clear the queue. Requires the lock."""
         self._ended = self._ended or why
         self._waiting.clear()
         self._waiting_bytes = 0
         self._changed.notify_all()
 
     def _run(self, writer: SessionWriter) -> None:
-        """The life of the thread."""
+        """Main function of the thread."""
         step_back()
         try:
             with storage_errors(self.folder):
@@ -228,7 +251,7 @@ class SessionRecorder:
                 writer.close(self._why)
         except OutputError as error:
             self._give_up(writer, str(error))
-        except av.FFmpegError as error:  # those that are no OSError
+        except av.FFmpegError as error:  # those that are not an OSError
             self._give_up(writer, f"{self.folder}: the recording cannot be written ({error}); check its disk")
         except BaseException as error:  # noqa: BLE001 - carried to the thread that closes
             self._give_up(writer, f"the recording failed: {type(error).__name__}: {error}")
@@ -245,7 +268,7 @@ class SessionRecorder:
         try:
             part.write(writer)
         except (InvalidInput, ValidationError) as error:
-            # A frame that no recording can hold, such as one whose pose is NaN.
+            # A frame that the format cannot store, for example with NaN in its pose.
             wrong = " ".join(str(error).split())[:200]
         if wrong is not None and (line := part.lost(wrong)) is not None:
             writer.line(line)
@@ -259,7 +282,7 @@ class SessionRecorder:
             if wrong is None:
                 self._written[what] += 1
             else:
-                self._lost[f"{what}: {_UNFIT}"] += 1  # the line says why, which differs from frame to frame
+                self._lost[f"{what}: {_UNFIT}"] += 1  # the line has the reason, which differs between frames
 
     def _give_up(self, writer: SessionWriter, why: str) -> None:
         with self._changed:
@@ -268,7 +291,9 @@ class SessionRecorder:
 
 
 def _remove(made: Sequence[Path]) -> None:
-    """Remove folders that were made for a recording that did not begin, the recording's own first; those that hold something else stay."""
+    """Remove the folders created for a recording that failed to start. Parents that are not empty
+    are kept.
+    """
     for folder in made:
         if folder == made[0]:
             shutil.rmtree(folder, ignore_errors=True)
@@ -277,7 +302,7 @@ def _remove(made: Sequence[Path]) -> None:
 
 
 def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
-    """Of the frame's pictures, but for those that wait already as those of `arrived`."""
+    """Return the size of the frame's pictures in bytes, without those shared with `arrived`."""
     planes = ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
     mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
     others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)

@@ -1,4 +1,4 @@
-"""The video of a run: every frame beside its reconstruction."""
+"""Video of a run with raw frame and reconstruction side by side."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ VIDEO_FILE = "reconstruction.mp4"
 
 @dataclass(frozen=True)
 class DisplayResult:
-    """What a run has shown."""
+    """Summary of the displayed frames of a run."""
 
     frames: int
-    """How many frames were displayed."""
+    """Number of displayed frames."""
 
 
 class VideoSinkOp(Operator):
-    """Writes raw | reconstruction side by side, with frame number and model version, to an MP4.
+    """Writes raw frame and reconstruction side by side, with a caption, to an MP4 file.
 
     Inputs:
         rendered: `RenderedFrame`.
 
     Params:
-        path: the file; it is finished when the graph stops, for whatever reason.
+        path: the file; it is finished when the graph stops for any reason.
         fps: frames per second of the video.
-        reserve: room that must stay free on the disk.
+        reserve: free disk space to be kept.
     """
 
     def __init__(
@@ -63,11 +63,11 @@ class VideoSinkOp(Operator):
         rendered: RenderedFrame = op_input.receive("rendered")
         picture = side_by_side(rendered)
         if self._video is None:
-            # The size is known with the first frame only.
+            # The size is known only with the first frame.
             self._size = picture.shape[:2]
             self._video = VideoFile(self.path, picture.shape[1], picture.shape[0], self.fps, self.reserve)
         if picture.shape[:2] != self._size:
-            # A stream may change its size, a video cannot.
+            # The size of a stream may change, that of a video cannot.
             picture = fitted(picture, *self._size)
         self._video.write(picture, rendered.frame.time_s)
         self.displayed += 1
@@ -80,7 +80,7 @@ class VideoSinkOp(Operator):
 
 
 def video_sink(fragment: Any, name: str, options: SinkOptions) -> VideoSinkOp:
-    """The run's video, at the source's rate."""
+    """Create the video sink of a run, at the source's frame rate."""
     return VideoSinkOp(
         fragment, name=name, path=options.out / VIDEO_FILE, fps=options.source.fps, reserve=options.reserve
     )

@@ -1,4 +1,4 @@
-"""A video file that is either playable or not there."""
+"""Writer of video files that are either complete and playable, or absent."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ from operators.errors import OutputError
 from operators.storage import StorageReserve, storage_errors
 
 CODEC = "libvpx-vp9"
-"""VP9, by libvpx: browsers play it in an MP4, OpenCV reads it, and the encoder is under a BSD licence."""
+"""VP9 by libvpx: playable in an MP4 by browsers, readable by OpenCV, and BSD-licensed."""
 _QUALITY = "24"
-"""libvpx's scale from 0 to 63, lower is better: 38 dB to the input and more (benchmarks/notes/graph.md)."""
+"""Constant quality of libvpx, 0 to 63, lower is better. Gives at least 38 dB
+(benchmarks/notes/graph.md).
+"""
 _FRAMES_WAITING = 2
-"""Frames that may wait for the encoder; the next one makes the caller wait."""
+"""Capacity of the encoder's queue in frames; a further frame blocks the caller."""
 _OPTIONS = {
     "deadline": "realtime",
     "cpu-used": "8",
@@ -38,17 +40,18 @@ _OPTIONS = {
 }
 _TICKS_PER_S = 90_000
 _KEYFRAME_S = 2
-"""A player can jump to every key frame."""
+"""Interval of key frames in seconds, at which a player can seek."""
 MAX_THREADS = 8
 MARK = "written by IntraSplat"
-"""Comment in the file, by which a video of this program is recognised."""
+"""Comment in the file that identifies videos of this program."""
 
 
 class VideoFile:
-    """Writes RGB frames of one size to an MP4; use as a context manager or call `close()`, which finishes the file's index.
+    """Writes RGB frames of one size to an MP4 file. Use as a context manager, or call `close()`.
 
-    Frames are coded in a thread of the file's own, so that the caller makes the next one meanwhile. What goes wrong there is raised by the
-    next call, `close()` at the latest; no file is left then. A file that an earlier run has left stays until this one is complete.
+    Frames are encoded in a separate thread. An error there is raised by the next call, at the
+    latest by `close()`, and no new file is left. An existing file is replaced only when the new one
+    is complete.
     """
 
     def __init__(
@@ -60,7 +63,7 @@ class VideoFile:
         self._last_ticks = -1
         self._broken = False
         self._size = (height_px, width_px)
-        # 4:2:0 colour needs even sides.
+        # 4:2:0 subsampling requires even sides.
         self._even = (height_px + height_px % 2, width_px + width_px % 2)
         self._reserve = reserve or StorageReserve(path.parent, lambda: 0)
         self._reserve.require(self._frame_bytes)
@@ -89,21 +92,26 @@ class VideoFile:
         context.time_base = Fraction(1, _TICKS_PER_S)
         context.gop_size = max(1, round(_KEYFRAME_S * self._fps))
         context.thread_count = min(MAX_THREADS, os.cpu_count() or 1)
-        # What OpenCV's conversion below makes, so that a player turns it back into the same colours.
+        # Matches OpenCV's conversion below, so that players restore the same colours.
         context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.SMPTE170M
-        context.open()  # now, so that what it cannot do is known before the first frame
+        context.open()  # open now, so that errors occur before the first frame
         return stream
 
     @property
     def _frame_bytes(self) -> int:
-        # Far above what a coded frame takes, so that the encoder's buffers are covered too.
+        # Far above the size of an encoded frame, to cover the encoder's buffers.
         return self._even[0] * self._even[1] * 3
 
     def write(self, image: NDArray[np.uint8], time_s: float | None = None) -> None:
-        """Add one RGB uint8 frame [H, W, 3], shown from `time_s` on; None: one frame after the other.
+        """Add a frame; blocks while the encoder's queue is full.
 
-        Waits while as many frames as may wait for the encoder do so. Raises StorageFull before the disk is so full that the file could not
-        be finished.
+        Args:
+            image: uint8 RGB [H, W, 3], of the file's size.
+            time_s: timestamp in seconds; None for a constant frame rate.
+
+        Raises:
+            OutputError: wrong size, or an earlier frame could not be written.
+            StorageFull: too little disk space to finish the file.
         """
         if image.shape[:2] != self._size:
             raise OutputError(
@@ -118,14 +126,14 @@ class VideoFile:
         planes = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
         frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
         time_s = self.frames / self._fps if time_s is None else time_s
-        # Times rise: a player refuses a frame that comes before the one that precedes it.
+        # Timestamps must increase, or players reject the frame.
         self._last_ticks = max(self._last_ticks + 1, round(time_s * _TICKS_PER_S))
         frame.pts, frame.time_base = self._last_ticks, Fraction(1, _TICKS_PER_S)
         self._waiting.append(self._encoder.submit(self._encode, frame))
         self.frames += 1
 
     def _wait_for_frames(self, most: int) -> None:
-        """Wait until at most `most` frames are with the encoder; raises what it has raised, once."""
+        """Wait until at most `most` frames are queued. Raises the encoder's exception once."""
         while self._waiting and (len(self._waiting) > most or self._waiting[0].done()):
             error = self._waiting.popleft().exception()
             if error is not None:
@@ -133,7 +141,7 @@ class VideoFile:
                 raise error
 
     def _encode(self, frame: av.VideoFrame) -> None:
-        """The encoder's thread: one frame, unless one before it could not be written."""
+        """Encode one frame in the encoder's thread, unless an earlier one failed."""
         if not self._broken:
             self._write(frame)
 
@@ -144,28 +152,28 @@ class VideoFile:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Errors of the disk and of FFmpeg as OutputError; after one the file cannot be finished."""
+        """Convert errors of the disk and of FFmpeg to OutputError and mark the file as broken."""
         try:
             with storage_errors(self.path.parent):
                 yield
         except OutputError:
             self._broken = True
             raise
-        except av.FFmpegError as error:  # those that are no OSError
+        except av.FFmpegError as error:  # those that are not an OSError
             self._broken = True
             raise OutputError(
                 f"{self.path}: the video cannot be written ({error}); check the path, its permissions and its disk"
             ) from error
 
     def close(self) -> None:
-        """Finish the file and give it its name; without any frame there is none. Closing twice is allowed."""
+        """Finish the file and rename it to its name; without frames no file is left. Idempotent."""
         partial, self._partial = self._partial, None
         if partial is None:
             return
         try:
             self._wait_for_frames(0)
             if self._broken:
-                return  # whoever wrote has been told why; finishing would fail for the same reason
+                return  # the caller has already received the error; finishing would fail for the same reason
             if self.frames:
                 self._write(None)
             with self._writing():
@@ -177,7 +185,7 @@ class VideoFile:
             if self._broken:
                 with suppress(OSError, av.FFmpegError):
                     self._container.close()
-            partial.discard()  # nothing, once it has its name
+            partial.discard()  # no effect after the file was renamed
 
     def __enter__(self) -> VideoFile:
         return self

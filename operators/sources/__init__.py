@@ -1,1 +1,1 @@
-"""Where frames come from: recordings now, streams of every kind behind the same protocol."""
+"""Sources of frames: recordings and live streams behind one protocol."""

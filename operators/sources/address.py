@@ -1,4 +1,4 @@
-"""Addresses of sources: `scheme:place?option=value&option=value`."""
+"""Parser of source addresses: `scheme:place?option=value&option=value`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_SIDE_PX = 8192
 
 @dataclass
 class Address:
-    """What an address says: a place, and options, each of which a source asks for by its name."""
+    """A parsed address. Sources query the options by name, and `refuse_others` rejects the rest."""
 
     scheme: str
     place: str
@@ -26,7 +26,7 @@ class Address:
 
     @classmethod
     def parse(cls, scheme: str, rest: str) -> Address:
-        """From what follows `scheme:`. Raises InvalidSetting for an option that is there twice."""
+        """Parse the text after `scheme:`. Raises InvalidSetting if an option occurs twice."""
         place, _, query = rest.partition("?")
         pairs = parse_qsl(query, keep_blank_values=True)
         options = dict(pairs)
@@ -36,12 +36,12 @@ class Address:
         return cls(scheme, place, options)
 
     def text(self, name: str, default: str | None = None) -> str | None:
-        """An option as it is written."""
+        """Return an option as text."""
         self._asked.add(name)
         return self.options.get(name, default)
 
     def choice(self, name: str, default: str, choices: tuple[str, ...]) -> str:
-        """One of a few words. Raises InvalidSetting."""
+        """Return an option that must be one of `choices`. Raises InvalidSetting."""
         value = self.text(name, default)
         if value not in choices:
             raise InvalidSetting(f"{self.scheme}: {name} is {value!r:.60}; choose {', '.join(choices)}")
@@ -52,7 +52,7 @@ class Address:
     @overload
     def number(self, name: str, default: float | None, least: float, most: float) -> float | None: ...
     def number(self, name: str, default: float | None, least: float, most: float) -> float | None:
-        """A number within bounds. Raises InvalidSetting."""
+        """Return a numeric option between `least` and `most`. Raises InvalidSetting."""
         text = self.text(name)
         if text is None:
             return default
@@ -67,7 +67,7 @@ class Address:
         return value
 
     def whole(self, name: str, default: int | None, least: int, most: int) -> int | None:
-        """A whole number within bounds. Raises InvalidSetting."""
+        """Return an integer option between `least` and `most`. Raises InvalidSetting."""
         text = self.text(name)
         if text is None:
             return default
@@ -78,7 +78,7 @@ class Address:
         return int(text)
 
     def flag(self, name: str, default: bool = False) -> bool:
-        """Yes or no. Raises InvalidSetting."""
+        """Return a boolean option. Raises InvalidSetting."""
         text = self.text(name)
         if text is None:
             return default
@@ -87,7 +87,9 @@ class Address:
         return _FLAGS[text.lower()]
 
     def size(self, name: str = "size") -> tuple[int, int] | None:
-        """Width and height in pixels, as in `640x512`. Raises InvalidSetting."""
+        """Return an option for width and height in pixels, such as `640x512`. Raises
+        InvalidSetting.
+        """
         text = self.text(name)
         if text is None:
             return None
@@ -100,7 +102,7 @@ class Address:
         return width, height
 
     def refuse_others(self) -> None:
-        """Raises InvalidSetting, with the known names, for an option that nobody asked for."""
+        """Raise InvalidSetting, listing the known names, if an option was never queried."""
         for name in self.options:
             if name not in self._asked:
                 known = ", ".join(sorted(self._asked)) or "none"

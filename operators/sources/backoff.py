@@ -1,25 +1,25 @@
-"""How long to wait before another attempt."""
+"""Exponential backoff between connection attempts."""
 
 from __future__ import annotations
 
 FIRST_S = 0.25
 MOST_S = 2.0
-"""Seconds between two attempts: twice as long after each one that fails, from the first to the most."""
+"""Delay between attempts in seconds: doubled after each failure, from `FIRST_S` to `MOST_S`."""
 
 
 class Backoff:
-    """Counts attempts that failed in a row, and says how long to wait before the next one."""
+    """Counts consecutive failures and computes the delay before the next attempt."""
 
     def __init__(self, first_s: float = FIRST_S, most_s: float = MOST_S) -> None:
         self._first_s, self._most_s = first_s, most_s
         self.failures = 0
-        """In a row."""
+        """Number of consecutive failures."""
 
     def failed(self) -> float:
-        """Another attempt failed; the seconds to wait."""
+        """Record a failure. Return the delay in seconds."""
         self.failures += 1
         return float(min(self._most_s, self._first_s * 2 ** min(self.failures - 1, 30)))
 
     def worked(self) -> None:
-        """It worked; the next failure is the first one again."""
+        """Record a success, which resets the delay."""
         self.failures = 0

@@ -1,7 +1,7 @@
-"""The process that a `ProcessSource` starts: opens one source, and hands over its frames.
+"""Capture process started by a `ProcessSource`: opens one source and transfers its frames.
 
-It imports no torch. It ends when the other side of its connection is gone, whatever the source is doing, and ignores the signals that a terminal
-or a service manager sends to all processes of a group: the parent decides.
+The process does not import torch. It ends when the parent closes the connection, even if the source
+blocks. It ignores signals sent to the process group, because the parent controls its lifetime.
 """
 
 from __future__ import annotations
@@ -31,13 +31,15 @@ from operators.sources.wire import (
 
 IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.1
-"""How often the parent hears from this process when there is no frame."""
+"""Period of state messages to the parent while no frame arrives, in seconds."""
 END_WITHIN_S = 0.6
-"""After the parent has let go, the process ends within so long, even when the source does not."""
+"""Time limit in seconds to exit after the parent has closed the connection, even if the source
+blocks.
+"""
 
 
 class Served:
-    """One source and the connection to the process that reads it."""
+    """One source and the connection to the parent process."""
 
     def __init__(self, connection: Connection, memory_fd: int) -> None:
         self._connection = connection
@@ -49,7 +51,7 @@ class Served:
         self.ended = threading.Event()
 
     def send(self, kind: str, **content: object) -> None:
-        """Say something; without effect when nobody listens any more."""
+        """Send a message to the parent. No effect after the connection was closed."""
         try:
             with self._sending:
                 self._connection.send_bytes(message(kind, **content))
@@ -57,7 +59,9 @@ class Served:
             self._let_go()
 
     def listen(self) -> None:
-        """Hear what the parent says, in a thread of its own, until it has let go."""
+        """Receive messages from the parent until the connection closes, then exit. Runs in its own
+        thread.
+        """
         try:
             while True:
                 told = parsed(self._connection.recv_bytes(1 << 12))
@@ -72,7 +76,7 @@ class Served:
         os._exit(0)
 
     def serve(self, source: FrameSource) -> None:
-        """Hand over the source's frames until it ends or nobody wants them."""
+        """Transfer frames until the source ends or the parent closes the connection."""
         with self._changed:
             self._changed.wait_for(lambda: self._wanted or self.ended.is_set())
         source.open()
@@ -115,19 +119,26 @@ class Served:
 
 
 class ToParent(logging.Handler):
-    """Log records become messages."""
+    """Log handler that forwards records to the parent."""
 
     def __init__(self, served: Served) -> None:
         super().__init__(logging.INFO)
         self._served = served
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler`."""
         self._served.send("log", level=record.levelno, text=record.getMessage()[:2000])
 
 
 def main(connection_fd: int, memory_fd: int) -> None:
-    """The life of the process. The first message names what opens the source: `module:function`, an address and options."""
+    """Run the capture process.
+
+    The first message names the function that opens the source (`module:function`), an address and
+    options.
+
+    Args:
+        connection_fd: file descriptor of the connection to the parent.
+        memory_fd: file descriptor of the shared memory.
+    """
     for number in IGNORED_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     connection = Connection(connection_fd)
@@ -144,8 +155,8 @@ def main(connection_fd: int, memory_fd: int) -> None:
         served.serve(source)
     except UserError as error:
         served.send("refused", error=str(error))
-    except Exception as error:  # noqa: BLE001 - carried to the parent, which says it
+    except Exception as error:  # noqa: BLE001 - carried to the parent, which reports it
         served.send("failed", error=f"{type(error).__name__}: {error}"[:2000])
-    # Threads within a library may still wait for a network; they keep nobody waiting.
+    # Exit without waiting for library threads, which may be blocked in network calls.
     connection.close()
     os._exit(0)

@@ -1,4 +1,4 @@
-"""Starting, hearing and ending the process that a source reads in."""
+"""Parent side of a capture process: start, messages and termination."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from operators.sources.shared_memory import BadHeader, FrameReader, new_memory
 from operators.sources.wire import MOST_BYTES, message, options_to, parsed
 
 END_WITHIN_S = 0.8
-"""A process that has not ended so long after it was let go is killed."""
+"""Time in seconds for the process to exit after its connection closed, before it is killed."""
 _BOOT = (
     "import signal, sys, json\n"
     "for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(number, signal.SIG_IGN)\n"
@@ -30,24 +30,24 @@ _BOOT = (
 
 
 class ChildLost(Exception):
-    """The process ended, does not answer, or says what makes no sense."""
+    """The capture process ended, does not respond, or sent an invalid message."""
 
 
 @dataclass(frozen=True)
 class Opening:
-    """What a process is to open."""
+    """Function, address and options for opening a source in the process."""
 
     opener: str
     """`module:function`, called with the address and the options."""
-    address: str = field(repr=False)  # it may have a password in it
+    address: str = field(repr=False)  # may contain a password
     options: SourceOptions
 
 
 class ChildProcess:
-    """One process with one source."""
+    """One capture process with one source."""
 
     def __init__(self, opening: Opening) -> None:
-        """Start it. It begins to open its source at once."""
+        """Start the process, which opens its source immediately."""
         memory_fd = new_memory()
         ours, theirs = Pipe()
         try:
@@ -55,9 +55,9 @@ class ChildProcess:
                 [sys.executable, "-P", "-c", _BOOT, json.dumps(sys.path), str(theirs.fileno()), str(memory_fd)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,  # what it has to say comes as messages
+                stderr=subprocess.DEVNULL,  # its output arrives as messages
                 pass_fds=(theirs.fileno(), memory_fd),
-                start_new_session=True,  # Ctrl-C is for the parent
+                start_new_session=True,  # keeps Ctrl-C from reaching the process
                 env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
         except BaseException:
@@ -70,17 +70,27 @@ class ChildProcess:
         self.frames = FrameReader(memory_fd)
         self._memory_fd = memory_fd
         self.heard_s = time.monotonic()
-        """When it last said something."""
+        """Time of the last received message, by `time.monotonic`."""
         content = {"opener": opening.opener, "address": opening.address, "options": options_to(opening.options)}
         self.say("ask", **content)
 
     def say(self, kind: str, **content: object) -> None:
-        """Tell the process something; one that has ended hears nothing."""
+        """Send a message to the process. No effect if it has ended."""
         with contextlib.suppress(OSError):
             self.connection.send_bytes(message(kind, **content))
 
     def hear(self, timeout_s: float) -> dict[str, Any] | None:
-        """What it says next; None when it says nothing for so long. Raises ChildLost when it has ended or talks nonsense."""
+        """Receive the next message.
+
+        Args:
+            timeout_s: maximum waiting time in seconds.
+
+        Returns:
+            The message; None if there was none in time.
+
+        Raises:
+            ChildLost: the process has ended or sent an invalid message.
+        """
         try:
             if not self.connection.poll(timeout_s):
                 return None
@@ -93,7 +103,9 @@ class ChildProcess:
         return told
 
     def end(self) -> None:
-        """Let it go, and kill it when it does not end. Nothing of it is left afterwards."""
+        """Close the connection, wait for the process to exit, kill it if necessary, and free its
+        resources.
+        """
         self.connection.close()
         try:
             self._process.wait(END_WITHIN_S)
@@ -103,7 +115,7 @@ class ChildProcess:
         self._forget()
 
     def kill(self) -> None:
-        """End it at once."""
+        """Kill the process immediately and free its resources."""
         self._process.kill()
         self._process.wait()
         self.connection.close()

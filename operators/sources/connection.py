@@ -1,4 +1,4 @@
-"""One connection to a stream that PyAV opens: packets in, pictures out, each marked where it is damaged."""
+"""Connection to a stream through PyAV, which decodes packets and marks damaged pictures."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 KEPT_PACKETS = 256
-"""So many packets may be under way in a decoder."""
+"""Maximum number of packets in flight in the decoder."""
 WHOLE_PICTURES = frozenset({"rawvideo", "wrapped_avframe", "mjpeg"})
-"""Codecs each of whose packets is a picture, whether or not it is marked as a key frame."""
+"""Codecs in which every packet is a complete picture, even if not marked as a key frame."""
 PACKETS_WITHOUT_KEY = 300
-"""A stream that has no key frame among so many packets is decoded without one."""
+"""Number of packets without a key frame after which decoding starts without one."""
 
 
 class ConnectionFailed(Exception):
-    """What went wrong, in words without the address."""
+    """The connection failed. The message never contains the address, which may include a password."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """What is to be opened."""
+    """Address and parameters of a stream."""
 
     url: str
     options: Mapping[str, str]
     format: str | None = None
-    """FFmpeg's name of the demuxer or device; None: what the data says."""
+    """FFmpeg's name of the demuxer or device; None to detect it from the data."""
     open_s: float = 10.0
     read_s: float = 5.0
-    """How long opening, and waiting for the next packet, may take."""
+    """Timeouts in seconds for opening the stream and for the next packet."""
 
 
 class Connection:
-    """An open stream. Raises ConnectionFailed when there is none, or none with a picture of a usable size."""
+    """An open stream. Raises ConnectionFailed if it cannot be opened or has no picture of a usable
+    size.
+    """
 
     def __init__(self, place: Place) -> None:
         self._container: av.container.InputContainer | None = None
@@ -54,7 +56,7 @@ class Connection:
                     timeout=(place.open_s, place.read_s),
                 )
         except (av.FFmpegError, OSError, ValueError) as error:
-            raise ConnectionFailed(_words(error)) from None  # the original names the address, with its password
+            raise ConnectionFailed(_words(error)) from None  # the original error contains the address with its password
         try:
             self._look()
         except ConnectionFailed:
@@ -75,16 +77,18 @@ class Connection:
         self.size = width_px, height_px
         self.fps = frame_rate(stream) or None
         self.has_an_end = bool(self._container.duration and self._container.duration > 0)
-        """Whether the data says how long it is: then its end is an end, and else a loss."""
+        """True if the stream states its duration. Its end is then regular, otherwise a lost
+        connection.
+        """
         try:
             self._decoder, self._converter = PictureDecoder(stream, probe=False), PictureConverter(0)
         except (av.FFmpegError, ValueError) as error:
             raise ConnectionFailed(f"its pictures cannot be decoded: {_words(error)}") from None
         self.skipped = 0
-        """Packets before the first key frame, which nothing can be made of."""
+        """Number of packets before the first key frame, which cannot be decoded."""
 
     def pictures(self) -> Iterator[Frame]:
-        """The pictures until the stream ends, each with the time at which its data came in. Raises ConnectionFailed."""
+        """Yield the pictures with the arrival times of their packets. Raises ConnectionFailed."""
         damage = StreamDamage()
         came: dict[int, int] = {}
         tick = self._stream.time_base or Fraction(1, 90_000)
@@ -120,7 +124,7 @@ class Connection:
             number += packet is not None
 
     def _packets(self) -> Iterator[av.Packet | None]:
-        """The stream's packets, and None at its end."""
+        """Yield the packets of the stream, then None at its end."""
         assert self._container is not None
         packets = self._container.demux(self._stream)
         while True:
@@ -133,27 +137,26 @@ class Connection:
                 return
             if packet.size:
                 yield packet
-            elif packet.dts is None:  # PyAV's sign of the end
+            elif packet.dts is None:  # PyAV's end marker
                 yield None
                 return
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection. Idempotent."""
         container, self._container = self._container, None
         if container is not None:
             container.close()
 
 
 class StreamDamage:
-    """Which pictures are damaged: those that something speaks against, and all that may be predicted from them: every one up to the next
-    key frame."""
+    """Damage of pictures: suspicious ones, and those predicted from them up to the next key frame."""
 
     def __init__(self) -> None:
         self._keys: list[int] = []
         self._own: dict[int, str] = {}
 
     def saw(self, number: int, is_key: bool) -> None:
-        """A packet goes into the decoder."""
+        """Record a packet before it is decoded."""
         if is_key:
             self._keys = [*self._keys[-3:], number]
         if len(self._own) > KEPT_PACKETS:
@@ -161,12 +164,12 @@ class StreamDamage:
             self._own = {newest: self._own[newest]}
 
     def doubt(self, doubts: dict[int, str]) -> None:
-        """Take over what the decoder doubts."""
+        """Take over the decoder's doubts, by packet number, and clear them."""
         self._own.update(doubts)
         doubts.clear()
 
     def of(self, number: int) -> str | None:
-        """What is wrong with the picture of a packet; None for one that is whole."""
+        """Return the damage of a packet's picture; None if it is intact."""
         if number in self._own:
             return self._own[number]
         key = max((key for key in self._keys if key <= number), default=0)
@@ -174,7 +177,7 @@ class StreamDamage:
 
 
 def _words(error: Exception) -> str:
-    """An error without the address that it names."""
+    """Return an error's text without the address that it contains."""
     if isinstance(error, av.error.ExitError):
         return "nothing came in time"
     return str(getattr(error, "strerror", None) or type(error).__name__)

@@ -1,4 +1,4 @@
-"""A folder that another program writes images into, one by one."""
+"""Source that reads images which another program writes into a folder."""
 
 from __future__ import annotations
 
@@ -19,22 +19,33 @@ from operators.sources.stream import DEFAULT_FPS, StreamSource
 
 LOOK_S = 0.01
 OPEN_S = 10.0
-"""How long the first image may take."""
+"""Timeout for the first image, in seconds."""
 UNREADABLE_AFTER_S = 2.0
-"""An image that cannot be read and has not changed for so long is passed over."""
+"""Time in seconds after which an unreadable file that no longer changes is skipped."""
 
 
 class FolderSource(StreamSource):
-    """Images (PNG, JPEG) in the order of their names, each as soon as it is whole: one that is being written is waited for.
+    """Reads PNG and JPEG images in the order of their names, each once it is complete.
 
-    A program that writes under another name and renames the file when it is done is read without delay, and so is one whose files end with
-    their format's end mark. What is there already is passed over but for the newest image.
+    A writer should rename finished files, or use a format with an end marker, to avoid delay. Of
+    the images present at the start, only the newest is read.
     """
 
     def __init__(
         self, path: str, fps: float | None, options: SourceOptions, *, every: bool = False, open_s: float = OPEN_S
     ) -> None:
-        """every: begin with the first image that is there. Raises SourceUnavailable without a folder, or without an image within `open_s`."""
+        """Wait for the first image and describe the source.
+
+        Args:
+            path: the folder.
+            fps: frame rate; None if unknown.
+            options: source options.
+            every: start with the first image present, not with the newest.
+            open_s: timeout for the first image, in seconds.
+
+        Raises:
+            SourceUnavailable: the folder does not exist, or no image arrived in time.
+        """
         super().__init__(options)
         self._folder, self._every = Path(path), every
         self._name = f"folder {self._folder.name or path}"
@@ -97,7 +108,7 @@ class FolderSource(StreamSource):
         return files
 
     def _next(self) -> Picture | None:
-        """The next image; None when there is none, or when it is not whole yet."""
+        """Return the next image; None if there is none or it is incomplete."""
         while (path := self._files.next()) is not None:
             try:
                 if path.is_symlink():
@@ -114,7 +125,7 @@ class FolderSource(StreamSource):
         return None
 
     def _may_become_whole(self, path: Path) -> bool:
-        """Whether a file that cannot be read has changed lately. It is left alone until it changes again or is given up."""
+        """Return True if an unreadable file has changed recently and may still be completed."""
         try:
             about = os.lstat(path)
         except FileNotFoundError:
@@ -128,7 +139,7 @@ class FolderSource(StreamSource):
 
 
 def folder_source(rest: str, options: SourceOptions) -> FolderSource:
-    """`folder:/path/of/images?fps=30&every=0`. Raises InvalidSetting and SourceUnavailable."""
+    """Open `folder:/path/of/images?fps=30&every=0`. Raises InvalidSetting and SourceUnavailable."""
     address = Address.parse("folder", rest)
     fps = address.number("fps", options.fps, 0.01, MAX_FPS)
     every = address.flag("every")

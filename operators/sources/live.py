@@ -1,4 +1,4 @@
-"""A source whose frames come when they come: whoever is late misses the oldest, never the newest."""
+"""Base class of live sources. If the consumer is slow, the oldest frames are dropped."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ STALLED_AFTER_S = 1.0
 
 
 class LiveSource(ThreadedSource):
-    """A `FrameSource` that follows the clock: a subclass gives `description` and `frames()`.
+    """`FrameSource` in real time. A subclass provides `description` and `frames()`.
 
-    `frames()` runs in a daemon thread and yields each frame at the moment at which it is there. At most `waiting` frames wait for `read`; when another
-    one comes, the oldest of them is dropped and counted as `too_late`. `frames()` waits with `wait`, says with `lost` that the connection
-    is gone and is being made again, and counts with `count` what it dropped or repaired.
+    `frames()` runs in a daemon thread and yields each frame on arrival. The queue for `read` holds
+    at most `waiting` frames; a further one replaces the oldest, counted as `too_late`. `frames()`
+    uses `wait` for waiting, `lost` to report a lost connection, and `count` for dropped or repaired
+    items.
     """
 
     close_timeout_s = 1.0
@@ -37,8 +38,17 @@ class LiveSource(ThreadedSource):
         drops: bool = True,
         order: FrameOrder | None = None,
     ) -> None:
-        """waiting: how many frames wait for `read`. stalled_after_s: without a frame for so long the state is `STALLED`. drops: False makes
-        `frames()` wait for room in place of dropping. order: repairs numbers and times of a sender that is not ours."""
+        """Set the queue's parameters.
+
+        Args:
+            waiting: capacity of the queue for `read`, in frames.
+            stalled_after_s: time without a frame until the state is `STALLED`, in seconds.
+            drops: drop the oldest frame of a full queue; False makes `frames()` wait instead.
+            order: repairs sequence numbers and timestamps of external senders.
+
+        Raises:
+            InvalidInput: `waiting` is less than 1.
+        """
         if waiting < 1:
             raise InvalidInput(f"waiting is {waiting}; at least one frame must be able to wait")
         super().__init__(ahead=waiting, stalled_after_s=stalled_after_s)
@@ -48,20 +58,22 @@ class LiveSource(ThreadedSource):
         self._lost: str | None = None
         self._ending: str | None = None
 
-    # What `frames()` uses, in the reader's thread.
+    # Methods for `frames()`, in the reader's thread.
 
     def wait(self, seconds: float) -> bool:
-        """Wait; True at once when the source is being closed."""
+        """Wait for `seconds`. Return True immediately when the source is being closed."""
         return self._my_stop().wait(seconds)
 
     def count(self, reason: str, times: int = 1) -> None:
-        """Count what was dropped or repaired."""
+        """Count dropped or repaired items."""
         with self._changed:
             if not self._my_stop().is_set():
                 self._counts[reason] += times
 
     def lost(self, sentence: str) -> None:
-        """Say that the connection is gone and is being made again; it holds until the next frame. Numbers and times go on after it."""
+        """Report a lost connection. The state holds until the next frame, which continues numbers
+        and timestamps.
+        """
         with self._changed:
             if self._my_stop().is_set():
                 return
@@ -73,14 +85,16 @@ class LiveSource(ThreadedSource):
             self._order.restart()
 
     def _my_stop(self) -> threading.Event:
-        """What stops this thread: a reader that was left behind keeps the event of its own reading."""
+        """Return the stop event of the current thread. A reader that outlived `close` keeps its own
+        event.
+        """
         return getattr(self._own, "stop", self._stop)
 
-    # What the consumer uses.
+    # Methods for the consumer.
 
     @property
     def drops(self) -> bool:
-        """Whether frames that nobody takes in time are dropped; else reading waits for whoever takes them."""
+        """True if frames are dropped when the queue is full; otherwise the reader waits."""
         return self._drops
 
     @property
@@ -92,7 +106,7 @@ class LiveSource(ThreadedSource):
 
     @property
     def state_sentence(self) -> str:
-        """What `state` means here, in a sentence."""
+        """State of the source as a sentence."""
         name, state = self.description.name, self.state
         if state is SourceState.RECONNECTING:
             return self._lost or f"the connection to {name} is being made again"
@@ -103,7 +117,7 @@ class LiveSource(ThreadedSource):
         return f"{name} gives frames"
 
     def counts(self) -> Mapping[str, int]:
-        """What was dropped or repaired since `open`, by reason."""
+        """Return the numbers of dropped or repaired items since `open`, by reason."""
         with self._changed:
             counts = Counter(self._counts)
         if self._order is not None:
@@ -111,7 +125,7 @@ class LiveSource(ThreadedSource):
         return {reason: times for reason, times in counts.items() if times}
 
     def open(self) -> None:
-        """See `FrameSource`. After `close` it begins again, with frame 0."""
+        """Start reading. After `close` it restarts with frame 0."""
         if self._thread is not None:
             return
         self._counts.clear()
@@ -134,7 +148,7 @@ class LiveSource(ThreadedSource):
         super()._run(stop)
 
     def _put(self, frame: Frame, stop: threading.Event) -> bool:
-        """Put a frame where `read` finds it; False when the source is being closed."""
+        """Append a frame to the queue. Return False when the source is being closed."""
         arrived_ns = time.monotonic_ns() if frame.arrived_ns is None else frame.arrived_ns
         status = FrameStatus.LIVE if frame.status is FrameStatus.REPLAY else frame.status
         if self._order is not None:
@@ -142,7 +156,7 @@ class LiveSource(ThreadedSource):
             if ordered is None:
                 return not stop.is_set()
             frame = ordered
-        # One copy of the dataclass, however many of its fields change.
+        # A single copy of the dataclass, whichever fields change.
         if (arrived_ns, status) != (frame.arrived_ns, frame.status):
             frame = replace(frame, arrived_ns=arrived_ns, status=status)
         with self._changed:

@@ -1,4 +1,4 @@
-"""The images of a folder in the order of their names, as they appear."""
+"""Detection of new images in a folder, in the order of their names."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ from pathlib import Path
 from gsplat_core.io.recordings.plain_files import IMAGE_SUFFIXES, natural_key
 
 SHARE = 10
-"""Looking through a large folder takes long: it is done so many times as seldom as it takes."""
+"""Minimum pause between scans of the folder, as a multiple of a scan's duration, because large
+folders are slow.
+"""
 _LAST_NUMBER = re.compile(r"(\d+)(?=\D*$)")
 
 
 class NewFiles:
-    """Names images after the last one that was taken. A name that comes before it is passed over, and counted in `late`."""
+    """Yields images that follow the last one in name order. Names before it are skipped and counted
+    in `late`.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -28,13 +32,15 @@ class NewFiles:
         self._changed_ns = -1
 
     def skip_to_newest(self) -> None:
-        """Pass over all images that are there but the last one. Raises OSError."""
+        """Skip all present images but the last. Raises OSError."""
         self._scan()
         while len(self._waiting) > 1:
             self.taken()
 
     def next(self) -> Path | None:
-        """The image to be read next; the same one until `taken`. None when there is none. Raises OSError when the folder is gone."""
+        """Return the next image, the same one until `taken`. None if there is none. Raises OSError
+        without the folder.
+        """
         if self._waiting:
             return self._waiting[0]
         following = None if self._last is None else following_name(self._last)
@@ -46,7 +52,7 @@ class NewFiles:
         return self._waiting[0] if self._waiting else None
 
     def taken(self) -> None:
-        """Go on to the one after it."""
+        """Advance to the next image."""
         self._last = self._waiting.popleft()
 
     def _scan(self) -> None:
@@ -54,13 +60,14 @@ class NewFiles:
         if now_s - self._scanned_s < SHARE * self._scan_took_s:
             return
         changed_ns = os.stat(self.folder).st_mtime_ns
-        # The clock of a file system is coarse: what changed just now may change again within the same tick.
+        # File system timestamps are coarse: a recent change may be followed by another with the
+        # same timestamp.
         if changed_ns == self._changed_ns and time.time_ns() - changed_ns > 1_000_000_000:
             return
         with os.scandir(self.folder) as entries:
             names = {entry.name for entry in entries if is_image(entry.name)}
         new = sorted((self.folder / name for name in names - self._known), key=natural_key)
-        self._known = names  # forgets what was removed
+        self._known = names  # also drops removed files
         for path in new:
             if self._last is not None and natural_key(path) <= natural_key(self._last):
                 self.late += 1
@@ -71,12 +78,14 @@ class NewFiles:
 
 
 def is_image(name: str) -> bool:
-    """Whether a name is that of an image; hidden files, and those that a writer renames when it is done, are none."""
+    """Return True for the name of an image. Hidden and temporary files are excluded."""
     return not name.startswith(".") and os.path.splitext(name)[1].lower() in IMAGE_SUFFIXES
 
 
 def following_name(path: Path) -> Path | None:
-    """The name with the next number in it: `frame-000042.png` after `frame-000041.png`; None where there is no number."""
+    """Return the path with the next number, `frame-000042.png` after `frame-000041.png`; None
+    without a number.
+    """
     found = _LAST_NUMBER.search(path.stem)
     if found is None:
         return None

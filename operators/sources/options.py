@@ -1,4 +1,4 @@
-"""What a user may ask of any source."""
+"""Options that apply to all sources."""
 
 from __future__ import annotations
 
@@ -16,28 +16,30 @@ MAX_WAITING = 64
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What a user may ask of any source. Raises InvalidSetting for a value that is out of its range."""
+    """User options of a source. Raises InvalidSetting for a value out of range."""
 
     scale: float = 1.0
-    """Resize the frames by this factor."""
+    """Scale of the frames."""
     max_frames: int | None = None
-    """End after so many frames."""
+    """Maximum number of frames."""
     realtime: bool = False
-    """Play a recording by the clock; other sources follow it anyway."""
+    """Play a recording in real time; live sources do so anyway."""
     loop: bool = False
-    """Play a recording over and over."""
+    """Play a recording in a loop."""
     bounce: bool = False
-    """Play each second round of a looped recording backwards, so that nothing jumps where one round meets the next."""
+    """Play every second round of a loop backwards, which avoids a jump between rounds."""
     speed: float = 1.0
-    """How fast a recording's time passes; `math.inf`: each frame as soon as the one before it is taken, and none is dropped."""
+    """Playback speed of a recording. `math.inf`: each frame when the previous one is taken, without
+    drops.
+    """
     fps: float | None = None
-    """Frames per second in place of those that the recording states."""
+    """Frame rate that replaces the recording's own, in frames/s."""
     waiting: int = 2
-    """How many frames wait for whoever reads them; when another one comes the oldest is dropped."""
+    """Capacity of the queue for the reader, in frames; if it is full, the oldest is dropped."""
     stereo: StereoLayout | None = None
-    """How the two eyes lie in one picture."""
+    """Arrangement of the two eyes in one picture; None for a single eye."""
     process: bool | None = None
-    """Whether the source reads in a process of its own; None: where its kind can block."""
+    """Read the source in a separate process; None: if sources of its kind can block."""
 
     def __post_init__(self) -> None:
         if not self.speed > 0:

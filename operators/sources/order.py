@@ -1,4 +1,4 @@
-"""Numbers and times of a sender that is not ours, put into the order that a `FrameSource` promises."""
+"""Repair of sequence numbers and timestamps of external senders."""
 
 from __future__ import annotations
 
@@ -11,38 +11,46 @@ import numpy as np
 from gsplat_core.scene.frames import Frame
 
 RESET_S = 1.0
-"""A sender whose time falls back by more has begun again, rather than sent a frame late."""
+"""Backward step of a sender's timestamp, in seconds, that counts as a restart rather than a late
+frame.
+"""
 JUMP_S = 2.0
-"""A sender's time that runs ahead of our clock by more, between two frames, has been set."""
+"""Excess of a sender's timestamp step over the local clock, in seconds, that counts as a clock
+change.
+"""
 MOST_LOST = 1_000_000
-"""Numbers that are missing between two frames; more than that is no loss but another way of counting."""
+"""Gap in sequence numbers above which a restart is assumed instead of lost frames."""
 RESET_FRAMES = 3
-"""So many late frames in a row, in order among themselves, are a sender that has begun again."""
+"""Number of consecutive late frames, in order among themselves, that count as a restarted sender.
+"""
 
 
 class FrameOrder:
-    """Makes `seq` increase and `pts_ns` rise, whatever a sender does.
+    """Produces increasing `seq` and `pts_ns` from any sender.
 
-    A frame that comes twice and one that comes after its time are dropped. A sender that begins again (its numbers or its time fall back)
-    or whose clock is set goes on from where it was: the step between the two frames is what our own clock says. Everything is counted.
+    Duplicate and late frames are dropped. If a sender restarts or its clock is changed, numbers and
+    timestamps continue; the step between the two frames is measured with the local clock. All
+    repairs are counted.
     """
 
     def __init__(self, *, trusted: bool = False) -> None:
-        """trusted: the sender's numbers and times are in order but begin anew after `restart`; nothing else is looked at."""
+        """trusted: numbers and timestamps are in order, and only `restart` makes them continue."""
         self._trusted = trusted
         self._counts: Counter[str] = Counter()
         self.begin()
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How often what was done, by reason: `duplicates`, `out_of_order`, `missing`, `clock_resets`, `clock_jumps`, `repaired_times`."""
+        """Number of repairs by reason: `duplicates`, `out_of_order`, `missing`, `clock_resets`,
+        `clock_jumps`, `repaired_times`.
+        """
         return self._counts
 
     def begin(self) -> None:
-        """Forget everything: the next frame is the first one, and gets number 0 and time 0."""
+        """Reset everything; the next frame gets number 0 and time 0."""
         self._counts.clear()
-        self._out: Frame | None = None  # as it was handed on
-        self._in: Frame | None = None  # the same, as the sender sent it
+        self._out: Frame | None = None  # last frame, as passed on
+        self._in: Frame | None = None  # last frame, as received
         self._arrived_ns = 0
         self._seq_offset = self._pts_offset_ns = 0
         self._late: Frame | None = None
@@ -50,15 +58,20 @@ class FrameOrder:
         self._restarted = False
 
     def restart(self) -> None:
-        """The next frame comes over a new connection: what it says of numbers and times begins anew."""
+        """Continue numbers and timestamps with the next frame, which arrives over a new connection."""
         self._restarted = True
 
     def take(self, frame: Frame, arrived_ns: int) -> Frame | None:
-        """The frame with its number and time put right; None for one to be dropped. arrived_ns: when it came in."""
+        """Return the frame with repaired number and timestamp; None to drop it.
+
+        Args:
+            frame: the received frame.
+            arrived_ns: its arrival by the local monotonic clock, in nanoseconds.
+        """
         known, out = self._in, self._out
         if known is None:
             if not self._trusted:
-                # From nought: a time since the start of some machine has too many digits for single precision.
+                # Start at 0, because large timestamps lose precision in float32.
                 self._seq_offset, self._pts_offset_ns = -frame.seq, -frame.pts_ns
             return self._accept(frame, frame.pts_ns + self._pts_offset_ns, arrived_ns)
         assert out is not None
@@ -87,7 +100,9 @@ class FrameOrder:
         return self._accept(frame, pts_ns, arrived_ns)
 
     def _is_a_new_beginning(self, frame: Frame) -> bool:
-        """Whether the late frames of late are a stream of their own."""
+        """Return True if the recent late frames form a consecutive stream, so that the sender has
+        restarted.
+        """
         late = self._late
         goes_on = late is not None and frame.seq > late.seq and frame.pts_ns >= late.pts_ns
         self._late_count = self._late_count + 1 if goes_on else 1
@@ -95,7 +110,9 @@ class FrameOrder:
         return self._late_count >= RESET_FRAMES
 
     def _rebase(self, frame: Frame, arrived_ns: int, reason: str | None) -> Frame:
-        """Go on from the last frame by as much time as passed here, with the next number."""
+        """Continue with the next number, and with the time elapsed on the local clock since the
+        last frame.
+        """
         assert self._out is not None
         if reason is not None:
             self._counts[reason] += 1
@@ -114,5 +131,5 @@ class FrameOrder:
 
 
 def same_picture(a: Frame, b: Frame) -> bool:
-    """Whether two frames show the same bytes."""
+    """Return True if both frames have identical pixels."""
     return a.image.shape == b.image.shape and np.array_equal(a.image, b.image)

@@ -1,4 +1,6 @@
-"""Raw frames on a pipe: what `ffmpeg -f rawvideo`, `ffmpeg -f yuv4mpegpipe` or `gst-launch … ! fdsink` write for a capture card."""
+"""Source that reads raw frames from a pipe, such as those of `ffmpeg -f rawvideo`, `ffmpeg -f
+yuv4mpegpipe` or `gst-launch … ! fdsink`.
+"""
 
 from __future__ import annotations
 
@@ -22,25 +24,34 @@ from operators.sources.y4m import FRAME, MOST_HEADER_BYTES, Y4mHeader
 
 LOOK_S = 0.05
 HEADER_TIMEOUT_S = 30.0
-"""How long the first line of a stream that describes itself may take."""
+"""Timeout for the header line of a YUV4MPEG2 stream, in seconds."""
 PIPE_BYTES = 1 << 20
-"""What a pipe is asked to hold: a frame takes fewer reads then."""
+"""Requested capacity of the pipe in bytes, to reduce the number of reads per frame."""
 
 
 class Ended(Exception):
-    """The writer has closed the pipe, or the source is being closed."""
+    """The writer closed the pipe, or the source is being closed."""
 
 
 class PipeSource(StreamSource):
-    """Frames from a pipe of the file system or from standard input.
+    """Reads frames from a named pipe or from standard input.
 
-    A writer of a named pipe may go and another one come: the state is `RECONNECTING` in between. When standard input ends, so does the source.
+    A named pipe may change its writer; the state is `RECONNECTING` in between. The end of standard
+    input ends the source.
     """
 
     def __init__(self, path: str, layout: RawFormat | None, fps: float | None, options: SourceOptions) -> None:
-        """path: of a named pipe, or `-`. layout: None for a stream that describes itself, whose first line is waited for here.
+        """Open the pipe and describe the source.
 
-        Raises SourceUnavailable when there is no such pipe or no such line, InvalidSetting for what the line says.
+        Args:
+            path: a named pipe, or `-` for standard input.
+            layout: format of the frames; None for a YUV4MPEG2 stream, whose header is awaited here.
+            fps: frame rate; None for that of the header.
+            options: source options.
+
+        Raises:
+            SourceUnavailable: the pipe does not exist, or no header arrived in time.
+            InvalidSetting: the header is invalid.
         """
         super().__init__(options)
         self._path, self._again = path, path != "-"
@@ -98,7 +109,9 @@ class PipeSource(StreamSource):
                     self._raw = None
 
     def _frames_of_a_writer(self) -> Iterator[memoryview]:
-        """The bytes of one frame after another. Raises Ended when the writer is gone, SourceLost when it is out of step."""
+        """Yield the bytes of each frame. Raises Ended if the writer is gone, SourceLost if the
+        stream is out of sync.
+        """
         if self._raw is None:
             self._read_header(None)
         assert self._raw is not None
@@ -117,7 +130,7 @@ class PipeSource(StreamSource):
         self._fps = self._fps or header.fps
 
     def _line(self, until_s: float | None) -> bytes:
-        """Up to the next line end, which is taken, too."""
+        """Read up to the next line end, which is consumed."""
         while b"\n" not in self._pending:
             if len(self._pending) > MOST_HEADER_BYTES:
                 raise InvalidSetting(
@@ -128,7 +141,7 @@ class PipeSource(StreamSource):
         return line
 
     def _exactly(self, count: int) -> memoryview:
-        """So many bytes, in a buffer that the next call writes to."""
+        """Read `count` bytes into a buffer that the next call overwrites."""
         if len(self._buffer) != count:
             self._buffer = bytearray(count)
         view = memoryview(self._buffer)
@@ -154,7 +167,7 @@ class PipeSource(StreamSource):
                 data = os.read(self._fd, count)
                 if data:
                     return data
-                # At the beginning a named pipe has nobody who writes to it yet.
+                # A named pipe has no writer at the beginning.
                 if until_s is None or not self._again or self._pending or self.wait(LOOK_S):
                     raise Ended
 
@@ -184,7 +197,7 @@ class PipeSource(StreamSource):
         if not stat.S_ISFIFO(os.fstat(fd).st_mode):
             os.close(fd)
             raise SourceUnavailable(f"{self._path} is no pipe. Make one with mkfifo, or give a recording by its path.")
-        with contextlib.suppress(OSError, AttributeError):  # it works with less
+        with contextlib.suppress(OSError, AttributeError):  # works with less
             fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         return fd
 
@@ -195,7 +208,9 @@ class PipeSource(StreamSource):
 
 
 def pipe_source(rest: str, options: SourceOptions) -> PipeSource:
-    """`pipe:-?size=640x512&format=rgb24&fps=30`, `pipe:/path/of/a/fifo`. Raises InvalidSetting and SourceUnavailable."""
+    """Open `pipe:-?size=640x512&format=rgb24&fps=30` or `pipe:/path/of/a/fifo`. Raises
+    InvalidSetting and SourceUnavailable.
+    """
     address = Address.parse("pipe", rest)
     size, name = address.size(), address.text("format")
     fps = address.number("fps", options.fps, 0.01, MAX_FPS)

@@ -1,4 +1,6 @@
-"""A source in a process of its own: whatever a driver or a decoder does, the reader goes on."""
+"""Source in a separate process, which isolates the reader from blocking drivers and crashing
+decoders.
+"""
 
 from __future__ import annotations
 
@@ -25,21 +27,22 @@ from operators.sources.wire import description_from, finite_counts, frame_from
 log = logging.getLogger(__name__)
 OPENER = "operators.sources.registry:open_source"
 OPEN_TIMEOUT_S = 30.0
-"""How long the process may take to start and to open its source."""
+"""Timeout for the process to start and to open its source, in seconds."""
 HUNG_AFTER_S = 5.0
-"""A process that says nothing for so long does not work any more."""
+"""Time without a message, in seconds, after which the process is considered hung."""
 ON_DISK = frozenset({"recording", "realtime"})
-"""Sources that do not come back once they are gone."""
+"""Schemes of sources on disk, which are not retried after a failure to open."""
 MOST_FAILURES = 10
-"""So many processes in a row that gave no frame are given up."""
+"""Maximum number of consecutive processes without a frame before the source is given up."""
 LOOK_S = 0.05
 
 
 class ProcessSource(LiveSource):
-    """Runs the source at an address in a child process, and starts another one when that ends, hangs or fails.
+    """Reads a source in a child process, which is restarted after an exit, hang or failure.
 
-    Its frames come through shared memory, numbers and times go on over a restart. Making the object starts the process, which opens the source:
-    what it cannot open is an error here. `close` ends it.
+    Frames arrive through shared memory. Numbers and timestamps continue over a restart. The
+    constructor starts the process and raises if the source cannot be opened. `close` ends the
+    process.
     """
 
     def __init__(
@@ -52,10 +55,23 @@ class ProcessSource(LiveSource):
         stuck_after_s: float = math.inf,
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
-        """opener: `module:function` that makes the source from address and options, in the process. hung_after_s: a process that says nothing
-        for so long is replaced. stuck_after_s: so is one whose source stalls for so long. Raises SourceUnavailable with what it said."""
+        """Start the process and wait for the description of the source.
+
+        Args:
+            address: address of the source.
+            options: source options.
+            opener: `module:function` called in the process with address and options.
+            hung_after_s: time without a message after which the process is replaced, in seconds.
+            stuck_after_s: time without a frame of a stalled source after which the process is
+                replaced.
+            open_timeout_s: timeout for opening the source, in seconds.
+
+        Raises:
+            SourceUnavailable: the source cannot be opened; has the message of the process.
+        """
         options = options or SourceOptions()
-        # The process knows best whether its source stalls, and counts it; whether the process itself does is asked in `state`.
+        # The process detects and counts stalls of its source; `state` detects stalls of the
+        # process.
         super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
         self._scheme = split_address(address)[0]
@@ -72,7 +88,9 @@ class ProcessSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """See `FrameSource`. What the process says of its source counts as long as the process itself is well."""
+        """State of the source. The state reported by the process applies while the process
+        responds.
+        """
         state, told, child = super().state, self._child_state, self._child
         if state is not SourceState.LIVE or self._ready:
             return state
@@ -91,7 +109,7 @@ class ProcessSource(LiveSource):
         return super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
-        """See `LiveSource`: what was dropped in the process and here."""
+        """Return the numbers of items dropped or repaired in the process and here, by reason."""
         counts = Counter(super().counts())
         counts.update(self._earlier_counts)
         counts.update(self._child_counts)
@@ -110,7 +128,7 @@ class ProcessSource(LiveSource):
         self._end()
 
     def frames(self) -> Iterator[Frame]:
-        """The frames of one process after another."""
+        """Yield the frames of successive processes."""
         backoff, crashes = Backoff(), 0
         try:
             while True:
@@ -128,7 +146,7 @@ class ProcessSource(LiveSource):
                     self._child_counts, self._child_state = {}, None
                     name = self.description.name
                     delay_s = backoff.failed()
-                    # A camera that is not there may come back; files that are gone, and what ends its process again and again, will not.
+                    # A missing camera may return. Missing files and repeated crashes are permanent.
                     comes_back = isinstance(error, SourceUnavailable) and self._scheme not in ON_DISK
                     crashes = 0 if comes_back else crashes + 1
                     if crashes >= MOST_FAILURES:
@@ -143,7 +161,7 @@ class ProcessSource(LiveSource):
             self._end()
 
     def _received(self) -> Iterator[Frame]:
-        """What the present process gives, until it says that its source has ended. Raises ChildLost."""
+        """Yield the frames of the current process until its source ends. Raises ChildLost."""
         child = self._child
         assert child is not None
         child.say("open")
@@ -171,11 +189,11 @@ class ProcessSource(LiveSource):
         except (BadHeader, TypeError, ValueError) as error:
             raise ChildLost(f"its frame cannot be read: {error}") from error
         child.say("free", slot=told.get("slot"))
-        self._child_state = None  # what it said of its state was before this frame
+        self._child_state = None  # the last reported state is older than this frame
         return frame
 
     def _note(self, told: dict[str, Any]) -> None:
-        """Everything but a frame."""
+        """Process a message other than a frame."""
         kind = told["kind"]
         if kind == "state":
             try:
@@ -190,10 +208,15 @@ class ProcessSource(LiveSource):
             raise ChildLost(str(told.get("error")))
 
     def _start(self) -> SourceDescription:
-        """A new process, once it has opened its source. Raises SourceUnavailable with what the source says, and ChildLost."""
+        """Start a process and wait until it has opened its source.
+
+        Raises:
+            SourceUnavailable: the source cannot be opened.
+            ChildLost: the process failed or timed out.
+        """
         child = ChildProcess(self._opening)
         self._child = child
-        self._finalizer = weakref.finalize(self, child.end)  # a source that is forgotten leaves no process
+        self._finalizer = weakref.finalize(self, child.end)  # ends the process of a source that was never closed
         try:
             return self._described(child)
         except BaseException:
@@ -220,7 +243,7 @@ class ProcessSource(LiveSource):
         raise ChildLost("it was no longer wanted")
 
     def _end(self, *, kill: bool = False) -> None:
-        """End the present process."""
+        """End the current process."""
         child, self._child = self._child, None
         if child is None:
             return

@@ -1,4 +1,4 @@
-"""Pictures as plain bytes, in the formats that capture programs write: how long they are, and RGB from them."""
+"""Raw pixel formats of capture programs: sizes and conversion to RGB."""
 
 from __future__ import annotations
 
@@ -26,25 +26,27 @@ PLANES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "yuyv422": ((2, 1, 4),),
     "uyvy422": ((2, 1, 4),),
 }
-"""Each plane of a format, by FFmpeg's names: by how much it is narrower and lower than the picture, and the bytes of one of its elements."""
+"""Planes by FFmpeg's format name: horizontal and vertical subsampling, and bytes per element."""
 
 
 class RawFormat:
-    """Pictures of one size and format, without gaps between rows and planes, as `ffmpeg -f rawvideo` and GStreamer's `fdsink` write them."""
+    """Format of contiguous pictures of one size, as written by `ffmpeg -f rawvideo` and GStreamer's
+    `fdsink`.
+    """
 
     def __init__(self, name: str, width_px: int, height_px: int) -> None:
-        """Raises InvalidSetting for a format that is not known or a size that cannot be used."""
+        """Raises InvalidSetting for an unknown format or an unusable size."""
         if name not in PLANES:
             raise InvalidSetting(f"format is {name!r:.60}; known are {', '.join(PLANES)}")
         check_size("raw frames", width_px, height_px)
         self.name, self.width_px, self.height_px = name, width_px, height_px
         self._planes = [(-(-width_px // across) * size, -(-height_px // down)) for across, down, size in PLANES[name]]
         self.frame_bytes = sum(row * rows for row, rows in self._planes)
-        """Of one picture."""
+        """Size of one picture in bytes."""
         self._converter = PictureConverter(0)
 
     def picture(self, data: memoryview | bytes) -> NDArray[np.uint8]:
-        """RGB uint8 [H, W, 3], in memory of its own, from the bytes of one picture."""
+        """Convert the bytes of one picture to a new uint8 RGB array [H, W, 3]."""
         values = np.frombuffer(data, np.uint8, self.frame_bytes)
         shape = self.height_px, self.width_px
         if self.name == "rgb24":

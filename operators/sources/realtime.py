@@ -1,4 +1,4 @@
-"""A recording played as if it were a camera: each frame at its time, over and over where it is asked for."""
+"""Playback of a recording in real time, optionally in a loop."""
 
 from __future__ import annotations
 
@@ -19,24 +19,29 @@ from operators.sources.options import MAX_FPS, MAX_SPEED, SourceOptions
 from operators.sources.source import SourceDescription
 
 DECODED_AHEAD = 4
-"""Frames that are decoded and wait for their time."""
+"""Number of frames decoded in advance."""
 REMEMBERED_BYTES = 512 * 2**20
-"""A looped recording whose frames take no more is decoded once."""
+"""Maximum size of a looped recording that is kept decoded in memory."""
 GIVEN_UP_S = 0.5
-"""When a frame is ready so long after its time, the clock starts again from there: nobody catches up by hurrying through what is over."""
+"""Delay of a frame in seconds after which the playback clock is shifted instead of catching up."""
 
 
 class RealtimeSource(LiveSource):
-    """Plays `recording` on the monotonic clock, with the masks, poses and depth that it has.
+    """Plays `recording` by the monotonic clock with its masks, poses and depth.
 
-    A frame is released when its time has come, whether or not somebody reads. Looped, its numbers and times go on: the first frame of a
-    round comes one frame's duration after the last one of the round before. `too_late` counts the frames that nobody took in time,
-    `decoded_late` those that were not ready at their time.
+    Each frame is released at its time, independent of the consumer. In a loop, numbers and
+    timestamps continue with one frame interval between rounds. `too_late` counts frames that the
+    consumer did not read in time, `decoded_late` frames that were not decoded in time.
     """
 
     def __init__(self, recording: Recording, options: SourceOptions | None = None) -> None:
-        """options: `loop`, `speed` (`math.inf`: each frame as soon as the one before it is taken, none dropped), `fps` in place of the
-        recording's own rate, `max_frames` over all rounds, `waiting`. Raises InvalidSetting."""
+        """Describe the playback.
+
+        Args:
+            recording: the recording.
+            options: `loop`, `bounce`, `speed`, `fps`, `max_frames` over all rounds, and `waiting`
+                apply.
+        """
         options = options or SourceOptions()
         super().__init__(waiting=options.waiting, drops=math.isfinite(options.speed))
         self.recording, self.options = recording, options
@@ -51,19 +56,20 @@ class RealtimeSource(LiveSource):
             fps=fps,
             camera=recording.camera,
             fields=recording.fields,
-            # A looped one has an end only where it is asked for.
+            # A looped recording has an end only with `max_frames`.
             frame_count=options.max_frames if count is None else min(count, options.max_frames or count),
             notes=recording.notes,
         )
 
     def frames(self) -> Iterator[Frame]:
-        """Each frame at its time."""
+        """Yield each frame at its time."""
         speed = self.options.speed
         start_ns: int | None = None
         with closing(read_ahead(self._numbered(), f"decode {self.description.name}", DECODED_AHEAD)) as decoded:
             for frame in decoded:
                 if math.isfinite(speed):
-                    # The clock starts with the first picture: opening a file is no delay of the second one.
+                    # The clock starts with the first picture, so that opening the file does not
+                    # delay the second one.
                     start_ns = time.monotonic_ns() if start_ns is None else start_ns
                     due_ns = start_ns + round(frame.pts_ns / speed)
                     late_ns = time.monotonic_ns() - due_ns
@@ -77,7 +83,7 @@ class RealtimeSource(LiveSource):
                 yield frame
 
     def _numbered(self) -> Generator[Frame, None, None]:
-        """The frames of all rounds, with numbers and times that go on."""
+        """Yield the frames of all rounds with continuous numbers and timestamps."""
         most = self.description.frame_count or math.inf
         seq, pts_ns = 0, 0
         for frames in self._rounds():
@@ -95,7 +101,7 @@ class RealtimeSource(LiveSource):
             pts_ns = end_ns
 
     def _rounds(self) -> Iterator[Iterator[Frame]]:
-        """Round after round; from the second one on out of memory, where the frames fit."""
+        """Yield the rounds; from the second one on from memory if the frames fit."""
         if not self.options.loop:
             yield iter(self.recording)
             return
@@ -113,12 +119,14 @@ class RealtimeSource(LiveSource):
             yield iter(remembered or self.recording)
 
     def _backwards(self, forwards: list[Frame]) -> list[Frame]:
-        """The frames between the last and the first, with times that rise."""
+        """Return the frames between the last and the first in reverse, with increasing timestamps."""
         last_ns = forwards[-1].pts_ns
         return [replace(frame, pts_ns=last_ns - frame.pts_ns) for frame in reversed(forwards[1:-1])]
 
     def _remembering(self, remembered: list[Frame]) -> Iterator[Frame]:
-        """The frames of the first round; `remembered` has them afterwards, unless they are too large."""
+        """Yield the frames of the first round, storing them in `remembered` unless they are too
+        large.
+        """
         size = 0
         fits = True
         for frame in self.recording:
@@ -134,7 +142,10 @@ class RealtimeSource(LiveSource):
 
 
 def realtime_source(rest: str, options: SourceOptions) -> RealtimeSource:
-    """`realtime:PATH?loop=1&speed=2&fps=60`; `loop=bounce` plays each second round backwards. Raises as `open_recording`, and InvalidSetting for options that are wrong."""
+    """Open `realtime:PATH?loop=1&speed=2&fps=60`; `loop=bounce` plays every second round backwards.
+
+    Raises InvalidSetting for invalid options, and the errors of `open_recording`.
+    """
     address = Address.parse("realtime", rest)
     bounces = address.text("loop") == "bounce"
     options = replace(
@@ -149,7 +160,7 @@ def realtime_source(rest: str, options: SourceOptions) -> RealtimeSource:
 
 
 def play(path: str, options: SourceOptions) -> RealtimeSource:
-    """A recording on disk in real time."""
+    """Open a recording on disk for playback in real time."""
     recording = open_recording(path, scale=options.scale, max_frames=None if options.loop else options.max_frames)
     if recording.frame_count < 1:
         raise InvalidSetting(f"{recording.name} has no frames")

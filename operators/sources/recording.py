@@ -1,4 +1,4 @@
-"""A recording played as a source: every frame once, as fast as they are taken."""
+"""Source that reads a recording once, as fast as frames are consumed."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from operators.sources.threaded import ThreadedSource
 
 
 class RecordingSource(ThreadedSource):
-    """Plays `recording` from its beginning. Nothing is dropped and time plays no part, so a run on it can be repeated.
+    """Reads `recording` from its beginning, without drops or timing, so that a run is reproducible.
 
-    The next frames are decoded while the graph works on the present one.
+    The next frames are decoded in advance.
     """
 
     def __init__(self, recording: Recording, *, ahead: int = 2) -> None:
@@ -25,7 +25,7 @@ class RecordingSource(ThreadedSource):
 
     @cached_property
     def description(self) -> SourceDescription:  # type: ignore[override]
-        """See `FrameSource`. The digest is computed when this is first asked for."""
+        """Description of the source. The digest is computed on first access."""
         recording = self.recording
         return SourceDescription(
             name=recording.name,
@@ -40,12 +40,14 @@ class RecordingSource(ThreadedSource):
         )
 
     def frames(self) -> Iterator[Frame]:
-        """The recording's frames, in order."""
+        """Return an iterator over the recording's frames, in order."""
         return iter(self.recording)
 
 
 def recording_source(address: str, options: SourceOptions) -> FrameSource:
-    """A recording on disk, by its path, by the clock where that is asked for. Raises as `open_recording`."""
+    """Open a recording by its path, in real time if requested. Raises the errors of
+    `open_recording`.
+    """
     if options.realtime:
         return play(address, options)
     return RecordingSource(open_recording(address, scale=options.scale, max_frames=options.max_frames))

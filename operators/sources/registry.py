@@ -1,4 +1,6 @@
-"""Sources by name: the scheme of an address, as in `scheme:place`, `scheme://place` or the path of a recording."""
+"""Registry of sources by the scheme of an address: `scheme:place`, `scheme://place`, or a
+recording's path.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from operators.sources.source import FrameSource
 __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "open_source", "split_address"]
 
 SourceFactory = Callable[[str, SourceOptions], FrameSource]
-"""From what follows the scheme, and the options, to a source that is not open yet. Raises a UserError for what cannot be read."""
+"""Creates a closed source from the text after the scheme and the options. Raises a UserError if it
+is unusable.
+"""
 
 _URLS = ("rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https")
 
@@ -38,26 +42,31 @@ SOURCES: Registry[SourceFactory] = Registry(
 )
 
 _OF_PATHS = frozenset({"recording", "realtime", "folder", "v4l2", "pipe", "zmq+ipc"})
-"""What follows these schemes is a path, which may begin with a slash."""
+"""Schemes followed by a path, which may begin with a slash."""
 _BLOCKING = frozenset({*_URLS, "v4l2"})
-"""Sources that wait within a library or a driver: they read in a process of their own."""
+"""Schemes of sources that block in a library or driver and are therefore read in a separate
+process.
+"""
 
 _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
-"""It renders before it plays."""
+"""Opening timeouts of slow sources in seconds; `synthetic` renders before it plays."""
 STUCK_AFTER_S = {"v4l2": 5.0}
-"""A driver may wait for a camera for ever; only the end of the process that reads ends that."""
+"""Time in seconds after which the process of a stalled source is replaced; a driver may block
+forever.
+"""
 _TWO_SOURCES = "stereo:"
 _STEREO = re.compile(r"(?P<before>[?&#])stereo=(?P<layout>[^&#]*)")
 
-# Two letters at least: one is a drive. A Path keeps only one of two slashes.
+# At least two letters, as a single letter is a drive. A Path collapses two slashes into one.
 _ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):(?P<slashes>/{0,2})(?P<rest>.*)", re.DOTALL)
 
 
 def split_address(address: str | os.PathLike[str]) -> tuple[str, str]:
-    """The scheme of an address and what follows it.
+    """Split an address into its scheme and the rest.
 
-    A path that exists is a path, whatever it looks like, and so is what has neither a known scheme nor a slash behind it.
+    An existing path is always a recording, and so is text without a known scheme or slashes after
+    it.
     """
     text = os.fspath(address)
     match = None if _exists(text) else _ADDRESS.fullmatch(text)
@@ -68,10 +77,21 @@ def split_address(address: str | os.PathLike[str]) -> tuple[str, str]:
 
 
 def open_source(address: str | os.PathLike[str], options: SourceOptions | None = None) -> FrameSource:
-    """The source at `address`: `scheme://rest` or `scheme:rest`, with a scheme in `SOURCES`, or the path of a recording.
+    """Create the source at an address.
 
-    `stereo=side_by_side` or `stereo=top_bottom` among an address's options splits the picture into two eyes; `stereo:LEFT|RIGHT` joins two
-    sources. Raises InvalidSetting for a scheme that is not known, and as the source's factory.
+    The option `stereo=side_by_side` or `stereo=top_bottom` in the address splits the picture into
+    two eyes. `stereo:LEFT|RIGHT` joins two sources.
+
+    Args:
+        address: `scheme://rest` or `scheme:rest` with a scheme in `SOURCES`, or a recording's path.
+        options: source options.
+
+    Returns:
+        The source, not yet opened.
+
+    Raises:
+        InvalidSetting: the scheme is unknown.
+        UserError: the source's factory rejected the address.
     """
     options = options or SourceOptions()
     text = os.fspath(address)
@@ -87,7 +107,7 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     if scheme in _URLS and scheme in _BUILT_IN:
         from operators.sources.url_address import UrlAddress
 
-        # A malformed address is refused here, and not once the reading process has started and the connection has timed out.
+        # Reject a malformed address before a process is started and a connection times out.
         UrlAddress.parse(scheme, rest)
     if _reads_in_a_process(scheme, rest, options):
         from operators.sources.process import OPEN_TIMEOUT_S, ProcessSource
@@ -104,14 +124,16 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
 
 
 def _reads_in_a_process(scheme: str, rest: str, options: SourceOptions) -> bool:
-    # Another process has neither this one's standard input nor what was registered here.
+    # A separate process has neither this process's standard input nor its registered sources.
     if scheme not in _BUILT_IN or (scheme == "pipe" and rest.partition("?")[0] == "-"):
         return False
     return scheme in _BLOCKING if options.process is None else options.process
 
 
 def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout | None]:
-    """An address without `stereo=…` among its options, and what that or the options say."""
+    """Return the address without its `stereo` option, and the stereo layout from it or from the
+    options.
+    """
     if _exists(address) or not _ADDRESS.fullmatch(address):
         return address, options.stereo
     said = _STEREO.search(address)
@@ -120,7 +142,7 @@ def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout 
     layout = said["layout"]
     if layout not in get_args(StereoLayout):
         raise InvalidSetting(f"stereo is {layout!r:.60}; choose {' or '.join(get_args(StereoLayout))}")
-    # `?stereo=x&more` leaves `?more`, `&stereo=x` leaves nothing.
+    # `?stereo=x&more` becomes `?more`, and `&stereo=x` is removed.
     before, after = address[: said.start()], address[said.end() :]
     if said["before"] == "?" and after.startswith("&"):
         after = "?" + after[1:]
@@ -160,5 +182,5 @@ def _joined(addresses: str, options: SourceOptions) -> FrameSource:
 def _exists(text: str) -> bool:
     try:
         return Path(text).exists()
-    except (OSError, ValueError):  # too long for a path, or with a zero byte in it
+    except (OSError, ValueError):  # too long for a path, or with a zero byte
         return False

@@ -1,4 +1,4 @@
-"""A source whose frames are resized where they are read: for a size that is chosen after the source was opened."""
+"""Source that resizes the frames of another source, for a size chosen after opening."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from operators.sources.source import FrameSource, ReportingSource, SourceDescrip
 
 
 def scaled_description(about: SourceDescription, scale: float) -> SourceDescription:
-    """Describe a source whose frames are resized by `scale`."""
+    """Return the description of a source whose frames are resized by `scale`."""
     camera = about.camera.scaled(scale)
     return replace(about, width_px=camera.width_px, height_px=camera.height_px, camera=camera)
 
 
 class ScaledSource:
-    """A `FrameSource` that resizes the frames of another one."""
+    """`FrameSource` that resizes the frames of another source."""
 
     def __init__(self, source: FrameSource, scale: float) -> None:
-        """`source` is opened and closed with this one."""
+        """Wrap a source.
+
+        Args:
+            source: opened and closed together with this one.
+            scale: factor on width and height.
+        """
         self._source = source
         self.description = scaled_description(source.description, scale)
 
@@ -43,7 +48,9 @@ class ScaledSource:
         self._source.open()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """See `FrameSource`. A frame that changes its size on the way keeps the factor, and is no frame of this stream's size."""
+        """Read a frame and resize it. A frame of another size keeps the factor instead of the
+        stream's size.
+        """
         frame = self._source.read(timeout_s)
         if frame is None:
             return None

@@ -1,4 +1,6 @@
-"""The frames of a recorded session as training was given them: with all that was found out about them at the time."""
+"""Source that reads the prepared frames of a recorded session, with the analysis results of that
+time.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,16 @@ from operators.sources.threaded import ThreadedSource
 
 
 class SessionSource(ThreadedSource):
-    """Plays a session's frames once, in order, as fast as they are taken."""
+    """Reads a session's prepared frames once, in order, as fast as they are consumed."""
 
     def __init__(self, reader: SessionReader, recording: Recording, *, max_frames: int | None = None) -> None:
-        """recording: the same session as a recording, for what is known about it."""
+        """Describe the source.
+
+        Args:
+            reader: reader of the session.
+            recording: the same session as a recording, for the description.
+            max_frames: maximum number of frames; None for all.
+        """
         super().__init__()
         self._reader = reader
         count = reader.prepared_count

@@ -1,6 +1,7 @@
-"""Frames in memory that two processes see.
+"""Shared memory for frames between two processes.
 
-The memory has no name: it is a file that exists only as long as one of the two processes has it open, so nothing is left behind, however they end.
+The memory is an anonymous file, which exists only while one of the processes has it open. It leaves
+nothing behind even after a crash.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 
 SLOTS = 4
-"""Frames that may be under way at once."""
+"""Number of frames in flight."""
 _ALIGNMENT = 64
 PLANES: Mapping[str, tuple[str, int | None]] = {
     "image": ("|u1", 3),
@@ -27,26 +28,28 @@ PLANES: Mapping[str, tuple[str, int | None]] = {
     "mask": ("|u1", None),
     "pose": ("<f8", None),
 }
-"""A frame's fields that are arrays: their type, and how many channels the picture has."""
+"""Array fields of a frame: data type and number of channels."""
 
 
 class BadHeader(Exception):
-    """What one process says of a frame does not fit the memory."""
+    """The header of a frame does not match the shared memory."""
 
 
 def new_memory() -> int:
-    """A file descriptor of shared memory, empty, that a child process may inherit."""
+    """Return a file descriptor of empty shared memory, inheritable by a child process through
+    `pass_fds`.
+    """
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("frames", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        # Memory that shrinks under a reader would kill it.
+        # Shrinking the memory would crash the reader.
         fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
         return fd
-    with tempfile.TemporaryFile() as file:  # has no name either
+    with tempfile.TemporaryFile() as file:  # also anonymous
         return os.dup(file.fileno())
 
 
 class FrameWriter:
-    """The side that puts frames there."""
+    """Writer of frames to shared memory."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
@@ -54,11 +57,11 @@ class FrameWriter:
         self._slot_bytes = 0
 
     def fits(self, planes: Mapping[str, NDArray]) -> bool:
-        """Whether a frame fits into a slot as they are."""
+        """Return True if the frame's arrays fit into a slot."""
         return _laid_out(planes)[1] <= self._slot_bytes
 
     def grow(self, planes: Mapping[str, NDArray]) -> None:
-        """Make the slots as large as this frame; no slot may be in use."""
+        """Enlarge the slots for this frame; no slot may be in use."""
         if self._memory is not None:
             self._memory.close()
         self._slot_bytes = _laid_out(planes)[1]
@@ -66,7 +69,9 @@ class FrameWriter:
         self._memory = mmap.mmap(self._fd, SLOTS * self._slot_bytes)
 
     def write(self, slot: int, planes: Mapping[str, NDArray]) -> list[Any]:
-        """Copy a frame's arrays into a slot; what the other side needs to find them."""
+        """Copy a frame's arrays into a slot. Return their names, offsets and shapes for
+        `FrameReader.read`.
+        """
         assert self._memory is not None
         begins, _ = _laid_out(planes)
         found = []
@@ -75,26 +80,26 @@ class FrameWriter:
             kind = np.dtype(PLANES[name][0])
             there = np.frombuffer(self._memory, kind, plane.size, offset).reshape(plane.shape)
             there[...] = plane
-            del there  # the memory cannot be closed while an array points into it
+            del there  # mmap cannot be closed while an array refers to it
             found.append([name, offset, list(plane.shape)])
         return found
 
 
 class FrameReader:
-    """The side that takes frames out."""
+    """Reader of frames from shared memory."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._memory: mmap.mmap | None = None
 
     def read(self, found: Any) -> dict[str, NDArray]:
-        """Copies of a frame's arrays. Raises BadHeader for what cannot be a frame or lies outside of the memory."""
+        """Return copies of a frame's arrays. Raises BadHeader for invalid arrays or positions."""
         if not isinstance(found, list) or not 1 <= len(found) <= len(PLANES):
             raise BadHeader(f"a frame cannot have the arrays {found!r:.80}")
         return {name: self._plane(name, offset, shape) for name, offset, shape in found}
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap the memory."""
         if self._memory is not None:
             self._memory.close()
             self._memory = None
@@ -123,7 +128,7 @@ class FrameReader:
 
 
 def _laid_out(planes: Mapping[str, NDArray]) -> tuple[list[int], int]:
-    """Where each array of a frame begins within a slot, and how many bytes they take."""
+    """Return the offset of each array within a slot, and the total size in bytes."""
     begins, end = [], 0
     for name, plane in planes.items():
         begins.append(end)

@@ -1,4 +1,4 @@
-"""What every source of frames promises, whether it has an end or not."""
+"""Protocol of frame sources, finite or endless."""
 
 from __future__ import annotations
 
@@ -12,90 +12,98 @@ from gsplat_core.scene.frames import Frame
 
 
 class SourceState(Enum):
-    """What a source is doing."""
+    """State of a source."""
 
     LIVE = "live"
-    """Frames come as they should."""
+    """Frames arrive as expected."""
     STALLED = "stalled"
-    """It is open, and no frame has come for longer than it should take."""
+    """The source is open, but no frame has arrived for longer than expected."""
     RECONNECTING = "reconnecting"
-    """The connection is lost and is being made again."""
+    """The connection was lost and is being re-established."""
     ENDED = "ended"
-    """Nothing more will come: it has given its last frame, failed, or is not open."""
+    """No more frames: the source ended, failed, or is not open."""
 
 
 @dataclass(frozen=True)
 class SourceDescription:
-    """What is known about a source before its first frame."""
+    """Properties of a source that are known before its first frame."""
 
     name: str
     width_px: int
     height_px: int
     fps: float
-    """Nominal frames per second."""
+    """Nominal frame rate in frames/s."""
     camera: Camera
-    """The camera of the first frame, of the frames' size."""
+    """Camera of the first frame, at the frames' size."""
     fields: frozenset[str] = frozenset()
-    """Which of mask, depth, right_image and pose the frames have."""
+    """Optional fields that the frames have: `mask`, `depth`, `right_image`, `pose`."""
     frame_count: int | None = None
-    """How many frames there are; None for a stream without an end."""
+    """Number of frames; None for an endless stream."""
     digest: str | None = None
-    """SHA-256 of what is read, where the same can be read again."""
+    """SHA-256 of the data; None if they cannot be read again."""
     notes: tuple[str, ...] = ()
-    """Fallbacks that were taken, in sentences."""
+    """Fallbacks and assumptions, as sentences for the user."""
 
     @property
     def is_stereo(self) -> bool:
-        """Whether frames have a picture of the right eye."""
+        """True if frames have a picture of the right eye."""
         return "right_image" in self.fields
 
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """Frames one after another, from a file, a camera or a network.
+    """Sequence of frames from a file, camera or network.
 
-    It may have no end, may stall, and numbers may be missing in `Frame.seq`; `seq` and `pts_ns` never run backwards, and no `seq`
-    comes twice. Reading happens in a thread or a process of the source's own. One consumer calls `open`, `read` and `close`, from one
-    thread at a time; `state` and `description` may be asked for from any thread.
+    A source may be endless and may stall. `seq` increases, possibly with gaps, and `pts_ns` never
+    decreases. Reading happens in the source's own thread or process. One consumer calls `open`,
+    `read` and `close`, from one thread at a time. `state` and `description` are thread-safe.
 
-    A `Recording` (`gsplat_core.io.recordings`) is something else: finite, with random access and a digest. `RecordingSource` plays one.
+    A `Recording` (`gsplat_core.io.recordings`) is finite, with random access and a digest; a
+    `RecordingSource` plays it.
     """
 
     @property
     def description(self) -> SourceDescription:
-        """What is known before the first frame."""
+        """Properties known before the first frame."""
         ...
 
     @property
     def state(self) -> SourceState:
-        """What the source is doing now."""
+        """Current state."""
         ...
 
     def open(self) -> None:
-        """Begin to read. Without effect when it is open."""
+        """Start reading. Idempotent."""
         ...
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame, as soon as there is one. None when none has come within `timeout_s`, or none will come: `state` says which.
+        """Return the next frame as soon as it is available.
 
-        Raises what the source failed with, after the frames that came before.
+        Args:
+            timeout_s: maximum waiting time in seconds.
+
+        Returns:
+            The frame; None after the timeout or at the end, which `state` distinguishes.
+
+        Raises:
+            Exception: the failure of the source, after all earlier frames were returned.
         """
         ...
 
     def close(self) -> None:
-        """Stop reading and release everything. Without effect when it is not open."""
+        """Stop reading and release all resources. Idempotent."""
         ...
 
 
 @runtime_checkable
 class ReportingSource(Protocol):
-    """A `FrameSource` that says more about itself; sources that follow the clock do. Both may be asked for from any thread."""
+    """`FrameSource` with counts and a state message, such as live sources. Both are thread-safe."""
 
     def counts(self) -> Mapping[str, int]:
-        """What was dropped or repaired since `open`, by reason."""
+        """Return the numbers of dropped or repaired items since `open`, by reason."""
         ...
 
     @property
     def state_sentence(self) -> str:
-        """What its state means here, in a sentence without secrets."""
+        """State of the source as a sentence without secrets."""
         ...

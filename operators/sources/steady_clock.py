@@ -1,18 +1,19 @@
-"""Times for frames whose sender states none: even like its frame rate, and true to the clock in the long run."""
+"""Timestamps for frames without any: evenly spaced, and synchronous with the clock in the long run."""
 
 from __future__ import annotations
 
 PULL = 0.05
-"""Which part of its lag behind the clock a frame makes good."""
+"""Share of the lag behind the clock that each frame corrects."""
 JUMP_S = 1.0
-"""A larger lag is a pause of the sender, and is made good at once."""
+"""Lag in seconds that counts as a pause of the sender and is corrected at once."""
 
 
 class SteadyClock:
-    """Gives each frame a time one period after that of the frame before, and a little more when it has fallen behind the clock.
+    """Advances the timestamp by one period per frame, plus a correction if it lags behind the
+    clock.
 
-    The moments at which frames arrive jitter; a deformation that is learned over them would jitter too. Frames that come faster than the
-    stated rate, as those of a file that is piped, keep the rate.
+    Arrival times jitter, which would disturb a deformation learned over time. Frames that arrive
+    faster than the nominal rate, for example from a piped file, keep that rate.
     """
 
     def __init__(self, fps: float) -> None:
@@ -21,7 +22,9 @@ class SteadyClock:
         self._time_ns = 0.0
 
     def time_ns(self, arrived_ns: int) -> int:
-        """The time of a frame that arrived at a moment of the monotonic clock; 0 for the first one."""
+        """Return the timestamp in nanoseconds of a frame that arrived at `arrived_ns`; 0 for the
+        first one.
+        """
         if self._first_ns is None:
             self._first_ns = arrived_ns
             return 0

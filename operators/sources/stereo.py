@@ -1,4 +1,4 @@
-"""Two eyes: lying in one picture, or coming from two sources."""
+"""Stereo sources: both eyes in one picture, or from two sources."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ from operators.sources.options import StereoLayout
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
 
 MOST_KEPT = 8
-"""Right pictures that wait for their left one."""
+"""Maximum number of right pictures kept for pairing."""
 
 
 class SplitSource:
-    """A `FrameSource` whose pictures hold both eyes: `image` becomes the left or upper half of them, `right_image` the other one.
+    """`FrameSource` that splits each picture into a left or upper half (`image`) and the other half
+    (`right_image`).
 
-    Both eyes have the size of a half; a sender that squeezes them is not stretched. What else a frame has belongs to the left eye.
+    Halves that the sender has squeezed are not stretched. All other fields belong to the left eye.
     """
 
     def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
-        """Raises InvalidSetting where there is a right picture already, or a camera that is not that of one eye."""
+        """Raises InvalidSetting if the source already has right pictures, or its camera is not that
+        of one eye.
+        """
         self._source, self._layout = source, layout
         self.description = self._described(source.description)
 
@@ -77,7 +80,7 @@ class SplitSource:
         )
 
     def _half(self, width_px: int, height_px: int) -> tuple[int, int]:
-        # A picture of one pixel has no halves; it is given to both eyes rather than to none.
+        # A picture of one pixel cannot be halved and serves both eyes.
         if self._layout == "side_by_side":
             return max(1, width_px // 2), height_px
         return width_px, max(1, height_px // 2)
@@ -112,16 +115,28 @@ class SplitSource:
 
 
 class JoinedSource(LiveSource):
-    """Two sources as one: each frame of the left one with that frame of the right one which came at nearly the same moment.
+    """Pairs each frame of the left source with the frame of the right source closest in arrival
+    time.
 
-    A left frame waits for its right one for half a frame's duration at most, and then goes without (`without_right`): losing an eye never
-    takes the picture away.
+    A left frame waits for its right one for at most half a frame interval. Without one it is
+    emitted alone and counted as `without_right`, so that a lost eye never interrupts the stream.
     """
 
     def __init__(
         self, left: FrameSource, right: FrameSource, *, waiting: int = 2, apart_s: float | None = None
     ) -> None:
-        """apart_s: how far two frames of a pair may be apart; by default half a frame's duration. Raises InvalidSetting when the sizes differ."""
+        """Join two sources.
+
+        Args:
+            left: source of the left eye.
+            right: source of the right eye.
+            waiting: capacity of the queue for `read`, in frames.
+            apart_s: largest difference of arrival times in a pair, in seconds; None: half a frame
+                interval.
+
+        Raises:
+            InvalidSetting: the sizes differ.
+        """
         super().__init__(waiting=waiting, stalled_after_s=math.inf)
         self._left, self._right = left, right
         about, other = left.description, right.description
@@ -141,19 +156,19 @@ class JoinedSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """See `FrameSource`: that of the left eye, while this source is open."""
+        """State of the left eye while this source is open."""
         state = super().state
         return self._left.state if state is SourceState.LIVE and not self._ready else state
 
     @property
     def state_sentence(self) -> str:
-        """See `ReportingSource`."""
+        """State messages of both eyes."""
         eyes = [("left", self._left), ("right", self._right)]
         said = [f"{name} eye: {eye.state_sentence}" for name, eye in eyes if isinstance(eye, ReportingSource)]
         return "; ".join(said) or super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
-        """See `ReportingSource`: its own, and those of the two sources behind their names."""
+        """Return the counts of this source, and those of both eyes prefixed by `left` or `right`."""
         counts = Counter(super().counts())
         for name, eye in (("left", self._left), ("right", self._right)):
             if isinstance(eye, ReportingSource):
@@ -161,7 +176,7 @@ class JoinedSource(LiveSource):
         return dict(counts)
 
     def frames(self) -> Iterator[Frame]:
-        """The left frames, with their right ones."""
+        """Yield the left frames, paired with right ones."""
         self._left.open()
         self._right.open()
         kept: deque[Frame] = deque(maxlen=MOST_KEPT)
@@ -197,11 +212,13 @@ class JoinedSource(LiveSource):
             self.count("right_of_another_size")
             return frame
         if frame.damage is None and best.damage is not None:
-            # What is learned from the two eyes together is wrong when one of them is.
+            # A damaged eye invalidates what is derived from both.
             return replace(frame, right_image=best.image, damage=f"right eye: {best.damage}", status=best.status)
         return replace(frame, right_image=best.image)
 
 
 def moment_ns(frame: Frame) -> int:
-    """When a frame came in, by the clock that all sources of a machine share; its own time where it is not live."""
+    """Return a frame's arrival time, which is comparable between sources; its timestamp if not
+    live.
+    """
     return frame.pts_ns if frame.arrived_ns is None else frame.arrived_ns

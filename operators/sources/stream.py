@@ -1,4 +1,4 @@
-"""A stream from somewhere else: its camera is assumed, its numbers and times are put right, its frames are resized where that is asked for."""
+"""Base class of streams from external senders: default camera, repaired timestamps, resizing."""
 
 from __future__ import annotations
 
@@ -24,10 +24,17 @@ MIN_SIDE_PX = 8
 
 
 class StreamSource(LiveSource):
-    """A `LiveSource` of frames from a sender that is not ours: a subclass calls `describe` and gives `pictures()`, frames as they come."""
+    """`LiveSource` for an external sender. A subclass calls `describe` and implements `pictures()`."""
 
     def __init__(self, options: SourceOptions, *, stalled_after_s: float = STALLED_AFTER_S) -> None:
-        """options: `scale`, `max_frames`, `waiting`, and `speed` where it is infinite: then nothing is dropped, and the sender waits."""
+        """Set the options.
+
+        Args:
+            options: `scale`, `max_frames` and `waiting` apply. An infinite `speed` makes the sender
+                wait
+                instead of dropping frames.
+            stalled_after_s: time without a frame until the state is `STALLED`, in seconds.
+        """
         super().__init__(
             waiting=options.waiting,
             stalled_after_s=stalled_after_s,
@@ -45,9 +52,17 @@ class StreamSource(LiveSource):
         camera: Camera | None = None,
         fields: frozenset[str] = frozenset(),
     ) -> None:
-        """Set `description`: size in pixels as the frames come, the rate where it is known, the camera where it is known.
+        """Set `description`.
 
-        Raises InvalidSetting for frames that are too large, or too small at the options' scale.
+        Args:
+            name: name of the source for the user.
+            size: width and height of the received frames, in pixels.
+            fps: frame rate; None if unknown.
+            camera: calibration; None if unknown.
+            fields: optional fields that the frames have.
+
+        Raises:
+            InvalidSetting: the frames are too large, or too small after scaling.
         """
         check_size(name, *size)
         notes = []
@@ -73,14 +88,16 @@ class StreamSource(LiveSource):
         )
 
     def pictures(self) -> Iterator[Frame]:
-        """The frames as they come, with the sender's numbers and times; called in the reader's thread."""
+        """Yield frames on arrival, with the sender's numbers and timestamps. Runs in the reader's
+        thread.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no pictures method")
 
     def frames(self) -> Iterator[Frame]:
         """See `LiveSource`."""
         for given, frame in enumerate(self.pictures(), start=1):
             if frame.status is FrameStatus.DAMAGED:
-                # As in recordings: no pixel of a damaged picture is known to be tissue.
+                # As in recordings, no pixel of a damaged picture counts as tissue.
                 frame = replace(frame, mask=np.zeros(frame.image.shape[:2], np.uint8))
             yield resized(frame, self.options.scale)
             if given == self.options.max_frames:
@@ -88,7 +105,7 @@ class StreamSource(LiveSource):
 
 
 def check_size(name: str, width_px: int, height_px: int, least: int = 1) -> None:
-    """Raises InvalidSetting for frames of a size that nobody can work with."""
+    """Raise InvalidSetting for frames of an unusable size."""
     if min(width_px, height_px) < least or width_px * height_px > MAX_PIXELS:
         raise InvalidSetting(
             f"{name}: frames of {width_px}x{height_px} px cannot be used; both sides must be at least {least} px, and at most"
@@ -97,7 +114,7 @@ def check_size(name: str, width_px: int, height_px: int, least: int = 1) -> None
 
 
 def resized(frame: Frame, scale: float) -> Frame:
-    """A frame at another size: images by the mean over areas, mask and depth by the nearest pixel."""
+    """Return a resized frame: images by area averaging, mask and depth by nearest neighbour."""
     if scale == 1:
         return frame
     size = max(1, round(frame.width_px * scale)), max(1, round(frame.height_px * scale))

@@ -1,4 +1,4 @@
-"""The project's own synthetic scene as a camera that never ends."""
+"""Endless source of the project's synthetic scene."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ log = logging.getLogger(__name__)
 DEFAULT_FRAMES = 48
 MOST_FRAMES = 1000
 MOST_BYTES = 512 * 2**20
-"""Of the frames that are kept: twice as many are played, forwards and backwards."""
+"""Maximum size in bytes of the rendered frames, which are played forwards and backwards."""
 
 
 def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
-    """`synthetic:?width=640&height=512&fps=30&seed=0&frames=48&moving=1&eyes=1`.
+    """Open `synthetic:?width=640&height=512&fps=30&seed=0&frames=48&moving=1&eyes=1`.
 
-    Ray casting takes longer than a frame may: `frames` frames are rendered here, before anything is played, and then played forwards and
-    backwards. They are kept, so that the same ones are there at once the next time. Raises InvalidSetting for options out of range.
+    Ray casting is slower than real time, so `frames` frames are rendered first and then played
+    forwards and backwards. They are cached for later runs. Raises InvalidSetting for options out of
+    range.
     """
     address = Address.parse("synthetic", rest)
     width = address.whole("width", 640, 32, 4096)

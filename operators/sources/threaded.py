@@ -1,4 +1,4 @@
-"""A source that reads in a thread of its own, so that reading overlaps with what is done with the frames."""
+"""Base class of sources that read in a separate thread, so that reading overlaps with processing."""
 
 from __future__ import annotations
 
@@ -17,18 +17,26 @@ log = logging.getLogger(__name__)
 
 
 class ThreadedSource:
-    """A `FrameSource` made from an iterator: a subclass gives `description` and `frames()`.
+    """`FrameSource` made from an iterator. A subclass provides `description` and `frames()`.
 
-    The iterator runs in a daemon thread and is at most `ahead` frames ahead of `read`; then it waits, so nothing is lost. What it raises
-    is raised by `read`, after the frames that came before it. It is closed in that thread, too.
+    The iterator runs in a daemon thread, at most `ahead` frames ahead of `read`, without dropping
+    frames. Its exception is raised by `read` after all earlier frames. It is closed in that thread.
     """
 
     description: SourceDescription
     close_timeout_s = 10.0
-    """How long `close` waits for a reader that is within a call of its library."""
+    """Maximum waiting time of `close` for a reader that blocks in a library, in seconds."""
 
     def __init__(self, *, ahead: int = 2, stalled_after_s: float = math.inf) -> None:
-        """ahead: frames that are kept ready. stalled_after_s: when no frame came for so long, the state is `STALLED`."""
+        """Set the queue's parameters.
+
+        Args:
+            ahead: capacity of the queue for `read`, in frames.
+            stalled_after_s: time without a frame until the state is `STALLED`, in seconds.
+
+        Raises:
+            InvalidInput: `ahead` is less than 1.
+        """
         if ahead < 1:
             raise InvalidInput(f"ahead is {ahead}; it must be at least 1")
         self._ahead = ahead
@@ -42,7 +50,7 @@ class ThreadedSource:
         self._last_s = 0.0
 
     def frames(self) -> Iterator[Frame]:
-        """The frames from the beginning; called in the reader's thread, once for each `open`."""
+        """Return the frames from the beginning. Called in the reader's thread, once per `open`."""
         raise NotImplementedError(f"{type(self).__name__} has no frames method")
 
     @property
@@ -57,10 +65,11 @@ class ThreadedSource:
             return SourceState.STALLED if late else SourceState.LIVE
 
     def open(self) -> None:
-        """See `FrameSource`. After `close` it begins again with the first frame."""
+        """Start reading. After `close` it restarts with the first frame."""
         if self._thread is not None:
             return
-        # A reader that did not end in time keeps the event that it was given, and so never writes into a later run's frames.
+        # A reader that outlived `close` keeps its own event, so it never writes into a later run's
+        # queue.
         self._stop = threading.Event()
         self._ready.clear()
         self._done, self._error, self._last_s = False, None, time.monotonic()
@@ -98,13 +107,15 @@ class ThreadedSource:
             self._done, self._error = True, None
 
     def interrupt(self) -> None:
-        """Make `frames()` return soon, from another thread, where that needs more than closing it."""
+        """Make a blocked `frames()` return soon. Called by `close` from another thread."""
 
     def _ended(self, error: BaseException | None) -> None:
-        """The iterator has ended, with what it raised; called once for each reading, under the lock."""
+        """Handle the end of the iterator; `error` is its exception or None. Called once per
+        reading, with the lock.
+        """
 
     def _run(self, stop: threading.Event) -> None:
-        """The life of the reader's thread."""
+        """Main function of the reader's thread."""
         error: BaseException | None = None
         try:
             frames = self.frames()
@@ -113,11 +124,11 @@ class ThreadedSource:
                     if not self._put(frame, stop):
                         break
             finally:
-                # A generator holds files open until it is closed.
+                # Closing a generator also closes its files.
                 close = getattr(frames, "close", None)
                 if close is not None:
                     close()
-        except BaseException as raised:  # noqa: BLE001 - carried to the thread that reads
+        except BaseException as raised:  # noqa: BLE001 - carried to the thread that calls read
             error = raised
         with self._changed:
             if not stop.is_set():
@@ -126,7 +137,7 @@ class ThreadedSource:
                 self._changed.notify_all()
 
     def _put(self, frame: Frame, stop: threading.Event) -> bool:
-        """Wait for room and put the frame there; False when the source is being closed."""
+        """Wait for space and append the frame. Return False when the source is being closed."""
         with self._changed:
             self._changed.wait_for(lambda: stop.is_set() or len(self._ready) < self._ahead)
             if stop.is_set():

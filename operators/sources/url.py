@@ -1,4 +1,4 @@
-"""A stream from the network: RTSP, and whatever else PyAV opens by a URL."""
+"""Network streams: RTSP and other URLs that PyAV can open."""
 
 from __future__ import annotations
 
@@ -16,18 +16,29 @@ from operators.sources.stream import StreamSource
 from operators.sources.url_address import UrlAddress
 
 FRESH_S = 1.0
-"""A connection that was made longer before it is read is made anew."""
+"""Age in seconds at which an idle connection is replaced before reading, because its data are
+outdated.
+"""
 
 
 class ConnectedSource(StreamSource):
-    """Pictures from a `Place` that may go away and come back.
+    """Pictures from a `Place` with automatic reconnection.
 
-    Making the object connects. A connection that breaks, ends or gives no data in time is made again, with longer and longer pauses; numbers and
-    times go on over that.
+    The constructor connects. A connection that breaks, ends or times out is re-established with
+    increasing delays. Numbers and timestamps continue.
     """
 
     def __init__(self, place: Place, name: str, options: SourceOptions) -> None:
-        """name: what it is called for people. Raises SourceUnavailable when it cannot be opened."""
+        """Connect and describe the source.
+
+        Args:
+            place: address and parameters of the stream.
+            name: name of the source for the user, without secrets.
+            options: source options.
+
+        Raises:
+            SourceUnavailable: the stream cannot be opened.
+        """
         super().__init__(options)
         self._place = place
         try:
@@ -44,7 +55,7 @@ class ConnectedSource(StreamSource):
         backoff = Backoff()
         connection, self._connection = self._connection, None
         if connection is not None and not connection.has_an_end and time.monotonic() - self._connected_s > FRESH_S:
-            # What has piled up since would come as if it were new.
+            # Data buffered since then would appear as if new.
             connection.close()
             connection = None
         while True:
@@ -79,7 +90,9 @@ class ConnectedSource(StreamSource):
 
 
 def url_source(scheme: str, rest: str, options: SourceOptions) -> ConnectedSource:
-    """A stream at `scheme://rest`, `rest` perhaps with options of ours behind `#`. Raises InvalidSetting and SourceUnavailable."""
+    """Open `scheme://rest`, with options of this program after `#`. Raises InvalidSetting and
+    SourceUnavailable.
+    """
     address = UrlAddress.parse(scheme, rest)
     place = Place(address.url, address.options(), open_s=address.open_s, read_s=address.stall_s)
     return ConnectedSource(place, address.name, replace(options, process=False))

@@ -1,4 +1,4 @@
-"""Addresses on a network: which are allowed, what FFmpeg may open for them, and how they are named without their secrets."""
+"""Network addresses: validation, restrictions for FFmpeg, and names without secrets."""
 
 from __future__ import annotations
 
@@ -23,34 +23,40 @@ PROTOCOLS = {
     "http": "http,https,httpproxy,tcp,tls,crypto",
     "https": "https,http,httpproxy,tcp,tls,crypto",
 }
-"""What FFmpeg may open for an address of each scheme, whatever a server or a playlist names: never a file."""
+"""Protocols that FFmpeg may open for each scheme. Files are excluded, whatever a server or playlist
+names.
+"""
 FORMATS = (
     "rtsp,rtp,sdp,mpegts,flv,live_flv,mov,mp4,matroska,webm,avi,asf,ogg,nut,mpjpeg,mjpeg,h264,hevc,mpeg,mpegvideo,m4v,ivf,"
     "yuv4mpegpipe,hls,jpeg_pipe,png_pipe"
 )
-"""Demuxers that a stream may turn out to be for; none that reads other files by name, but for HLS, whose parts are bound by `PROTOCOLS`."""
+"""Permitted demuxers. None opens other files by name except HLS, whose segments are restricted by
+`PROTOCOLS`.
+"""
 _LABEL = re.compile(r"(?![-])[\w-]{1,63}(?<!-)")
 _SECRET = re.compile(r"(?<=://)[^/@\s'\"]*@")
 
 
 @dataclass(frozen=True)
 class UrlAddress:
-    """A URL, and options of ours: what stands behind `#`, which is never sent to a server."""
+    """A URL with the options after `#`, which are never sent to a server."""
 
     url: str = field(repr=False)
     scheme: str
     name: str
-    """The URL without user, password and query: for people, reports and logs."""
+    """URL without user, password and query, for messages, reports and logs."""
     transport: str = "tcp"
-    """Of RTSP: `tcp` or `udp`."""
+    """RTSP transport: `tcp` or `udp`."""
     open_s: float = 10.0
-    """How long a connection may take."""
+    """Connection timeout in seconds."""
     stall_s: float = 5.0
-    """Without data for so long the connection is lost."""
+    """Time without data, in seconds, after which the connection counts as lost."""
 
     @classmethod
     def parse(cls, scheme: str, rest: str) -> UrlAddress:
-        """From what follows `scheme://`. Raises InvalidSetting, in words without secrets, for what is no such URL."""
+        """Parse the text after `scheme://`. Raises InvalidSetting, without secrets, for an invalid
+        URL.
+        """
         place, _, fragment = rest.partition("#")
         url = f"{scheme}://{place}"
         ours = Address.parse(scheme, f"?{fragment}")
@@ -87,13 +93,13 @@ class UrlAddress:
         return address
 
     def options(self) -> dict[str, str]:
-        """FFmpeg's options: nothing is kept back, and nothing but this stream is opened."""
+        """Return FFmpeg's options, which minimise buffering and restrict protocols and formats."""
         options = {
             "protocol_whitelist": PROTOCOLS[self.scheme],
             "format_whitelist": FORMATS,
-            "analyzeduration": f"{round(0.9 * self.open_s * 1e6)}",  # µs: sizes may come with the next key frame only
+            "analyzeduration": f"{round(0.9 * self.open_s * 1e6)}",  # microseconds; the picture size may arrive only with the next key frame
             "probesize": "50000000",
-            "max_delay": "100000",  # µs; how long RTP packets that are missing are waited for
+            "max_delay": "100000",  # microseconds; maximum wait for missing RTP packets
         }
         if self.scheme in ("rtsp", "rtsps"):
             options["rtsp_transport"] = self.transport
@@ -101,15 +107,17 @@ class UrlAddress:
 
 
 def _is_host(host: str) -> bool:
-    """True for an IP address and for a name that could be one: labels of letters, digits, - and _ with dots between them."""
+    """Return True for an IP address or a valid host name: labels of letters, digits, - and _,
+    separated by dots.
+    """
     with contextlib.suppress(ValueError):
         ipaddress.ip_address(host.partition("%")[0])
         return True
     labels = host.removesuffix(".").split(".")
-    # What ends in a number is an IPv4 address, and has not been one.
+    # A host that ends in a number must be an IPv4 address, which was rejected above.
     return len(host) <= 253 and not labels[-1].isdigit() and all(_LABEL.fullmatch(label) for label in labels)
 
 
 def without_secrets(text: str) -> str:
-    """A text in which addresses have neither user nor password."""
+    """Return the text with user and password removed from all addresses."""
     return _SECRET.sub("", text)

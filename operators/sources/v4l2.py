@@ -1,4 +1,4 @@
-"""A camera or capture card of this machine through Video4Linux."""
+"""Local cameras and capture cards through Video4Linux."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ READ_S = 5.0
 
 
 def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
-    """`v4l2:/dev/video0?size=1920x1080&fps=60&format=mjpeg`; what is left out is what the driver has set.
+    """Open `v4l2:/dev/video0?size=1920x1080&fps=60&format=mjpeg`; omitted options keep the driver's
+    settings.
 
-    A camera that is pulled out is looked for again. Raises InvalidSetting, and SourceUnavailable where there is no such device.
+    A disconnected camera is searched for again. Raises InvalidSetting, and SourceUnavailable if the
+    device does not exist.
     """
     address = Address.parse("v4l2", rest)
     size, fps = address.size(), address.number("fps", options.fps, 0.01, MAX_FPS)
@@ -40,9 +42,11 @@ def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
 
 
 def device_of(path: str) -> str:
-    """The device behind a path: `/dev/video0`, or a link to one as in `/dev/v4l/by-id/`. Raises InvalidSetting and SourceUnavailable."""
+    """Resolve `/dev/video0`, or a link to it as in `/dev/v4l/by-id/`. Raises InvalidSetting and
+    SourceUnavailable.
+    """
     device = os.path.realpath(path) if path.startswith("/dev/") and "\0" not in path else path
-    # Opening a device has effects: nothing but a camera is opened.
+    # Opening a device can have side effects, so only camera devices are accepted.
     if not _DEVICE.fullmatch(device):
         raise InvalidSetting(f"v4l2: {path!r:.200} is no camera; give /dev/video0, or a link to one in /dev/v4l/by-id")
     try:

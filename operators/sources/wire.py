@@ -1,4 +1,4 @@
-"""What a source in a process of its own and its reader say to each other: JSON, and frames' arrays in shared memory."""
+"""Messages between a capture process and its parent: JSON, with frame arrays in shared memory."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from operators.sources.shared_memory import PLANES, BadHeader
 from operators.sources.source import SourceDescription
 
 MOST_BYTES = 1 << 20
-"""Of one message."""
+"""Maximum size of a message in bytes."""
 
 
 def message(kind: str, **content: Any) -> bytes:
-    """A message as bytes."""
+    """Encode a message."""
     return json.dumps({"kind": kind, **content}).encode()
 
 
 def parsed(data: bytes) -> dict[str, Any]:
-    """A message from its bytes. Raises BadHeader."""
+    """Decode a message. Raises BadHeader."""
     try:
         content = json.loads(data)
     except ValueError as error:
@@ -38,17 +38,17 @@ def parsed(data: bytes) -> dict[str, Any]:
 
 
 def options_to(options: SourceOptions) -> dict[str, Any]:
-    """Options as JSON."""
+    """Convert options to JSON values."""
     return asdict(options)
 
 
 def options_from(content: dict[str, Any]) -> SourceOptions:
-    """Options from JSON."""
+    """Create options from JSON values."""
     return SourceOptions(**content)
 
 
 def description_to(about: SourceDescription) -> dict[str, Any]:
-    """A description as JSON."""
+    """Convert a description to JSON values."""
     return {
         "name": about.name,
         "width_px": about.width_px,
@@ -62,7 +62,7 @@ def description_to(about: SourceDescription) -> dict[str, Any]:
 
 
 def camera_to(camera: Camera) -> dict[str, Any]:
-    """A camera as JSON."""
+    """Convert a camera to JSON values."""
     return {
         "K": camera.K.tolist(),
         "width_px": camera.width_px,
@@ -73,7 +73,7 @@ def camera_to(camera: Camera) -> dict[str, Any]:
 
 
 def description_from(content: dict[str, Any]) -> SourceDescription:
-    """A description from JSON. Raises BadHeader."""
+    """Create a description from JSON values. Raises BadHeader."""
     try:
         camera = Camera(**content["camera"])
         fields, notes = frozenset(content["fields"]), tuple(content["notes"])
@@ -83,13 +83,13 @@ def description_from(content: dict[str, Any]) -> SourceDescription:
 
 
 def planes_of(frame: Frame) -> dict[str, NDArray]:
-    """The arrays of a frame, by field."""
+    """Return the arrays of a frame by field."""
     planes = {name: getattr(frame, name) for name in PLANES}
     return {name: plane for name, plane in planes.items() if plane is not None}
 
 
 def frame_header(frame: Frame) -> dict[str, Any]:
-    """What a frame has beside its arrays, as JSON."""
+    """Return the fields of a frame other than arrays as JSON values."""
     return {
         "seq": frame.seq,
         "pts_ns": frame.pts_ns,
@@ -102,7 +102,7 @@ def frame_header(frame: Frame) -> dict[str, Any]:
 
 
 def frame_from(header: Mapping[str, Any], planes: Mapping[str, Any]) -> Frame:
-    """A frame from its header and its arrays. Raises BadHeader."""
+    """Create a frame from its header and arrays. Raises BadHeader."""
     try:
         seq, pts_ns, arrived_ns, damage = (header[name] for name in ("seq", "pts_ns", "arrived_ns", "damage"))
         whole = all(type(value) is int and abs(value) < 2**62 for value in (seq, pts_ns))
@@ -124,12 +124,12 @@ def frame_from(header: Mapping[str, Any], planes: Mapping[str, Any]) -> Frame:
 
 
 def finite_counts(content: Any) -> dict[str, int]:
-    """Counts by reason, from JSON."""
+    """Return the valid counts of a JSON object; empty if it is not an object."""
     if not isinstance(content, dict):
         return {}
     return {str(name): int(times) for name, times in content.items() if isinstance(times, int) and math.isfinite(times)}
 
 
 def as_contiguous(planes: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """The arrays without gaps."""
+    """Return the arrays in contiguous memory."""
     return {name: np.ascontiguousarray(plane) for name, plane in planes.items()}

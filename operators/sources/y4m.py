@@ -1,4 +1,4 @@
-"""YUV4MPEG2 (`.y4m`): raw pictures that describe themselves, as `ffmpeg -f yuv4mpegpipe` and mjpegtools write them."""
+"""YUV4MPEG2 (`.y4m`) headers of raw video, as written by `ffmpeg -f yuv4mpegpipe` and mjpegtools."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _RATE = re.compile(r"(\d{1,9}):(\d{1,9})")
 
 @dataclass(frozen=True)
 class Y4mHeader:
-    """What the first line says."""
+    """Contents of the header line."""
 
     width_px: int
     height_px: int
     fps: float | None
     format: str
-    """FFmpeg's name."""
+    """FFmpeg's name of the pixel format."""
 
     @classmethod
     def parse(cls, line: bytes) -> Y4mHeader:
-        """From the first line, without its end. Raises InvalidSetting."""
+        """Parse the first line, without its line end. Raises InvalidSetting."""
         words = line.decode("ascii", "replace").split(" ")
         if words[0].encode() != MAGIC:
             raise InvalidSetting(

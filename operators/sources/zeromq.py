@@ -1,4 +1,6 @@
-"""Frames from another program over ZeroMQ (`zeromq_publisher.FramePublisher` sends them)."""
+"""Source that receives frames from another program over ZeroMQ (see
+`zeromq_publisher.FramePublisher`).
+"""
 
 from __future__ import annotations
 
@@ -21,21 +23,34 @@ from operators.sources.zeromq_message import MOST_BYTES, BadMessage, unpacked
 
 LOOK_MS = 50
 NEW_SOCKET_S = 2.0
-"""After so long without a connection, a new socket tries."""
+"""Time without a connection, in seconds, after which the socket is replaced."""
 OPEN_S = 10.0
-"""How long the first frame may take: it says how large the pictures are."""
+"""Timeout for the first frame, which defines the picture size, in seconds."""
 
 
 class ZeroMqSource(StreamSource):
-    """Subscribes to a publisher of frames. ZeroMQ makes the connection again by itself; `state` says when it is lost.
+    """Subscribes to a publisher of frames. ZeroMQ reconnects automatically, and `state` reports a
+    lost connection.
 
-    A message that is no frame is dropped and counted (`bad_messages`).
+    Messages that are not valid frames are dropped and counted (`bad_messages`).
     """
 
     def __init__(
         self, endpoint: str, curve: dict[int, bytes], fps: float | None, options: SourceOptions, open_s: float = OPEN_S
     ) -> None:
-        """curve: ZeroMQ's options for encryption. Raises InvalidSetting, and SourceUnavailable when no frame comes within `open_s`."""
+        """Connect and wait for the first frame.
+
+        Args:
+            endpoint: ZeroMQ endpoint.
+            curve: ZeroMQ's encryption options; empty for none.
+            fps: frame rate; None if unknown.
+            options: source options.
+            open_s: timeout for the first frame, in seconds.
+
+        Raises:
+            InvalidSetting: invalid endpoint or keys, or a remote endpoint without encryption.
+            SourceUnavailable: no frame arrived in time.
+        """
         require_encryption(endpoint, bool(curve))
         super().__init__(options)
         self._endpoint, self._curve = endpoint, curve
@@ -69,7 +84,7 @@ class ZeroMqSource(StreamSource):
 
     def pictures(self) -> Iterator[Frame]:
         """See `StreamSource`."""
-        for _ in range(2 * self.options.waiting):  # what has waited since the source was made is no longer new
+        for _ in range(2 * self.options.waiting):  # discard frames queued since the source was created
             self._next(0)
         while not self.wait(0):
             frame = self._next()
@@ -86,7 +101,7 @@ class ZeroMqSource(StreamSource):
         raise SourceUnavailable(f"{self._name} cannot be opened: {what}. Start what sends to it, and check the keys.")
 
     def _next(self, look_ms: int = LOOK_MS) -> Frame | None:
-        """The next frame; None when none came while it was looked for."""
+        """Receive the next frame; None if none arrived within `look_ms` milliseconds."""
         assert self._socket is not None and self._monitor is not None
         found = dict(self._poller.poll(look_ms))
         now_s = time.monotonic()
@@ -94,15 +109,16 @@ class ZeroMqSource(StreamSource):
             self._lost_s = now_s
             self.lost(f"the connection to {self._name} is lost; it is being made again")
         if self._socket not in found:
-            if now_s - self._lost_s > NEW_SOCKET_S:  # never where it is infinite
-                # A sender that breaks the protocol, as by a message that is too large, is not connected to again by the same socket.
+            if now_s - self._lost_s > NEW_SOCKET_S:  # never true while it is infinite
+                # A socket does not reconnect to a sender that broke the protocol, for example with
+                # an oversized message.
                 self._disconnect()
                 self._connect()
             return None
         self._lost_s = math.inf
         message = self._socket.recv(copy=False)
         now_ns = time.monotonic_ns()
-        if self._socket.getsockopt(zmq.RCVMORE):  # a frame is one part
+        if self._socket.getsockopt(zmq.RCVMORE):  # a frame is a single part
             while self._socket.getsockopt(zmq.RCVMORE):
                 self._socket.recv(copy=False)
             self.count("bad_messages")
@@ -146,9 +162,10 @@ class ZeroMqSource(StreamSource):
 
 
 def zeromq_source(transport: str, rest: str, options: SourceOptions) -> ZeroMqSource:
-    """`zmq+tcp://127.0.0.1:5555?fps=30`, `zmq+ipc:///run/frames`; beyond this machine with `server=FILE` and `client=FILE`, certificates.
+    """Open `zmq+tcp://127.0.0.1:5555?fps=30` or `zmq+ipc:///run/frames`.
 
-    Raises InvalidSetting and SourceUnavailable.
+    Remote endpoints require the certificates `server=FILE` and optionally `client=FILE`. Raises
+    InvalidSetting and SourceUnavailable.
     """
     address = Address.parse(f"zmq+{transport}", rest)
     fps = address.number("fps", options.fps, 0.01, MAX_FPS)

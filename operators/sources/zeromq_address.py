@@ -1,4 +1,4 @@
-"""Endpoints of ZeroMQ: on this machine in the clear, beyond it only encrypted (CURVE)."""
+"""ZeroMQ endpoints. Connections to other machines must be encrypted (CURVE)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsplat_core.errors import InvalidSetting
 
 
 def is_of_this_machine(endpoint: str) -> bool:
-    """Whether what goes to an endpoint stays on this machine."""
+    """Return True if the endpoint is on this machine."""
     scheme, _, place = endpoint.partition("://")
     if scheme == "ipc":
         return True
@@ -25,7 +25,7 @@ def is_of_this_machine(endpoint: str) -> bool:
 
 
 def require_encryption(endpoint: str, encrypted: bool) -> None:
-    """Raises InvalidSetting for an endpoint beyond this machine without keys."""
+    """Raise InvalidSetting for an unencrypted endpoint on another machine."""
     if not encrypted and not is_of_this_machine(endpoint):
         raise InvalidSetting(
             f"{endpoint} leads to another machine, and patients' pictures do not go over a network in the clear; give keys "
@@ -34,7 +34,9 @@ def require_encryption(endpoint: str, encrypted: bool) -> None:
 
 
 def keys_from(path: str) -> tuple[bytes, bytes | None]:
-    """Public and secret key of a certificate file, as `zmq.auth.create_certificates` writes it. Raises InvalidSetting."""
+    """Return public and secret key of a certificate file of `zmq.auth.create_certificates`. Raises
+    InvalidSetting.
+    """
     try:
         return zmq.auth.load_certificate(os.fspath(path))
     except (OSError, ValueError) as error:
@@ -42,7 +44,17 @@ def keys_from(path: str) -> tuple[bytes, bytes | None]:
 
 
 def connected(kind: int, endpoint: str, *, bind: bool, options: dict[int, Any]) -> tuple[zmq.Context, zmq.Socket]:
-    """A socket in a context of its own. Raises InvalidSetting for an endpoint that cannot be used."""
+    """Create a socket in a new context and bind or connect it.
+
+    Args:
+        kind: ZeroMQ's socket type.
+        endpoint: ZeroMQ endpoint.
+        bind: bind the socket; otherwise connect it.
+        options: socket options.
+
+    Raises:
+        InvalidSetting: the endpoint or an option is invalid.
+    """
     context = zmq.Context()
     socket = context.socket(kind)
     try:

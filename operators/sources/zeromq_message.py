@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 MAGIC, VERSION = b"ISPF", 1
 HEADER = struct.Struct("<4sHHIIQq")
 MOST_PIXELS = 2**24
-"""Of one picture, 4096x4096: what a message may hold is known before any of it is read."""
+"""Maximum number of pixels of a picture, 4096x4096, which bounds the size of a message."""
 ARRAYS: Mapping[str, tuple[int, str, int]] = {
     "image": (0, "<u1", 3),
     "right_image": (1, "<u1", 3),
@@ -32,21 +32,32 @@ ARRAYS: Mapping[str, tuple[int, str, int]] = {
     "mask": (4, "<u1", 1),
     "pose": (8, "<f8", 0),
 }
-"""By field, in order: its bit in the header, its type, values per pixel (0: 16 values)."""
+"""Arrays by field, in order: bit in the header, data type, and values per pixel (0: 16 values in
+all).
+"""
 MOST_BYTES = HEADER.size + MOST_PIXELS * (3 + 3 + 4 + 1) + 16 * 8
 
 
 class BadMessage(Exception):
-    """Why a message is no frame."""
+    """Reason that a message is not a valid frame."""
 
 
 def packed(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> bytes:
-    """A frame as a message. arrays: `image` [H, W, 3], and any of the others of the same size. Raises ValueError."""
+    """Encode a frame as one message. Raises ValueError.
+
+    Args:
+        seq: sequence number.
+        pts_ns: timestamp in nanoseconds.
+        arrays: `image` [H, W, 3], and optionally the other arrays of the same size.
+    """
     return b"".join(pieces(seq, pts_ns, arrays))
 
 
 def pieces(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> list[bytes | memoryview]:
-    """The same in pieces: the header, and each array where it lies, which nobody may change any more. Raises ValueError."""
+    """Encode a frame as header and arrays without copying. Raises ValueError.
+
+    The arrays must not be modified until the message is sent.
+    """
     image = arrays["image"]
     height_px, width_px = image.shape[:2]
     if not 0 < width_px * height_px <= MOST_PIXELS:
@@ -64,7 +75,11 @@ def pieces(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> list[bytes |
 
 
 def unpacked(data: memoryview) -> tuple[int, int, dict[str, NDArray]]:
-    """Number, time and arrays of a message; the arrays look into its memory. Raises BadMessage before anything is allocated."""
+    """Decode a message into number, timestamp and arrays, which refer to its memory. Raises
+    BadMessage.
+
+    The header is validated before memory is allocated.
+    """
     seq, pts_ns, announced = _announced(data)
     found: list[memoryview] = []
     begin = HEADER.size
@@ -79,7 +94,7 @@ def unpacked(data: memoryview) -> tuple[int, int, dict[str, NDArray]]:
 
 
 def unpacked_pieces(data: Sequence[memoryview]) -> tuple[int, int, dict[str, NDArray]]:
-    """`unpacked`, of a message in pieces. Raises BadMessage."""
+    """Decode a message in pieces, as `unpacked` does. Raises BadMessage."""
     if not data:
         raise BadMessage("it has no pieces")
     if len(data[0]) != HEADER.size:
@@ -95,7 +110,9 @@ _Announced = tuple[str, str, tuple[int, ...], int]
 
 
 def _announced(data: memoryview) -> tuple[int, int, list[_Announced]]:
-    """Number, time, and name, type, shape and bytes of each array that a header announces."""
+    """Return number and timestamp of a header, with name, type, shape and bytes of each array.
+    Raises BadMessage.
+    """
     if len(data) < HEADER.size:
         raise BadMessage(f"it has {len(data)} bytes, less than a header")
     magic, version, bits, width_px, height_px, seq, pts_ns = HEADER.unpack_from(data)
