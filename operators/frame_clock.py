@@ -61,7 +61,7 @@ class ClockSettings:
     at_most_steps: int = 80
     """Maximum number of optimiser steps before a frame is displayed."""
     first_ms: float = 20.0
-    """Training time for the first frame of a scene, in milliseconds."""
+    """Display deadline of a scene's first frame after its arrival, in milliseconds."""
     first_at_least_steps: int | None = None
     """Minimum number of steps for the first frame of a scene. None: device default."""
     first_at_most_steps: int = 60

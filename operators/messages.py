@@ -1,4 +1,4 @@
-"""Messages on the edges of the graph besides `Frame`. Each one carries its frame and adds a result."""
+"""Messages on the edges of the graph other than `Frame`. Each one carries its frame and adds a result."""
 
 from __future__ import annotations
 

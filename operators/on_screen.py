@@ -23,7 +23,7 @@ from operators.outcome import OutcomeBuilder
 
 LOOK_NS = 500_000_000
 WAITING = 8
-"""Capacity of each input queue, in messages. If it is full the oldest is dropped and later counted
+"""Capacity of each input queue, in messages. If a queue is full, the oldest message is dropped and later counted
 as unscored.
 """
 PREDICTIONS_KEPT = 64

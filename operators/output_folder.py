@@ -73,7 +73,7 @@ class OutputFolder:
 
         Args:
             folder: the output folder.
-            made_by: the command line, for the marker.
+            made_by: name of the command, for the marker.
             inputs: paths that the run reads; the folder must not overlap them.
         """
         self.folder, self.made_by, self.inputs = folder, made_by, tuple(inputs)
@@ -207,7 +207,7 @@ def _write_marker(folder: Path, made_by: str, files: Iterable[str], **more: obje
 
     Args:
         folder: the output folder.
-        made_by: the command line.
+        made_by: name of the command.
         files: names of results that are, or will be, in the folder.
         more: `contents` (fingerprints by path). During a transaction also `arriving` (source
             folder)

@@ -1,4 +1,5 @@
-"""Recognition of this program's output files by content, so that `--overwrite` replaces no others.
+"""Recognition of this program's output files by content, so that `--overwrite`
+replaces only those.
 
 Each format carries a mark: a comment in `.ply` and `.mp4`, the generator of `.glb`, bytes after the
 array of `.npy`. A `.splat` has no space for a mark, so its rows are validated instead.

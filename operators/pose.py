@@ -119,7 +119,7 @@ def pose_operators(fragment: Any, choice: Poses, camera: Camera, depth: str) -> 
         fragment: the graph.
         choice: `given` (recorded) or `estimated`.
         camera: camera of the frames.
-        depth: the setting `depth`; selects whether the frames' depth sets the scale.
+        depth: the setting `depth`; for measured depth or stereo, the frames' depth sets the scale.
     """
     if choice == "given":
         return ()

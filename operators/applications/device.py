@@ -1,4 +1,4 @@
-"""Selection of the compute device, with the scheduler and the random seed for it."""
+"""Selection of the compute device, of its scheduler and of the random seed."""
 
 from __future__ import annotations
 

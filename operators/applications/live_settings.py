@@ -61,8 +61,8 @@ LIVE_PREDICT_EVERY = {"cpu": 8, "cuda": 4}
 scoring a picture.
 """
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
-"""Longest wait of a frame before it is dropped, in frame intervals. A GPU catches up within a few
-frames; a CPU would display each of them late.
+"""Longest wait of a frame before it is dropped, in frame intervals. A GPU
+catches up within a few frames. A CPU with two cores would display all queued frames late.
 """
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
 """Initialise motion by optical flow. With few steps, flow follows the tissue faster than training;
@@ -87,8 +87,8 @@ class LiveSettings:
     seed: int = 0
     eyes: Eyes = "left"
     """Pictures of a stereo scope used for training; `both` requires the right camera's calibration.
-    Stereo depth uses both pictures in any case. The display shows the left one, from which the
-    right one takes steps.
+    Stereo depth uses both pictures in any case. The display
+    shows the left one. Training on the right one reduces the steps on the left one.
     """
     scale: float | None = None
     """Scale of the stream's pictures. None: chosen by measurement on a CPU (`working_size`), 1 on a

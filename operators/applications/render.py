@@ -133,8 +133,8 @@ class _Pictures:
 
 
 def _eyes_of(model: Model, view: View) -> list[Model | None]:
-    """Return the model variant for each picture side by side; None renders colours by viewing
-    direction.
+    """Return the model variant for each picture side by side; None selects
+    colours by the position of the camera.
     """
     if not view.is_virtual:
         return [model]

@@ -43,8 +43,8 @@ class SceneNumberStage(Stage):
 class CutStage(Stage):
     """Sets `Frame.new_scene` at cuts, never on a withheld or damaged frame.
 
-    It must run after all stages that withhold pictures. A frame that may be a cut is withheld until
-    the next frame decides.
+    It must run after all stages that withhold pictures. A frame that may be a cut is
+    withheld, and the next frame decides.
     """
 
     counts_type = CutCounts

@@ -112,7 +112,7 @@ class PictureStagesOp(StageOp):
 
 
 def _settled(frame: Frame, came: Frame) -> bool:
-    """Return True if the stages changed nothing but the masks, and did not withhold the frame or
+    """Return True if the stages changed only the masks, and did not withhold the frame or
     begin a scene.
     """
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns

@@ -153,9 +153,9 @@ class AsynchronousEventState(Enum):
     READY = 0
     """No event pending: the operator may compute."""
     WAIT = 1
-    """The operator must not compute. Does not keep the graph alive."""
+    """The operator waits. Does not keep the graph alive."""
     EVENT_WAITING = 2
-    """Event pending: the operator must not compute, and the graph stays alive."""
+    """Event pending: the operator waits, and the graph stays alive."""
     EVENT_DONE = 3
     """The event has occurred: the operator may compute."""
     EVENT_NEVER = 4

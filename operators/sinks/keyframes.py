@@ -73,7 +73,7 @@ class KeyframesOp(Operator):
 
     @property
     def keyframes(self) -> list[ScoredFrame]:
-        """At most `count` frames in order: the first, the last, the worst and some in between."""
+        """Up to `count` frames in order: the first, the last, the worst and some in between."""
         if self._last is None:
             return []
         chosen = {f.rendered.frame.seq: f for f in (self._kept[0], self._last, self._worst) if f is not None}

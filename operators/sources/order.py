@@ -34,7 +34,7 @@ class FrameOrder:
     """
 
     def __init__(self, *, trusted: bool = False) -> None:
-        """trusted: numbers and timestamps are in order, and only `restart` makes them continue."""
+        """trusted: the sender repeats no frame and keeps the order; only `restart` is handled."""
         self._trusted = trusted
         self._counts: Counter[str] = Counter()
         self.begin()

@@ -1,16 +1,18 @@
-"""One frame as one ZeroMQ message: a header of fixed form, then the arrays, without gaps. Nothing in it is ever unpickled.
+"""Binary format of one frame as one ZeroMQ message: a fixed header, then contiguous arrays.
 
-| bytes | type | what |
+| bytes | type | content |
 |---|---|---|
 | 0-3 | `ISPF` | |
 | 4-5 | uint16 | version, 1 |
-| 6-7 | uint16 | which arrays follow the image: 1 right image, 2 depth, 4 mask, 8 pose |
+| 6-7 | uint16 | arrays after the image, as bits: 1 right image, 2 depth, 4 mask, 8 pose |
 | 8-11, 12-15 | uint32 | width and height in pixels |
-| 16-23 | uint64 | the frame's number |
-| 24-31 | int64 | its presentation time in nanoseconds |
-| 32- | | image uint8 [H, W, 3] RGB, right image the same, depth float32 [H, W] in mm, mask uint8 [H, W], pose float64 [4, 4] world to camera |
+| 16-23 | uint64 | sequence number |
+| 24-31 | int64 | presentation timestamp in nanoseconds |
+| 32- | | arrays in the order below |
 
-Little-endian throughout.
+The arrays are image uint8 [H, W, 3] RGB, right image of the same form, depth float32 [H, W] in mm,
+mask uint8 [H, W], and pose float64 [4, 4] world to camera. All values are little-endian. Decoding
+never unpickles data.
 """
 
 from __future__ import annotations
