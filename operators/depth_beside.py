@@ -17,8 +17,8 @@ from operators.outcome import OutcomeBuilder
 from operators.side_thread import step_back, usable_cores
 
 FEW_CORES = 4
-"""Largest number of cores at which depth estimation is throttled, because training uses
-them all.
+"""Largest number of cores at which depth estimation is throttled, because training uses them
+all.
 """
 SHARE_OF_FEW = 0.25
 """Share of one core's time for depth estimation on a throttled machine."""
@@ -29,8 +29,8 @@ KEEPS = ("auto", "recorded")
 class DepthBeside:
     """Estimates depth in a background thread of lower priority. `offer` and `take` never block.
 
-    The queue holds one pending frame. A newer frame replaces the pending one, which is
-    counted in `DepthCounts.passed_over`.
+    The queue holds one pending frame. A newer frame replaces the pending one, which is counted in
+    `DepthCounts.passed_over`.
     """
 
     def __init__(self, choice: str, camera: Camera, *, share: float | None = None, device: str = "cpu") -> None:

@@ -155,7 +155,9 @@ class NothingShown(RunError, UserError):
 
 
 class RunFailed(RunError):
-    """A run ended early; the cause is `__cause__`. `result` is the outcome so far, already saved."""
+    """A run ended early; the cause is `__cause__`. `result` is the outcome so far, already
+    saved.
+    """
 
     def __init__(self, what: str, result: object) -> None:
         super().__init__(what)

@@ -16,7 +16,8 @@ from operators.storage import StorageReserve, storage_errors
 
 FRAMES_FILE = "frames.jsonl"
 MAX_SERIES = 4096
-"""Maximum number of entries of a report's series. Longer runs are averaged in bins of equal size.
+"""Maximum number of entries of a report's series. Longer runs are averaged in bins of equal
+size.
 """
 
 Value = float | int | bool | str | None
@@ -74,7 +75,9 @@ class FrameLog:
 
 
 def read_frames(path: Path) -> Iterator[Entry]:
-    """Yield the entries of a log. A truncated last line is skipped. A missing file yields nothing."""
+    """Yield the entries of a log. A truncated last line is skipped. A missing file yields
+    nothing.
+    """
     try:
         lines = open_regular(path)
     except FileNotFoundError:

@@ -112,7 +112,9 @@ class LiveReconstructOp(Operator):
 
     @property
     def parameter_count(self) -> int:
-        """Number of values in all tensors of the whole model, which is saved at the end of the run."""
+        """Number of values in all tensors of the whole model, which is saved at the end of the
+        run.
+        """
         kept = self._reconstructor or self.model
         return 0 if kept is None else kept.parameter_count
 

@@ -1,4 +1,6 @@
-"""Messages on the edges of the graph other than `Frame`. Each one carries its frame and adds a result."""
+"""Messages on the edges of the graph other than `Frame`. Each one carries its frame and adds a
+result.
+"""
 
 from __future__ import annotations
 
@@ -131,7 +133,8 @@ class Prediction:
 
     frame: Frame
     image: NDArray[np.uint8] | None
-    """uint8 RGB [H, W, 3], rendered at the frame's time and pose; None if no prediction was made.
+    """uint8 RGB [H, W, 3], rendered at the frame's time and pose; None if no prediction was
+    made.
     """
 
 

@@ -1,4 +1,6 @@
-"""Quality scores of displayed frames with trivial baselines, and a digest of the displayed bytes."""
+"""Quality scores of displayed frames with trivial baselines, and a digest of the displayed
+bytes.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ class ScoredFrame:
 
     rendered: RenderedFrame
     quality: FrameQuality
-    """Scores of the picture. For a frame trained on before display they measure the training error.
+    """Scores of the picture. For a frame trained on before display they measure the training
+    error.
     """
     previous_frame_db: float
     """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline). NaN for the
@@ -56,7 +59,9 @@ class ScoredFrame:
 
 @dataclass(frozen=True)
 class NextFrameResult:
-    """Accuracy of predictions of frames before training on them, as opposed to the training error."""
+    """Accuracy of predictions of frames before training on them, as opposed to the training
+    error.
+    """
 
     psnr_tissue_db: float | None
     """Mean tissue PSNR of the predictions, in dB."""

@@ -1,4 +1,6 @@
-"""Scores of a live stream: each frame against the picture on display when the next frame arrived."""
+"""Scores of a live stream: each frame against the picture on display when the next frame
+arrived.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ from operators.outcome import OutcomeBuilder
 
 LOOK_NS = 500_000_000
 WAITING = 8
-"""Capacity of each input queue, in messages. If a queue is full, the oldest message is dropped and later counted
-as unscored.
+"""Capacity of each input queue, in messages. If a queue is full, the oldest message is dropped and
+later counted as unscored.
 """
 PREDICTIONS_KEPT = 64
 """Maximum number of stored scores whose counterpart (prediction or baseline) has not arrived."""
@@ -51,10 +53,12 @@ class OnScreenResult:
     worst_seq: int | None
     """Sequence number of the frame with the lowest PSNR."""
     previous_frame_db: float | None
-    """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial baseline).
+    """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial
+    baseline).
     """
     previous_frame_throughout_db: float | None
-    """Mean tissue PSNR in dB of the previous raw frame over all scored frames (trivial baseline).
+    """Mean tissue PSNR in dB of the previous raw frame over all scored frames (trivial
+    baseline).
     """
     frames: int
     """Number of scored frames."""
@@ -128,7 +132,8 @@ class OnScreenMetricsOp(Operator):
         self._predicted: OrderedDict[int, float] = OrderedDict()
         """Tissue PSNR in dB of predictions whose frame is not scored yet, by sequence number."""
         self._waiting_db: OrderedDict[int, float] = OrderedDict()
-        """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not arrived.
+        """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not
+        arrived.
         """
         self._on_screen: ShownPicture | None = None
         self._previous: Frame | None = None

@@ -1,4 +1,6 @@
-"""Gate that withholds pictures taken outside of the patient's body from all downstream components."""
+"""Gate that withholds pictures taken outside of the patient's body from all downstream
+components.
+"""
 
 from __future__ import annotations
 

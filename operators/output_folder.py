@@ -176,7 +176,9 @@ def is_whole_output(folder: Path) -> bool:
 
 
 def _check_results(folder: Path, marker: dict[str, object]) -> None:
-    """Raise OutputFolderInUse if publishing would replace a file that no run of this program wrote."""
+    """Raise OutputFolderInUse if publishing would replace a file that no run of this program
+    wrote.
+    """
     ours = _results(folder)
     foreign = [entry.name for entry in folder.iterdir() if _RESULT.fullmatch(entry.name) and entry.name not in ours]
     if marker.get("arriving") is None:  # otherwise an interrupted transaction is pending, which the next run completes
@@ -210,8 +212,7 @@ def _write_marker(folder: Path, made_by: str, files: Iterable[str], **more: obje
         made_by: name of the command.
         files: names of results that are, or will be, in the folder.
         more: `contents` (fingerprints by path). During a transaction also `arriving` (source
-            folder)
-            and `earlier` (fingerprints of the replaced results).
+            folder) and `earlier` (fingerprints of the replaced results).
     """
     marker = {"format": _FORMAT, "version": 1, "made_by": made_by, "files": sorted(files), **more}
     write_whole(folder / MARKER, (json.dumps(marker) + "\n").encode())

@@ -164,7 +164,9 @@ def _with_parents(path: Path) -> Iterator[Path]:
 
 
 def _same(first: Path, second: Path) -> bool:
-    """Return True if both paths name one file or folder, also through bind mounts or ignored case."""
+    """Return True if both paths name one file or folder, also through bind mounts or ignored
+    case.
+    """
     if first == second:
         return True
     try:

@@ -1,5 +1,4 @@
-"""Recognition of this program's output files by content, so that `--overwrite`
-replaces only those.
+"""Recognition of this program's output files by content, so that `--overwrite` replaces only those.
 
 Each format carries a mark: a comment in `.ply` and `.mp4`, the generator of `.glb`, bytes after the
 array of `.npy`. A `.splat` has no space for a mark, so its rows are validated instead.
@@ -27,7 +26,9 @@ _MOST_JSON_BYTES = 64 << 20
 
 
 def is_own_file(path: Path) -> bool:
-    """Return True if the file has the mark for its suffix. False for a missing or unreadable file."""
+    """Return True if the file has the mark for its suffix. False for a missing or unreadable
+    file.
+    """
     recognise = _KINDS.get(path.suffix.lower())
     if recognise is None:
         return False

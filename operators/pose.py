@@ -1,4 +1,6 @@
-"""Camera poses of frames: recorded with the stream, or estimated frame by frame from the pictures."""
+"""Camera poses of frames: recorded with the stream, or estimated frame by frame from the
+pictures.
+"""
 
 from __future__ import annotations
 

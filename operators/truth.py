@@ -39,7 +39,8 @@ class BehindTools:
     last_seen_db: float
     """Trivial baseline in dB: each pixel's most recent visible value."""
     inpainted_db: float
-    """Trivial baseline in dB: the frame's own picture inpainted from around the tool (Telea 2004).
+    """Trivial baseline in dB: the frame's own picture inpainted from around the tool (Telea
+    2004).
     """
     frames: int
     """Number of scored frames."""

@@ -25,7 +25,9 @@ WITHOUT_LEARNING = ("heldout", "live", "retention", "second_eye", "geometry")
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Selection of protocols and their parameters. Raises InvalidSetting for a value out of range."""
+    """Selection of protocols and their parameters. Raises InvalidSetting for a value out of
+    range.
+    """
 
     recording: Path | str
     protocols: tuple[str, ...] = ()

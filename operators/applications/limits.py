@@ -13,7 +13,8 @@ MAX_SCALE = 64.0
 MAX_PIXELS = 64 * 2**20
 """Maximum number of pixels of a picture (8192x8192). Surgical video has at most 8 million."""
 MAX_SIDE_PX = 2**15
-"""Maximum side of a picture. Videos show two side by side, and video formats are limited to 65535.
+"""Maximum side of a picture. Videos show two side by side, and video formats are limited to
+65535.
 """
 MAX_STEPS = 100_000_000
 MAX_FRAMES = 10**9

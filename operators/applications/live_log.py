@@ -39,7 +39,9 @@ class _Line:
 
 
 def is_live_log(path: Path) -> bool:
-    """Return True if a run's log has display times. Raise InvalidSetting if the file is not a log."""
+    """Return True if a run's log has display times. Raise InvalidSetting if the file is not a
+    log.
+    """
     first = next(_entries(path), None)
     return first is not None and "shown_ns" in first and "arrived_ns" in first
 

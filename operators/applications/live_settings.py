@@ -61,8 +61,8 @@ LIVE_PREDICT_EVERY = {"cpu": 8, "cuda": 4}
 scoring a picture.
 """
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
-"""Longest wait of a frame before it is dropped, in frame intervals. A GPU
-catches up within a few frames. A CPU with two cores would display all queued frames late.
+"""Longest wait of a frame before it is dropped, in frame intervals. A GPU catches up within a few
+frames. A CPU with two cores would display all queued frames late.
 """
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
 """Initialise motion by optical flow. With few steps, flow follows the tissue faster than training;
@@ -87,8 +87,8 @@ class LiveSettings:
     seed: int = 0
     eyes: Eyes = "left"
     """Pictures of a stereo scope used for training; `both` requires the right camera's calibration.
-    Stereo depth uses both pictures in any case. The display
-    shows the left one. Training on the right one reduces the steps on the left one.
+    Stereo depth uses both pictures in any case. The display shows the left one. Training on the
+    right one reduces the steps on the left one.
     """
     scale: float | None = None
     """Scale of the stream's pictures. None: chosen by measurement on a CPU (`working_size`), 1 on a
@@ -110,7 +110,8 @@ class LiveSettings:
     Disable for endless runs, because the log grows.
     """
     tool_mask: str = "builtin"
-    """Tool detector for frames without a recorded mask, a name in `operators.tool_mask.TOOL_MASKS`.
+    """Tool detector for frames without a recorded mask, a name in
+    `operators.tool_mask.TOOL_MASKS`.
     """
     depth: str = "auto"
     """Depth source: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
@@ -172,7 +173,9 @@ class LiveSettings:
         return (*((path,) if path.exists() else ()), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
-        """Return the reconstructor's settings for frames of `pixels` pixels. Raises InvalidSetting."""
+        """Return the reconstructor's settings for frames of `pixels` pixels. Raises
+        InvalidSetting.
+        """
         device = self.device
         wanted = LIVE_GAUSSIANS[device]
         if device == "cuda":

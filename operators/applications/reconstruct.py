@@ -33,7 +33,9 @@ from operators.sources.source import FrameSource
 
 
 class FittedModel:
-    """Adapter that presents a finished model as a reconstructor, which observes without training."""
+    """Adapter that presents a finished model as a reconstructor, which observes without
+    training.
+    """
 
     def __init__(self, model: Model, eyes: BothEyes) -> None:
         self.model, self.eyes = model, eyes

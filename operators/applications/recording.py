@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from operators.applications.live_settings import LiveSettings
 
 RECORDING_RESERVE_BYTES = 64 * 2**20
-"""Disk space that a recording leaves free in addition to the space for finishing the run, in bytes.
+"""Disk space that a recording leaves free in addition to the space for finishing the run, in
+bytes.
 """
 
 

@@ -1,4 +1,6 @@
-"""Rendering of a finished model to a video or images over its time window, from selectable views."""
+"""Rendering of a finished model to a video or images over its time window, from selectable
+views.
+"""
 
 from __future__ import annotations
 
@@ -133,8 +135,8 @@ class _Pictures:
 
 
 def _eyes_of(model: Model, view: View) -> list[Model | None]:
-    """Return the model variant for each picture side by side; None selects
-    colours by the position of the camera.
+    """Return the model variant for each picture side by side; None selects colours by the position
+    of the camera.
     """
     if not view.is_virtual:
         return [model]

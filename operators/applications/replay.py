@@ -66,7 +66,8 @@ class ReplaySettings:
     """Settings of a replay. Raises InvalidSetting for a value out of range."""
 
     recording: Path | str
-    """Path of a recording, or address of a finite source, `scheme://address` (see `open_source`).
+    """Path of a recording, or address of a finite source, `scheme://address` (see
+    `open_source`).
     """
     out: Path
     device: str = "cpu"
@@ -86,7 +87,8 @@ class ReplaySettings:
     depth: str = "auto"
     """Depth source: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     eyes: Eyes | None = None
-    """Pictures of a stereo scope used for training; None: the left ones, which are also displayed.
+    """Pictures of a stereo scope used for training; None: the left ones, which are also
+    displayed.
     """
     poses: Poses = "given"
     """Pose source: the recording, or frame-by-frame estimation from the pictures

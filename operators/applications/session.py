@@ -77,7 +77,9 @@ class Session:
         self.started = started
 
     def execute(self) -> RunOutcome:
-        """Run all four phases. Raises RunFailed, with the outcome, after all phases if one failed."""
+        """Run all four phases. Raises RunFailed, with the outcome, after all phases if one
+        failed.
+        """
         self.start()
         self.run()
         self.end()

@@ -20,7 +20,9 @@ class CutCounts(StageCounts):
 
 @dataclass(frozen=True)
 class SceneCounts(StageCounts):
-    """Number of frames that were given a scene number; `CutCounts` has the reasons for new scenes."""
+    """Number of frames that were given a scene number; `CutCounts` has the reasons for new
+    scenes.
+    """
 
 
 class SceneNumberStage(Stage):
@@ -43,8 +45,8 @@ class SceneNumberStage(Stage):
 class CutStage(Stage):
     """Sets `Frame.new_scene` at cuts, never on a withheld or damaged frame.
 
-    It must run after all stages that withhold pictures. A frame that may be a cut is
-    withheld, and the next frame decides.
+    It must run after all stages that withhold pictures. A frame that may be a cut is withheld, and
+    the next frame decides.
     """
 
     counts_type = CutCounts

@@ -11,7 +11,9 @@ from operators.endoscope.stage import Stage, StageCounts, tissue_of
 
 @dataclass(frozen=True)
 class ExposureCounts(StageCounts):
-    """Frames whose exposure differs from that of their scene, and frames in which it was changing."""
+    """Frames whose exposure differs from that of their scene, and frames in which it was
+    changing.
+    """
 
 
 class ExposureStage(Stage):

@@ -112,8 +112,8 @@ class PictureStagesOp(StageOp):
 
 
 def _settled(frame: Frame, came: Frame) -> bool:
-    """Return True if the stages changed only the masks, and did not withhold the frame or
-    begin a scene.
+    """Return True if the stages changed only the masks, and did not withhold the frame or begin a
+    scene.
     """
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
     return unchanged and frame.withheld is None and frame.new_scene is None and frame.status is not FrameStatus.DAMAGED

@@ -166,7 +166,9 @@ class Fragment:
         return () if graph is None else graph.edge_stats()
 
     def compute_counts(self) -> dict[str, int]:
-        """Return the number of compute calls by operator in the current or last run. Thread-safe."""
+        """Return the number of compute calls by operator in the current or last run.
+        Thread-safe.
+        """
         graph = self._graph
         return {} if graph is None else {task.name: task.computes for task in graph.tasks}
 

@@ -51,7 +51,9 @@ class Condition:
         """Update the state after a compute that was found ready at `timestamp` (ns)."""
 
     def wake_scheduler(self) -> None:
-        """Make the scheduler check the conditions again, after a change from outside of `compute`."""
+        """Make the scheduler check the conditions again, after a change from outside of
+        `compute`.
+        """
         wake = self._wake
         if wake is not None:
             wake()

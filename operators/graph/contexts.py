@@ -44,7 +44,9 @@ class InputContext:
         return self._receive_batch(name)
 
     def queued(self, name: str) -> int:
-        """Return the number of queued messages at an input with one connection; 0 if not connected."""
+        """Return the number of queued messages at an input with one connection; 0 if not
+        connected.
+        """
         edge = self._single.get(name)
         return 0 if edge is None else len(edge)
 

@@ -1,4 +1,6 @@
-"""Multi-threaded scheduler with one thread per operator, woken by changes on the operator's edges."""
+"""Multi-threaded scheduler with one thread per operator, woken by changes on the operator's
+edges.
+"""
 
 from __future__ import annotations
 

@@ -82,7 +82,9 @@ class Operator:
         """Release the resources acquired by `start`."""
 
     def stop_execution(self) -> None:
-        """Finish this operator after its current compute; downstream operators drain. Thread-safe."""
+        """Finish this operator after its current compute; downstream operators drain.
+        Thread-safe.
+        """
         self._finish = True
         if self._wake is not None:
             self._wake()

@@ -15,7 +15,9 @@ from operators.graph.tracking import Trail
 
 
 class Message:
-    """A queued value with its metadata (None if empty) and, with flow tracking, the path it took."""
+    """A queued value with its metadata (None if empty) and, with flow tracking, the path it
+    took.
+    """
 
     __slots__ = ("metadata", "trail", "value")
 
@@ -35,7 +37,8 @@ class EdgeStats:
     received: int
     queued: int
     dropped: dict[str, int]
-    """Dropped messages by reason: `drop_oldest`, `drop_new`, `closed` (the consumer had finished).
+    """Dropped messages by reason: `drop_oldest`, `drop_new`, `closed` (the consumer had
+    finished).
     """
 
 

@@ -162,7 +162,9 @@ class OperatorSpec:
         type: Any = None,
         optional: bool = False,
     ) -> IOSpec:
-        """Declare an output. An `optional` output may stay unconnected; its messages are discarded."""
+        """Declare an output. An `optional` output may stay unconnected; its messages are
+        discarded.
+        """
         port = IOSpec(name, is_input=False, size=size, policy=policy, type=type, optional=optional)
         return self._add(self.outputs, name, port)
 

@@ -91,7 +91,9 @@ class OperatorTask:
         return True
 
     def consent(self, now_ns: int) -> tuple[SchedulingStatus, int]:
-        """Return the combined status of the operator's conditions, with the due time for WAIT_TIME."""
+        """Return the combined status of the operator's conditions, with the due time for
+        WAIT_TIME.
+        """
         status, due_ns = READY, 0
         for condition in self.conditions:
             verdict, at_ns = condition.check(now_ns)

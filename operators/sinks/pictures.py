@@ -10,7 +10,8 @@ from operators.messages import RenderedFrame
 from operators.remembered import marked
 
 MINIMUM_PANE_WIDTH_PX = 320
-"""Minimum width of a pane. Smaller pictures are enlarged by an integer factor to fit the caption.
+"""Minimum width of a pane. Smaller pictures are enlarged by an integer factor to fit the
+caption.
 """
 CAPTION_HEIGHT_PX = 26
 ERROR_FULL_SCALE = 32

@@ -19,7 +19,8 @@ class Recorded:
     shown: int = 0
     """Number of written displayed pictures."""
     lost: Mapping[str, int] | None = None
-    """Items that were not written, by kind and reason, for example `frame: the disk is too slow`.
+    """Items that were not written, by kind and reason, for example `frame: the disk is too
+    slow`.
     """
     bytes: int = 0
     """Size on disk in bytes."""

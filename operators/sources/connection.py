@@ -22,7 +22,9 @@ PACKETS_WITHOUT_KEY = 300
 
 
 class ConnectionFailed(Exception):
-    """The connection failed. The message never contains the address, which may include a password."""
+    """The connection failed. The message never contains the address, which may include a
+    password.
+    """
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,9 @@ class Connection:
 
 
 class StreamDamage:
-    """Damage of pictures: suspicious ones, and those predicted from them up to the next key frame."""
+    """Damage of pictures: suspicious ones, and those predicted from them up to the next key
+    frame.
+    """
 
     def __init__(self) -> None:
         self._keys: list[int] = []

@@ -21,7 +21,8 @@ change.
 MOST_LOST = 1_000_000
 """Gap in sequence numbers above which a restart is assumed instead of lost frames."""
 RESET_FRAMES = 3
-"""Number of consecutive late frames, in order among themselves, that count as a restarted sender.
+"""Number of consecutive late frames, in order among themselves, that count as a restarted
+sender.
 """
 
 
@@ -58,7 +59,9 @@ class FrameOrder:
         self._restarted = False
 
     def restart(self) -> None:
-        """Continue numbers and timestamps with the next frame, which arrives over a new connection."""
+        """Continue numbers and timestamps with the next frame, which arrives over a new
+        connection.
+        """
         self._restarted = True
 
     def take(self, frame: Frame, arrived_ns: int) -> Frame | None:

@@ -31,7 +31,9 @@ OPEN_TIMEOUT_S = 30.0
 HUNG_AFTER_S = 5.0
 """Time without a message, in seconds, after which the process is considered hung."""
 ON_DISK = frozenset({"recording", "realtime"})
-"""Schemes of sources on disk. Missing files count towards `MOST_FAILURES`, as they do not return."""
+"""Schemes of sources on disk. Missing files count towards `MOST_FAILURES`, as they do not
+return.
+"""
 MOST_FAILURES = 10
 """Maximum number of consecutive processes without a frame before the source is given up."""
 LOOK_S = 0.05

@@ -119,7 +119,9 @@ class RealtimeSource(LiveSource):
             yield iter(remembered or self.recording)
 
     def _backwards(self, forwards: list[Frame]) -> list[Frame]:
-        """Return the frames between the last and the first in reverse, with increasing timestamps."""
+        """Return the frames between the last and the first in reverse, with increasing
+        timestamps.
+        """
         last_ns = forwards[-1].pts_ns
         return [replace(frame, pts_ns=last_ns - frame.pts_ns) for frame in reversed(forwards[1:-1])]
 

@@ -1,4 +1,6 @@
-"""Timestamps for frames without any: evenly spaced, and synchronous with the clock in the long run."""
+"""Timestamps for frames without any: evenly spaced, and synchronous with the clock in the long
+run.
+"""
 
 from __future__ import annotations
 

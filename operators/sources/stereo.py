@@ -168,7 +168,9 @@ class JoinedSource(LiveSource):
         return "; ".join(said) or super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
-        """Return the counts of this source, and those of both eyes prefixed by `left` or `right`."""
+        """Return the counts of this source, and those of both eyes prefixed by `left` or
+        `right`.
+        """
         counts = Counter(super().counts())
         for name, eye in (("left", self._left), ("right", self._right)):
             if isinstance(eye, ReportingSource):

@@ -24,15 +24,16 @@ MIN_SIDE_PX = 8
 
 
 class StreamSource(LiveSource):
-    """`LiveSource` for an external sender. A subclass calls `describe` and implements `pictures()`."""
+    """`LiveSource` for an external sender. A subclass calls `describe` and implements
+    `pictures()`.
+    """
 
     def __init__(self, options: SourceOptions, *, stalled_after_s: float = STALLED_AFTER_S) -> None:
         """Set the options.
 
         Args:
             options: `scale`, `max_frames` and `waiting` apply. An infinite `speed` makes the sender
-                wait
-                instead of dropping frames.
+                wait instead of dropping frames.
             stalled_after_s: time without a frame until the state is `STALLED`, in seconds.
         """
         super().__init__(

@@ -1,4 +1,6 @@
-"""Base class of sources that read in a separate thread, so that reading overlaps with processing."""
+"""Base class of sources that read in a separate thread, so that reading overlaps with
+processing.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""YUV4MPEG2 (`.y4m`) headers of raw video, as written by `ffmpeg -f yuv4mpegpipe` and mjpegtools."""
+"""YUV4MPEG2 (`.y4m`) headers of raw video, as written by `ffmpeg -f yuv4mpegpipe` and
+mjpegtools.
+"""
 
 from __future__ import annotations
 
