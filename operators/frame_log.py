@@ -89,7 +89,7 @@ def read_frames(path: Path) -> Iterator[Entry]:
 
 
 def frames_per_entry(frames: int, most: int) -> int:
-    """Return the bin size that reduces `frames` frames to at most `most` bins."""
+    """Return the number of frames per bin that reduces `frames` frames to at most `most` bins."""
     return max(1, -(-frames // most))
 
 

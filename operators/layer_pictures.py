@@ -137,7 +137,12 @@ def mark_unobserved(image: NDArray[np.uint8], alpha: NDArray[np.float32]) -> flo
 
 
 def mark_virtual(image: NDArray[np.uint8], text: str) -> None:
-    """Draw a border and `text` at the lower edge into a picture from a virtual camera, in place."""
+    """Mark a picture from a virtual camera by a border and a text, in place.
+
+    Args:
+        image: uint8 RGB [H, W, 3], modified.
+        text: drawn at the lower edge.
+    """
     height, width = image.shape[:2]
     edge = max(2, height // 80)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), VIRTUAL, edge)

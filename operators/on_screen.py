@@ -25,8 +25,8 @@ from operators.outcome import OutcomeBuilder
 
 LOOK_NS = 500_000_000
 WAITING = 8
-"""Capacity of each input queue, in messages. If a queue is full, the oldest message is dropped and
-later counted as unscored.
+"""Capacity of each input queue, in messages. A full queue drops its oldest message; dropped frames
+are counted as unscored.
 """
 PREDICTIONS_KEPT = 64
 """Maximum number of stored scores whose counterpart (prediction or baseline) has not arrived."""

@@ -23,7 +23,15 @@ _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".npy", ".mp4", ".avi", ".mkv", 
 
 
 def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
-    """Raise OutputError if a run with these inputs must not use `out` as its output folder."""
+    """Check that a run may use `out` as its output folder.
+
+    Args:
+        out: the output folder.
+        inputs: files and folders that the run reads.
+
+    Raises:
+        OutputError: `out` is a protected folder, or contains or is part of an input or recording.
+    """
     if len(os.fsencode(out)) >= MAX_PATH_BYTES:
         raise OutputError(f"--out has {len(os.fsencode(out))} bytes; a path has at most {MAX_PATH_BYTES - 1}")
     real = Path(os.path.realpath(out))

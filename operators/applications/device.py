@@ -35,8 +35,9 @@ def check_device(device: str) -> None:
 
 
 def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThreadScheduler:
-    """Return the scheduler of an application that processes every frame. Its choice does not affect
-    the results.
+    """Return the scheduler for an application that processes every frame.
+
+    The results do not depend on the scheduler.
 
     On the CPU, training occupies all cores, so one thread runs all operators in turn. With a GPU
     the host is idle during training: each operator gets a thread, and decoding, scoring and
@@ -47,7 +48,12 @@ def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThrea
 
 @contextmanager
 def seeded(seed: int, device: str) -> Iterator[None]:
-    """Context manager that seeds torch's random generators and restores their state on exit."""
+    """Context manager that seeds torch's random generators and restores their state on exit.
+
+    Args:
+        seed: the seed.
+        device: `cuda` also covers the generators of all GPUs.
+    """
     import torch
 
     with torch.random.fork_rng(devices=range(torch.cuda.device_count()) if device == "cuda" else []):

@@ -83,9 +83,14 @@ def check_width(width_px: int) -> None:
 
 
 def frames_to_render(window_s: tuple[float, float], fps: float) -> int:
-    """Return the number of frames that cover a time window at `fps` frames/s.
+    """Return the number of frames that cover a time window.
 
-    Raises InvalidSetting for a rate out of range or for too many frames.
+    Args:
+        window_s: start and end, in seconds.
+        fps: frame rate in frames/s.
+
+    Raises:
+        InvalidSetting: the rate is out of range, or there are too many frames.
     """
     if not (math.isfinite(fps) and LEAST_FPS <= fps <= 1000):
         raise InvalidSetting(f"fps is {fps:g}; it must be at least {LEAST_FPS:g} and at most 1000")

@@ -216,9 +216,17 @@ def measured_size(settings: LiveSettings, about: SourceDescription, share: float
 
 
 def on_trial(settings: LiveSettings, source: FrameSource, notes: list[str]) -> tuple[LiveSettings, FrameSource]:
-    """Perform the trial run. Return the settings and the source at the working size.
+    """Perform the trial run and select the working size.
 
-    On a CPU without a given scale the working size is measured and reported in `notes`.
+    On a CPU without a given scale the working size is measured.
+
+    Args:
+        settings: settings of the run.
+        source: the source at the given scale.
+        notes: list that receives the selected size as a sentence.
+
+    Returns:
+        The settings and the source at the working size.
     """
     if settings.device != "cpu" or settings.scale is not None:
         trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
@@ -230,10 +238,17 @@ def on_trial(settings: LiveSettings, source: FrameSource, notes: list[str]) -> t
 
 
 def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
-    """Perform all checks that are possible before the first frame. Return the source and add to
-    `notes`.
+    """Perform all checks that are possible before the first frame.
 
-    Raises as `live` does before anything is written.
+    Args:
+        settings: settings of the run.
+        notes: list that receives notes for the report.
+
+    Returns:
+        The source, not yet opened.
+
+    Raises:
+        UserError: as `live` raises it before anything is written.
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)

@@ -52,7 +52,14 @@ def new_recording_folder(out: Path) -> Path:
 def new_recorder(
     folder: Path, source: SourceDescription, settings: LiveSettings, room_to_finish: Callable[[], int]
 ) -> SessionRecorder:
-    """Create the recorder of a run. The graph opens it at its start."""
+    """Create the recorder of a run. The graph opens it at its start.
+
+    Args:
+        folder: folder for this recording alone.
+        source: description of the stream.
+        settings: settings of the run.
+        room_to_finish: returns the disk space that finishing the run needs, in bytes.
+    """
     info = SessionInfo(
         source=source.name[:1000],
         utc=datetime.now(UTC).isoformat(),

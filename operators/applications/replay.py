@@ -330,8 +330,7 @@ def replay(
 
 
 def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False) -> FrameSource:
-    """Perform all checks that are possible before the first frame. Return the source and add to
-    `notes`.
+    """Perform all checks that are possible before the first frame, and return the source.
 
     Args:
         settings: settings of the replay.

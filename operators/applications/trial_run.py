@@ -61,9 +61,16 @@ def made_up_tissue(height_px: int, width_px: int) -> NDArray[np.uint8]:
 def trial_run(
     settings: LiveSettings, source: FrameSource, new_graph: Callable[[FrameSource, LiveSettings], Application]
 ) -> None:
-    """Run the graph made by `new_graph` on synthetic pictures.
+    """Run the graph made by `new_graph` on synthetic pictures, to detect failures before the
+    stream.
 
-    Raises the errors of a run, such as OperatorFailed, before the stream is touched.
+    Args:
+        settings: settings of the live run.
+        source: source of the stream; only its description is used.
+        new_graph: creates the graph from a source and settings.
+
+    Raises:
+        OperatorsError: the errors of a run, such as OperatorFailed.
     """
     run_on_trial(settings, lambda inside: new_graph(MadeUpTissue(source.description), inside))
 

@@ -98,9 +98,12 @@ def view_of(model: Model, camera: Camera, wish: ViewWish) -> View:
 
 
 def on_orbit(camera: Camera, distance: float, turns: float) -> Camera:
-    """Return the camera after `turns` orbits around the point at `distance` in front of `camera`.
+    """Return a camera on a closed curve that begins at `camera` and faces a fixed point.
 
-    The orbit is a closed curve that begins at `camera`.
+    Args:
+        camera: start of the orbit.
+        distance: distance from the start to the fixed point in front of it, in the scene's unit.
+        turns: position on the orbit; 1 is a complete round.
     """
     phase = 2 * math.pi * turns
     return Orbit(AZIMUTH_DEG * math.sin(phase), ELEVATION_DEG * math.sin(2 * phase)).camera(camera, distance)

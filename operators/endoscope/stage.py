@@ -130,6 +130,11 @@ def tissue_of(frame: Frame) -> NDArray[np.uint8] | None:
 
 
 def left_out(frame: Frame, kept: NDArray[np.uint8]) -> Frame:
-    """Return the frame with the pixels excluded from the loss at which `kept` [H, W] is 0."""
+    """Return the frame with further pixels excluded from the loss.
+
+    Args:
+        frame: the frame; its own `loss_mask` stays in effect.
+        kept: uint8 [H, W], 0 = excluded.
+    """
     together = kept if frame.loss_mask is None else np.minimum(frame.loss_mask, kept)
     return frame.with_fields(loss_mask=together)

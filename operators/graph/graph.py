@@ -227,8 +227,11 @@ class Graph:
 
 
 def accepts(taken: Any, given: Any) -> bool:
-    """Return True if an output's type `given` fits an input's type `taken`; None and Any fit all
-    types.
+    """Return True if an input accepts an output's values.
+
+    Args:
+        taken: type or union declared by the input; None, Any or object accepts everything.
+        given: type or union declared by the output; None or Any fits every input.
     """
     if taken in (None, Any, object) or given in (None, Any):
         return True

@@ -7,15 +7,17 @@ the embedded engine.
 
 Workarounds for problems of the SDK (4.6):
 
-- Its MultiThreadScheduler may stop early. Threaded runs use its EventBasedScheduler, and a run that
-  ends while an operator could compute raises EngineError.
+- Its MultiThreadScheduler may stop early. Threaded runs use its EventBasedScheduler, and a run
+  that ends while an operator could compute raises EngineError.
 - `stop_execution` does not wake a graph that waits for an event. The gates perform the stop.
-- Its greedy scheduler sleeps through events until the next due time. Due times are limited to 10 ms.
-- Its schedulers declare a deadlock before they have seen the latest change. They wait 0.5 s first.
+- Its greedy scheduler sleeps through events until the next due time. No due time is more than
+  10 ms ahead.
+- Its schedulers declare a deadlock before they have seen the latest change. They are configured
+  to wait 0.5 s first.
 - An exception in compute can end a run silently. No exception is passed to the SDK.
-- It replaces the SIGINT and SIGTERM handlers permanently. The handlers are restored after the start.
-- Its EventBasedScheduler may check an operator in one thread while stopping it in another, and fail.
-  With it a finished operator waits forever, which does not keep the run from ending.
+- It replaces the SIGINT and SIGTERM handlers permanently. They are restored after the start.
+- Its EventBasedScheduler may check an operator in one thread while stopping it in another, and
+  fail. With it a finished operator waits forever, which does not keep the run from ending.
 - It checks an operator while that operator computes. Such a check decides nothing.
 - It drops messages without counting. Edges apply the policy, and the SDK's queues never overflow.
 """

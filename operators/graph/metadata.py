@@ -23,7 +23,16 @@ class MetadataPolicy(Enum):
 
 
 def merge_metadata(into: dict[str, Any], received: dict[str, Any], policy: MetadataPolicy) -> None:
-    """Merge `received` into `into`. Raises MetadataConflict under `RAISE`."""
+    """Merge the metadata of a received message.
+
+    Args:
+        into: metadata of the current compute, modified.
+        received: metadata of the message.
+        policy: treatment of keys that are already present.
+
+    Raises:
+        MetadataConflict: a key has different values and `policy` is `RAISE`.
+    """
     if policy is MetadataPolicy.UPDATE:
         into.update(received)
         return

@@ -52,7 +52,17 @@ class Address:
     @overload
     def number(self, name: str, default: float | None, least: float, most: float) -> float | None: ...
     def number(self, name: str, default: float | None, least: float, most: float) -> float | None:
-        """Return a numeric option between `least` and `most`. Raises InvalidSetting."""
+        """Return a numeric option.
+
+        Args:
+            name: name of the option.
+            default: value if the option is missing.
+            least: smallest valid value.
+            most: largest valid value.
+
+        Raises:
+            InvalidSetting: the option is not a number or out of range.
+        """
         text = self.text(name)
         if text is None:
             return default

@@ -69,8 +69,14 @@ class FrameWriter:
         self._memory = mmap.mmap(self._fd, SLOTS * self._slot_bytes)
 
     def write(self, slot: int, planes: Mapping[str, NDArray]) -> list[Any]:
-        """Copy a frame's arrays into a slot. Return their names, offsets and shapes for
-        `FrameReader.read`.
+        """Copy a frame's arrays into a slot.
+
+        Args:
+            slot: number of the slot, which must be free.
+            planes: arrays by field, as in `PLANES`.
+
+        Returns:
+            Name, offset in bytes and shape of each array, as `FrameReader.read` expects them.
         """
         assert self._memory is not None
         begins, _ = _laid_out(planes)

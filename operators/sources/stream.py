@@ -106,7 +106,17 @@ class StreamSource(LiveSource):
 
 
 def check_size(name: str, width_px: int, height_px: int, least: int = 1) -> None:
-    """Raise InvalidSetting for frames of an unusable size."""
+    """Check the size of frames.
+
+    Args:
+        name: name of the source, for the error message.
+        width_px: width in pixels.
+        height_px: height in pixels.
+        least: minimum side in pixels.
+
+    Raises:
+        InvalidSetting: a side is too short, or there are more than `MAX_PIXELS` pixels.
+    """
     if min(width_px, height_px) < least or width_px * height_px > MAX_PIXELS:
         raise InvalidSetting(
             f"{name}: frames of {width_px}x{height_px} px cannot be used; both sides must be at least {least} px, and at most"
@@ -115,7 +125,10 @@ def check_size(name: str, width_px: int, height_px: int, least: int = 1) -> None
 
 
 def resized(frame: Frame, scale: float) -> Frame:
-    """Return a resized frame: images by area averaging, mask and depth by nearest neighbour."""
+    """Return the frame with width and height multiplied by `scale`.
+
+    Images are resampled by area averaging, mask and depth by nearest neighbour.
+    """
     if scale == 1:
         return frame
     size = max(1, round(frame.width_px * scale)), max(1, round(frame.height_px * scale))

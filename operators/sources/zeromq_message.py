@@ -56,9 +56,17 @@ def packed(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> bytes:
 
 
 def pieces(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> list[bytes | memoryview]:
-    """Encode a frame as header and arrays without copying. Raises ValueError.
+    """Encode a frame as a header and contiguous arrays.
 
-    The arrays must not be modified until the message is sent.
+    Contiguous arrays are not copied, so they must not be modified until the message is sent.
+
+    Args:
+        seq: sequence number.
+        pts_ns: timestamp in nanoseconds.
+        arrays: `image` [H, W, 3], and optionally the other arrays of the same size.
+
+    Raises:
+        ValueError: shapes do not match, or the picture is too large.
     """
     image = arrays["image"]
     height_px, width_px = image.shape[:2]
