@@ -109,8 +109,8 @@ class DepthOp(Operator):
         camera: camera of the frames.
         has_time: allow `auto` to use estimators slower than the camera's frame rate.
         device: device of estimators that are not limited to the CPU.
-        held_out: returns True for evaluation frames, which the estimator must not use to refine the
-            depth of other frames.
+        held_out: returns True for evaluation frames, which keep their recorded depth but are never
+            passed to an estimator.
     """
 
     def __init__(

@@ -130,7 +130,7 @@ class ReplaySettings:
         if offline:
             config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:
-            # Pixels limit the useful number of Gaussians to a quarter of their count.
+            # One Gaussian per `PIXELS_PER_GAUSSIAN` pixels is the useful maximum.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)
             config = replace(
                 config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most)

@@ -197,7 +197,7 @@ class PipeSource(StreamSource):
         if not stat.S_ISFIFO(os.fstat(fd).st_mode):
             os.close(fd)
             raise SourceUnavailable(f"{self._path} is no pipe. Make one with mkfifo, or give a recording by its path.")
-        with contextlib.suppress(OSError, AttributeError):  # works with less
+        with contextlib.suppress(OSError, AttributeError):  # a smaller pipe works, too
             fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         return fd
 
