@@ -1,24 +1,25 @@
-"""Errors of the core. Each says what happened, the value that was seen, and what to do.
+"""Exceptions of the core. Each message names the event, the observed value and the remedy.
 
 CoreError
-├── InvalidInput (also ValueError)      a call of an API has an argument of a wrong shape, type or value: the caller's mistake
-├── InvalidSetting (UserError, also ValueError)   an option that a user chose is out of its range
+├── InvalidInput (also ValueError)      argument of wrong shape, dtype or value: a caller bug
+├── InvalidSetting (UserError, also ValueError)   an option chosen by the user is out of range
 ├── NativeLibraryMissing (UserError)    the C++ core was not built or cannot be loaded
 ├── BundleError (UserError)             a model file cannot be used
-│   ├── BundleCorrupt                   wrong digest, truncated, not finite
+│   ├── BundleCorrupt                   wrong digest, truncated, or non-finite values
 │   └── UnknownFormatVersion            written by a later version
-├── ExportError (UserError)             a model cannot be written in a format of other programs
+├── ExportError (UserError)             a model cannot be written in a foreign format
 └── RecordingError (UserError)          a recording cannot be used
-    ├── RecordingMissing                a file or folder is not there
-    └── RecordingInvalid                counts, sizes, polarity, calibration or video data are wrong
+    ├── RecordingMissing                a file or folder does not exist
+    └── RecordingInvalid                wrong counts, sizes, polarity, calibration or video data
 
-`UserError` marks, in this package and in those above it, what the user of a program can change: a file, an option, a disk, a device.
-A program answers it with one sentence. Every other exception that reaches a program's end is a bug in it.
+`UserError` marks failures that the user of a program can remedy (a file, an option, a disk, a
+device). It is the base of such errors in every package of the project. Programs report it as one
+sentence. Any other exception that ends a program is a bug in the program.
 """
 
 
 class UserError(Exception):
-    """Something that the user of a program can change; its text is the one sentence that they get."""
+    """Failure that the user of a program can remedy; its text is shown to them as one sentence."""
 
 
 class CoreError(Exception):
@@ -58,7 +59,7 @@ class RecordingError(CoreError, UserError):
 
 
 class RecordingMissing(RecordingError):
-    """A file or folder of a recording is not there."""
+    """A file or folder of a recording does not exist."""
 
 
 class RecordingInvalid(RecordingError):

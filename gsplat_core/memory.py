@@ -1,4 +1,4 @@
-"""How much memory there is, so that what cannot fit is refused before work starts."""
+"""Query of available memory, used to reject oversized inputs before any work starts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _of_control_group(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
     limit, current = _text(folder / "memory.max").strip(), _text(folder / "memory.current").strip()
     if not limit.isdecimal() or not current.isdecimal():
         return None
-    # Cached files are counted as used, but make room.
+    # The page cache counts as used but can be reclaimed.
     stated = dict(line.split()[:2] for line in _text(folder / "memory.stat").splitlines() if " " in line)
     return max(0, int(limit) - int(current) + int(stated.get("inactive_file", "0")))
 
@@ -51,10 +51,10 @@ def _text(path: Path) -> str:
 
 
 def return_freed_memory() -> None:
-    """Give the system back what this process has freed and its allocator kept for itself; nothing happens where that is not known.
+    """Return freed heap pages to the operating system (glibc's `malloc_trim`); a no-op elsewhere.
 
-    Takes milliseconds. Without it the memory of a process that runs for days seems to grow: what is freed lies in pieces between what is in
-    use (glibc's `malloc_trim`).
+    Takes milliseconds. Without it, the resident size of a long-running process grows through heap
+    fragmentation.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:

@@ -12,14 +12,19 @@ Kind = TypeVar("Kind")
 
 
 class Registry(Generic[Kind]):
-    """Names and what they stand for, in the order in which they were added.
+    """Mapping from names to implementations, iterated in order of registration.
 
-    An entry is the implementation itself or where it is, as `"package.module:attribute"`; that module is imported when the name is first
-    used, so that listing the names loads nothing.
+    An entry is either the implementation or its import path `"package.module:attribute"`. The
+    module is imported when the name is first looked up, so listing the names imports nothing.
     """
 
     def __init__(self, what: str, entries: Mapping[str, Kind | str] | None = None) -> None:
-        """`what` names the kind of thing in messages: "renderer"."""
+        """Create a registry.
+
+        Args:
+            what: noun for one entry in error messages, such as "renderer".
+            entries: initial entries by name.
+        """
         self.what = what
         self._entries: dict[str, Any] = dict(entries or {})
 
@@ -35,7 +40,11 @@ class Registry(Generic[Kind]):
         del self._entries[name]
 
     def __getitem__(self, name: str) -> Kind:
-        """What `name` stands for. Raises InvalidSetting, with the known names, when it is not registered."""
+        """Return the implementation registered under `name`.
+
+        Raises:
+            InvalidSetting: if the name is not registered; the message lists the known names.
+        """
         self.check(name)
         entry = self._entries[name]
         if isinstance(entry, str):

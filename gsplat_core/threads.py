@@ -1,7 +1,9 @@
-"""The number of threads that torch uses in one thread of this process.
+"""Limit on the number of threads that torch uses for operations called from one Python thread.
 
-LAPACK, BLAS and torch's own reductions share long sums among their threads, so their rounding depends on how many there are: a solved system of 200
-unknowns or the mean of 40,000 pixels has other last bits with two threads than with one. Geometry runs such operations within `one_thread`.
+LAPACK, BLAS and torch's reductions split long sums among threads, so rounding depends on the thread
+count. The solution of a system with 200 unknowns, or the mean of 40,000 pixels, differs in its last
+bits between one and two threads. Geometry runs such operations within `one_thread` to be
+reproducible.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Between the host's memory and a device's, without making either wait for the other. On the CPU nothing is copied."""
+"""Asynchronous copies between host and device memory. CPU tensors are not copied."""
 
 from __future__ import annotations
 
@@ -37,12 +37,14 @@ class StagedCopies:
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
-        """What is to be copied must be ready on it."""
+        """Stream on which copies run; it must wait for the stream that computes the
+        copied tensor.
+        """
         self._staged = torch.empty(self.PIECE_BYTES, dtype=torch.uint8, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
     def to_host(self, tensor: Tensor) -> Tensor:
-        """A copy in host memory; of a tensor that is there, itself."""
+        """Return the tensor in host memory: a copy of a CUDA tensor, a CPU tensor itself."""
         if not tensor.is_cuda:
             return tensor
         with torch.cuda.stream(self.stream):
@@ -60,7 +62,10 @@ class StagedCopies:
 
 
 class HostCopy:
-    """A tensor's values on their way to the host: queued behind what computes them, waited for when they are asked for."""
+    """Asynchronous copy of a tensor to the host.
+
+    The copy is enqueued after the kernels that compute the tensor. Reading the values waits for it.
+    """
 
     def __init__(self, tensor: Tensor) -> None:
         tensor = tensor.detach()
@@ -74,11 +79,13 @@ class HostCopy:
             self._values = tensor
 
     def numpy(self) -> NDArray[Any]:
-        """The values; waits until they are there. On the CPU they share the tensor's memory."""
+        """Return the values as an array after waiting for the copy; a CPU tensor shares
+        its memory.
+        """
         if self._arrived is not None:
             self._arrived.synchronize()
         return self._values.numpy()
 
     def item(self) -> float:
-        """The one value of a tensor that has one; waits until it is there."""
+        """Return the value of a one-element tensor after waiting for the copy."""
         return float(self.numpy().item())

@@ -50,7 +50,10 @@ BOX_MARGIN = 0.05
 
 
 def box_around(means: Tensor) -> Tensor:
-    """[2, 3]: corners of the finite positions with a margin; the unit box around the origin when there are none."""
+    """Return the corners [2, 3] of the bounding box of all finite positions, with a margin.
+
+    Without finite positions, the box is [-1, 1]³.
+    """
     box = torch.tensor([[-1.0] * 3, [1.0] * 3], device="cpu" if means.is_meta else means.device)
     if means.is_meta:  # only the shape is wanted
         return box
@@ -130,11 +133,16 @@ class HexPlaneField(DeformationField):
 
     @property
     def has_frame_deltas(self) -> bool:
-        """Whether the kernel takes the network's sizes; plain torch, which others fall back to, cannot be captured."""
+        """True if the kernel supports the network's sizes.
+
+        The torch fallback cannot be captured in a CUDA graph.
+        """
         return takes_layers(self.channels, len(self.levels), self.width, self.depth)
 
     def frame_time(self, time_s: float) -> float:
-        """What `frame_deltas` takes for a time: it, clamped to the window, in [-1, 1]."""
+        """Map `time_s`, clamped to the time window, to the argument of `frame_deltas`
+        in [-1, 1].
+        """
         start, end = self.time_window_s
         return 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
 
@@ -145,7 +153,7 @@ class HexPlaneField(DeformationField):
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`; outside the window the state of its nearest end."""
         coordinates = self.coordinates(gaussians.means, time_s)
-        # With a graph, torch's own layers: they keep what their gradients need.
+        # The torch implementation keeps the intermediates that autograd needs.
         ops = plain_torch if torch.is_grad_enabled() else self._ops
         return self._displaced(
             gaussians, ops.hexplane_decode(self._features(coordinates), coordinates, [], *self._network())
@@ -176,14 +184,22 @@ class HexPlaneField(DeformationField):
         return at
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
-        """From a float32 [1] on the field's device, a time of `frame_time`, to what the field adds then: [N, 16], the frame path's layout.
+        """Return a function from a normalised time to the field's deltas, without autograd.
 
-        No autograd graph. What does not depend on time is computed now, for the planes as they are; the function follows later changes of
-        time planes and network only. On CUDA nothing waits for the host, so that a CUDA graph can hold the call.
+        Features of the space planes are computed now. The returned function reflects later changes
+        of the time planes and the network only. On CUDA it does not synchronise with the host, so a
+        CUDA graph can capture the call.
 
         Args:
-            dtype: torch.float16 keeps the space features in half the memory and runs the network in half precision, which on CUDA is
-                twice as fast and adds an error of about 1e-3 of the deltas. Elsewhere, and for sizes that the kernels do not take, float32.
+            gaussians: canonical Gaussians.
+            dtype: torch.float16 halves the memory of the space features and runs the network in
+                half precision. On CUDA this is twice as fast and adds an error of about 1e-3 of the
+                deltas. On other devices, and for sizes that the kernels do not support, float32 is
+                used.
+
+        Returns:
+            Function from a float32 tensor [1] on the field's device, as computed by `frame_time`,
+                to deltas [N, 16] in the layout of `scene.layout`.
         """
         is_cuda = self.box.device.type == "cuda" and self._ops is compiled
         with torch.no_grad():
@@ -210,10 +226,11 @@ class HexPlaneField(DeformationField):
         return at
 
     def extend(self, time_window_s: tuple[float, float]) -> None:
-        """Cover another window with the same number of time rows: what was learned keeps its place in time.
+        """Change the time window while preserving the learned motion at each time.
 
-        The rows are interpolated linearly, so a longer window has coarser rows; beyond the old window they hold the nearest
-        end. Parameters are changed in place, so that an optimiser can go on with them.
+        The number of time rows is constant. Rows are interpolated linearly, so a longer window has
+        coarser rows. Times outside the old window take the value at its nearest end. Parameters are
+        changed in place, so optimiser state stays attached.
         """
         start, end = checked_window(time_window_s)
         old_start, old_end = self.time_window_s
@@ -325,7 +342,7 @@ class HexPlaneTraining:
     rates = 2
     """Learning rates that `update` takes: of the planes, of the network."""
     reads_positions = True
-    """The deltas depend on the Gaussians' positions, whose gradient `update` completes."""
+    """The deltas depend on the Gaussians' positions; `update` adds that part of their gradient."""
 
     def __init__(
         self,
@@ -353,15 +370,20 @@ class HexPlaneTraining:
         self._state: TrainingState | None = None
 
     def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
-        """Of the planes, of the network."""
+        """Return the learning rates in the order planes, network."""
         return [rates["planes"], rates["network"]]
 
     def tensors(self) -> Sequence[Tensor]:
-        """Everything on the device that a step reads or changes."""
+        """Tensors on the device that a training step reads or changes."""
         return self._tensors
 
     def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
-        """What the field adds to the Gaussians at `time` [1], one of `HexPlaneField.frame_time`: [N, 16], the frame path's layout."""
+        """Return the deltas [N, 16] at a normalised time.
+
+        Args:
+            gaussians: canonical Gaussians.
+            time: float32 [1] as computed by `HexPlaneField.frame_time`.
+        """
         means = gaussians.means.detach()
         self._state = hexplane_train(means, self._box, time, self._planes, self._weights, self._biases)
         return self._state.deltas
@@ -374,13 +396,15 @@ class HexPlaneTraining:
         return hexplane_train_backward(v_raw, self._box, self._state, self._planes, *layers)
 
     def update(self, v_raw: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor | None = None) -> None:
-        """One step of Adam for dL/d(deltas) `v_raw` [N, 16] of the last `deltas`; adds the positions' part to its first 3 columns.
+        """Take one Adam step for the gradient of the deltas last returned by `deltas`.
 
         Args:
-            time: as for `deltas`.
-            rates: float32 [2], of the planes and of the network.
-            step: int64 [1], counts from 1.
-            status: int32 [4] of the frame; if its lists overflowed, nothing but `v_raw` is changed.
+            v_raw: dL/d(deltas) [N, 16]; the gradient through the positions is added to columns 0 to
+                2.
+            time: argument of the last `deltas` call.
+            rates: float32 [2], learning rates of the planes and the network.
+            step: int64 [1], step number from 1.
+            status: int32 [4] of the frame; if its lists overflowed, only `v_raw` is changed.
         """
         gradient = self.gradient(v_raw)
         of_planes, of_network = (
@@ -412,7 +436,11 @@ MOST_ROWS = 1 << 10
 
 
 def new_hexplane_field(wanted: NewField) -> HexPlaneField:
-    """Time rows as fine as motion has to be, and space planes of three levels, where all frames are there; online the field's own default."""
+    """Create a HexPlane field (Cao & Johnson 2023).
+
+    For a recording with a known end, the time resolution follows the wanted motion spacing and the
+    space planes have three levels. Live, the field's default resolution is used.
+    """
     if wanted.end_s is None:
         return HexPlaneField.for_gaussians(wanted.gaussians, wanted.time_window_s)
     rows = round(ROWS_PER_SPACING * (wanted.end_s - wanted.start_s) / wanted.spacing_s) + 1
@@ -421,7 +449,9 @@ def new_hexplane_field(wanted: NewField) -> HexPlaneField:
 
 
 def captured_training(field: HexPlaneField) -> HexPlaneTraining | None:
-    """What trains the field in a CUDA graph; None for sizes that the kernels do not take."""
+    """Return the field's trainer for CUDA graphs, or None if the kernels do not support
+    its sizes.
+    """
     fits = takes_layers(field.channels, len(field.levels), field.width, field.depth)
     return HexPlaneTraining(field) if fits else None
 

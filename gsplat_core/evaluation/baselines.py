@@ -31,10 +31,16 @@ _per_thread = threading.local()
 
 
 def half_velocity(before_last: NDArray[np.uint8], last: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """The next picture if motion went on as it was, moved by half of it; causal.
+    """Predict the next picture by moving the last one by half of the last motion; causal.
 
-    Half, because an estimated motion is uncertain: the whole of it scores less. Args: RGB uint8 [H, W, 3], in order. Returns floats in 0..1,
-    or None for pictures that are too small for the flow.
+    Half of the motion scores better than all of it, because the estimated flow is uncertain.
+
+    Args:
+        before_last: RGB uint8 [H, W, 3].
+        last: RGB uint8 [H, W, 3], the frame after `before_last`.
+
+    Returns:
+        float32 [H, W, 3] in 0..1, or None if the pictures are too small for the flow.
     """
     backward = _flow(last, before_last)
     return None if backward is None else _moved(last, backward, 0.5)
@@ -49,7 +55,7 @@ def half_way(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.
 
 
 def _flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """Where each pixel of `source` is in `target`, as an offset [H, W, 2] in pixels."""
+    """Return the optical flow from `source` to `target` as offsets [H, W, 2] in pixels."""
     if min(source.shape[:2]) < SMALLEST_SIDE_PX:
         return None
     finder = getattr(_per_thread, "finder", None)
@@ -73,7 +79,7 @@ def _moved(image: NDArray[np.uint8], flow: NDArray[np.float32], share: float) ->
 
 
 AGES = (1, 2, 3, 5, 8)
-"""How many frames old the copies of the frame-hold curve are."""
+"""Ages of the copies on the frame-hold curve, in frames."""
 PREVIOUS_FRAME, NEIGHBOUR_MEAN, TRAIN_MEAN = "previous_frame", "neighbour_mean", "train_mean"
 HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
 SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
@@ -83,14 +89,19 @@ _MAX_THREADS = 4
 
 @dataclass(frozen=True)
 class BaselineScore:
-    """What one baseline scores: means in decibels over `frames` frames; None where no frame has the measure."""
+    """Score of one baseline: means in decibels over `frames` frames; None if no frame has the
+    measure.
+    """
 
     psnr_tissue_db: float | None = None
     psnr_frame_db: float | None = None
     frames: int = 0
     psnr_both_db: float | None = None
-    """Of copies: over the pixels that are tissue in the frame and in its copy. The published frame-hold curves are measured so; what a tool
-    had hidden in the copy does not count against it."""
+    """PSNR of a copy over pixels that are tissue both in the frame and in the copy.
+
+    Published frame-hold curves use this mask, so tissue occluded in the copy does not count as
+    error.
+    """
 
 
 @dataclass(frozen=True)
@@ -98,12 +109,15 @@ class Baselines:
     """Each baseline, against the tissue pixels of the frame that is scored."""
 
     copies: Mapping[int, BaselineScore] = field(default_factory=dict)
-    """By age: the frame that came so many frames before, shown for every frame that has one."""
+    """Scores by age in frames of the copy that is shown instead of each frame."""
     every: Mapping[str, BaselineScore] = field(default_factory=dict)
-    """By name, over every frame that has it: `half_velocity_flow`."""
+    """Scores by baseline name over every frame that has the baseline: `half_velocity_flow`."""
     heldout: Mapping[str, BaselineScore] = field(default_factory=dict)
-    """By name, over the held-out frames: the previous frame, the neighbours' mean and the half-way flow (both see the future), the mean of
-    all training frames (tools and all, as the field computes it)."""
+    """Scores by baseline name over the held-out frames.
+
+    The baselines are the previous frame, the mean of both neighbours and the half-way flow (both
+    use the next frame), and the mean of all training frames including their tools.
+    """
     left_out: Mapping[str, int] = field(default_factory=dict)
     """Frames that were not scored, by reason."""
 
@@ -173,13 +187,16 @@ def measure_baselines(
 
 @dataclass(frozen=True)
 class _Values:
-    """What the baselines score on one frame, by group and name: tissue, whole frame, tissue in both."""
+    """PSNR of the baselines on one frame by group and name: tissue, whole frame, tissue in both."""
 
     frame: Frame
     by_key: dict[tuple[str, object], tuple[float, ...]]
 
     def entry(self, ages: Sequence[int]) -> Entry:
-        """For a log, every entry with the same names; the copy of the previous frame is what the other figures are compared with."""
+        """Return the log entry of the frame; all entries have the same keys.
+
+        The copy of the previous frame is the reference for the other figures.
+        """
         frame = self.frame
         value = lambda group, name: finite(self.by_key[group, name][0]) if (group, name) in self.by_key else None
         return {
@@ -287,7 +304,9 @@ class _Pool:
             self._pool.shutdown(cancel_futures=True)
 
     def put(self, work: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]) -> None:
-        """Have `work(*arguments)` done; `done` gets its result, in the order of the calls."""
+        """Submit `work(*arguments)` to the pool; `done` receives the results in order of
+        submission.
+        """
         self._pending.append((self._pool.submit(work, *arguments), done))
         if len(self._pending) > 2 * self._threads:
             self._take()

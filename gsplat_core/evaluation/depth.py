@@ -25,7 +25,10 @@ MOST_STEPS = 100
 CONVERGED = 1e-10
 """Relative decrease of the squared error that ends the iteration."""
 STEEPEST_RATIO = 1e-6
-"""Least inverse depth of a plane at a fitted pixel, as a share of the mean: a plane has to lie in front of the camera there."""
+"""Lower limit of a fitted plane's inverse depth at a pixel, as a share of the mean inverse depth.
+
+Keeps the plane in front of the camera.
+"""
 
 
 class FlatDepths(NamedTuple):
@@ -106,7 +109,7 @@ def pixels_to_compare(camera: Camera, where: NDArray[np.bool_], most: int, *plan
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Means over frames of errors over the tissue pixels whose depth is known."""
+    """Depth errors over tissue pixels with known depth, averaged over frames."""
 
     mae_mm: float
     """Mean absolute error."""
@@ -122,7 +125,7 @@ class DepthErrors:
 
 
 class DepthSums:
-    """Takes frames one at a time; `errors` is what they come to."""
+    """Streaming accumulator of per-frame depth errors; the result is `errors`."""
 
     def __init__(self) -> None:
         self._means = {name: ScoredMean() for name in ("mae_mm", "rmse_mm", "relative", "scaled_rmse_mm", "covered")}
@@ -164,7 +167,7 @@ class DepthSums:
 
 
 MOST_DEPTH_PIXELS = 8192
-"""Pixels of a frame that are compared, spread evenly: what is kept does not grow with the pictures."""
+"""Maximum number of evenly spaced pixels compared per frame, to bound memory."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,7 @@ class DepthShare:
     rmse_share: float
     """Root of the mean squared error, divided by the median true depth."""
     scaled_rmse_share: float
-    """The same after the model's depth was multiplied by `scale`: of the shape alone."""
+    """RMSE share after scaling the model's depth by `scale`; measures the shape alone."""
     plane_rmse_share: float
     """Error of each frame's best-fit plane (`FlatDepths.plane`), which is fitted to the truth."""
     level_rmse_share: float
@@ -184,7 +187,7 @@ class DepthShare:
     rmse: float
     """`rmse_share` in the unit of the recording's depth."""
     scale: float
-    """One factor for the whole sequence: the median of true depth over the model's."""
+    """Scale factor of the whole sequence: the median of true depth over model depth."""
     median_depth: float
     covered: float
     """Share of the pixels of tissue with known depth at which the model has depth."""
@@ -210,7 +213,7 @@ class DepthShareSums:
 
     @property
     def errors(self) -> DepthShare | None:
-        """What they come to; None where nothing could be compared."""
+        """Depth errors of all frames so far; None if nothing was comparable."""
         if not self._kept:
             return None
         true, shown, plane, level = np.concatenate(self._kept, axis=1)

@@ -61,7 +61,7 @@ class PartShares:
     size: float
     """Sizes and opacities."""
     explained: float
-    """The sum: of the whole deformation. The rest is what no part explains."""
+    """Sum of the three shares. The rest of the change is explained by none of the parts."""
     reference_s: float
     frames: int
 
@@ -89,7 +89,7 @@ class PartSums:
 
     @property
     def shares(self) -> PartShares | None:
-        """What they come to; None where nothing changes."""
+        """Shares of all compared frames; None if the images do not change over time."""
         whole = self._errors[frozenset()]
         if not self._frames or whole <= 0:
             return None
@@ -122,22 +122,22 @@ NO_SCALING = 0.005
 
 @dataclass(frozen=True)
 class Geometry:
-    """What was measured; None or empty where the recording does not know the truth."""
+    """Results of a geometry evaluation; None or empty where the recording has no ground truth."""
 
     frames: int
-    """How many were compared."""
+    """Number of compared frames."""
     depth: DepthShare | None
     normals: NormalErrors | None
     views: tuple[NovelView, ...]
-    """With the model's lengths as they are."""
+    """Scores rendered at the model's own scale, without scale alignment."""
     scaled_views: tuple[NovelView, ...]
     """After the one factor of the sequence's depth."""
     tracking: Tracking | None
     flow: FlowErrors | None
     trajectory: TrajectoryErrors | None
-    """None as well where the model has the recording's own poses."""
+    """None also if the model uses the poses of the recording."""
     parts: PartShares | None
-    """None where the model does not deform."""
+    """None if the model is static."""
 
 
 def evaluate_geometry(
@@ -203,7 +203,10 @@ def evaluate_geometry(
 
 
 def _known(frame: Frame, true: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where there is a true depth to compare with. That which the frame came with is none where it is doubted: it lies on neither side of an edge."""
+    """Return the mask [H, W] of tissue pixels with a true depth to compare with.
+
+    Depth measured by the recording is excluded where its confidence is low, such as at depth edges.
+    """
     known = np.isfinite(true) & (true > 0) & _tissue(frame)
     if true is frame.depth:
         confidence = frame.depth_confidence
@@ -231,7 +234,7 @@ def _picture_from(camera: Camera, frame: Frame) -> Callable[[Gaussians], NDArray
 
 
 def _is_chosen(frame: Frame, frame_count: int, most: int) -> bool:
-    """Whether a frame is among `most` that are spread evenly, and shows something that can be compared."""
+    """Return True for comparable frames among at most `most` evenly spaced ones."""
     return frame.seq % -(-frame_count // most) == 0 and why_left_out(frame) is None
 
 

@@ -24,12 +24,15 @@ from gsplat_core.training.metrics import FrameQuality, ScoredMean, frame_quality
 _FINEST_MS = 1e-3
 _RATIO = 1.01
 _BUCKETS = 2600
-"""From a microsecond to two days."""
+"""Number of logarithmic buckets; covers ages from one microsecond to two days."""
 
 
 @dataclass(frozen=True)
 class Ages:
-    """How old what was shown was, in milliseconds; percentiles are at most 1 % too high, `max_ms` is exact."""
+    """Distribution of picture ages in milliseconds.
+
+    Percentiles are at most 1 % too high; `max_ms` is exact.
+    """
 
     count: int
     p50_ms: float
@@ -70,7 +73,7 @@ class AgeHistogram:
 
 
 MOST_BEHIND = 8
-"""Lateness is counted up to so many frames; what is later counts as this many."""
+"""Largest lateness in frames with a counter of its own; later pictures are counted here too."""
 SETTLING_S = 1.0
 """The first second, in which a model begins, is in `score` and not in `settled`."""
 NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"
@@ -80,48 +83,53 @@ _NS_PER_MS = 1e6
 
 @dataclass(frozen=True)
 class Shown:
-    """One picture that was put on the screen."""
+    """Picture that was put on the screen."""
 
     seq: int
-    """Number of the frame whose content it shows."""
+    """Sequence number of the frame whose content is shown."""
     arrived_ns: int
-    """When that frame had come in."""
+    """Arrival time of that frame, in nanoseconds."""
     shown_ns: int
-    """When the picture was on the screen; both by one clock."""
+    """Display time of the picture, in nanoseconds on the clock of `arrived_ns`."""
     image: NDArray[np.uint8] | None = None
     """RGB [H, W, 3]; None where the picture was not kept."""
     state: str = "live"
-    """What was written on it: `live`, `stale`, `frozen`, `source lost`."""
+    """Status label drawn on the picture: `live`, `stale`, `frozen` or `source lost`."""
 
 
 @dataclass(frozen=True)
 class Live:
-    """How good what a viewer saw was, and how old."""
+    """Image quality and latency of the pictures that a viewer saw."""
 
     score: Score
     settled: Score
-    """Without the first second."""
+    """Score without the first second."""
     previous: BaselineScore
-    """The raw frame before, shown instead, over the same frames and pixels: what `score` is to be compared with."""
+    """Baseline for `score`: the previous raw frame, over the same frames and pixels."""
     settled_previous: BaselineScore
-    """The same for `settled`."""
+    """Baseline for `settled`."""
     age_when_shown: Ages | None
-    """From a frame's arrival to the moment when its picture was shown."""
+    """Time from a frame's arrival until its picture is displayed."""
     age_on_screen: Ages | None
-    """How old what was on the screen was when the next frame arrived: at least the time between two frames."""
+    """Age of the displayed picture at the arrival of the next frame; at least one frame
+    interval.
+    """
     in_time: int
-    """Frames whose own picture was on the screen when the next one came."""
+    """Number of frames whose own picture was on the screen when the next frame arrived."""
     behind: Mapping[int, int]
-    """How many frames older than the newest one the picture on the screen was, and how often; `MOST_BEHIND` stands for all that is more."""
+    """Number of frames by lateness of the displayed picture, in frames.
+
+    Key `MOST_BEHIND` includes all greater latenesses.
+    """
     states: Mapping[str, int]
-    """How many pictures were shown in each state."""
+    """Number of displayed pictures by status label."""
 
 
 class LiveSums:
-    """Takes what was shown and what was on the screen, one at a time; `live` is what they come to."""
+    """Streaming accumulator of displayed pictures; the result is `live`."""
 
     def __init__(self, record: Record | None = None) -> None:
-        """record: given each scored frame's figures."""
+        """Create an empty accumulator; `record` receives the figures of each scored frame."""
         self._record = record
         self._score, self._settled = ScoreSums(), ScoreSums()
         self._before = ScoredMean(), ScoredMean()
@@ -140,9 +148,16 @@ class LiveSums:
     def frame(
         self, quality: FrameQuality, time_s: float, behind: int, age_ms: float, before_db: tuple[float, float]
     ) -> None:
-        """What was on the screen when the next frame came, against frame `quality.seq` of that time: so many frames older, and so old then.
+        """Score the picture that was on the screen when the next frame arrived.
 
-        before_db: what the raw frame before scores instead, over tissue and over the whole frame; NaN where there is none.
+        Args:
+            quality: quality of the picture against frame `quality.seq`, the newest one at that
+                time.
+            time_s: recording time of that frame in seconds.
+            behind: lateness of the picture in frames.
+            age_ms: age of the picture at that moment in milliseconds.
+            before_db: PSNR in dB of the previous raw frame, over tissue and over the whole frame;
+                NaN if unavailable.
         """
         if self._first_s is None:
             self._first_s = time_s
@@ -173,7 +188,7 @@ class LiveSums:
 
     @property
     def live(self) -> Live:
-        """Everything so far."""
+        """Results of all frames so far."""
         return Live(
             score=self._score.score,
             settled=self._settled.score,
@@ -188,15 +203,19 @@ class LiveSums:
 
 
 def evaluate_live(frames: Iterable[Frame], shown: Iterable[Shown], *, record: Record | None = None) -> Live:
-    """Score what was on the screen; everything is read once.
+    """Score the pictures on the screen against the frames that had arrived; single pass.
 
     Args:
-        frames: every frame that arrived, in order, with `arrived_ns`; also those that were dropped and never shown. The last one is not
-            scored: nobody knows when the next one would have come.
-        shown: the pictures in the order in which they were shown.
-        record: given each scored frame's figures.
+        frames: every frame that arrived, in order, with `arrived_ns`, including dropped frames that
+            were never displayed. The last frame is not scored, because no next arrival is known.
+        shown: displayed pictures in display order.
+        record: callback that receives the figures of each scored frame.
 
-    Raises InvalidInput when a frame has no time of arrival, or when times run backwards.
+    Returns:
+        Quality, latency and baselines.
+
+    Raises:
+        InvalidInput: if a frame has no arrival time, or timestamps decrease.
     """
     sums = LiveSums(record)
     screen = _Screen(shown, sums)
@@ -233,7 +252,7 @@ def _baseline(means: tuple[ScoredMean, ScoredMean]) -> BaselineScore:
 
 
 class _Screen:
-    """What is to be seen at a moment. Takes the pictures as time goes on."""
+    """Cursor over the displayed pictures that returns the visible one at increasing times."""
 
     def __init__(self, shown: Iterable[Shown], sums: LiveSums) -> None:
         self._coming = iter(shown)

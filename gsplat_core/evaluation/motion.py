@@ -44,14 +44,23 @@ class CarriedPoints:
         self._start = start.means[self._index].double()
 
     def at(self, time_s: float) -> Points:
-        """Where the points [P, 3] are at a time."""
+        """Return the positions [P, 3] of the points at `time_s` seconds."""
         now = self._model.at(time_s).means[self._index].double()
         motion = ((now - self._start) * self._weights[..., None]).sum(dim=1)
         return np.asarray(self._points + motion.cpu().numpy())
 
 
 def _neighbours(gaussians: Gaussians, points: Tensor) -> tuple[Tensor, Tensor]:
-    """For each of P points the nearest Gaussians [P, K], and their weights, of sum 1: what they show, less where they are farther away."""
+    """Return the nearest Gaussians of each point and their interpolation weights.
+
+    Args:
+        gaussians: model at the start time.
+        points: [P, 3].
+
+    Returns:
+        Indices [P, K] and weights [P, K] that sum to 1. A weight is the opacity times a Gaussian of
+            the distance.
+    """
     shows = gaussians.opacities.detach()
     candidates = torch.nonzero(shows > LEAST_OPACITY).flatten()
     if not len(candidates):
@@ -90,7 +99,7 @@ class Tracking:
     scaled: TrackErrors
     """After all of the model's lengths were multiplied by the one factor of the sequence's depth."""
     still: TrackErrors
-    """No motion: each point stays at its first pixel and at its first true depth."""
+    """Baseline without motion: each point keeps its first pixel and its first true depth."""
     points: int
     compared: int
     """Positions that were compared."""
@@ -104,19 +113,19 @@ class TrackSums:
         self._px: list[Points] = []
 
     def add(self, found: Points, true: Points, found_px: Points, true_px: Points) -> None:
-        """Compare where points are said to be with where they are."""
+        """Add the errors of estimated positions [P, 3] and pixels [P, 2] against the true ones."""
         self._mm.append(np.linalg.norm(found - true, axis=1))
-        # Behind the camera there is no pixel: as far away as the challenge's last threshold, and no nearer.
+        # A point behind the camera has no pixel. Count it as an error beyond the last threshold.
         self._px.append(np.nan_to_num(np.linalg.norm(found_px - true_px, axis=1), nan=2.0 * WITHIN_PX[-1]))
 
     @property
     def count(self) -> int:
-        """How many positions were compared."""
+        """Number of compared positions."""
         return sum(len(each) for each in self._mm)
 
     @property
     def errors(self) -> TrackErrors | None:
-        """None where nothing was compared."""
+        """Error statistics; None if nothing was compared."""
         if not self.count:
             return None
         mm, px = np.concatenate(self._mm), np.concatenate(self._px)
@@ -132,7 +141,10 @@ class TrackSums:
 
 
 class FollowedPoints:
-    """Takes frames in order. Each point starts in the first of them that sees it and at whose pixel the model has depth."""
+    """Tracking errors of points followed through frames in order.
+
+    Each point starts in the first frame that sees it and in which the model has depth at its pixel.
+    """
 
     def __init__(self, model: Model, camera: Camera, tracks: Tracks) -> None:
         self._model, self._camera, self._tracks = model, camera, tracks
@@ -141,7 +153,7 @@ class FollowedPoints:
         self._start_px, self._start_true = np.zeros((count, 2)), np.zeros((count, 3))
         self._groups: list[tuple[NDArray[np.int64], CarriedPoints]] = []
         self._found: list[tuple[Points, Points]] = []
-        """Of each compared frame: where the model has the points, and where they are, in the left camera's coordinates."""
+        """Estimated and true positions of each compared frame, in the left camera's coordinates."""
         self._pixels, self._still = TrackSums(), TrackSums()
 
     def add(self, frame: Frame, own: Camera, shown: NDArray[Any]) -> None:
@@ -184,7 +196,11 @@ class FollowedPoints:
         self._start_px[new], self._start_true[new] = true_px[new], true[new]
 
     def tracking(self, scale: float) -> Tracking | None:
-        """What the errors come to; `scale`: the factor that a model's lengths lack. None where nothing was compared."""
+        """Return the tracking errors, or None if nothing was compared.
+
+        Args:
+            scale: factor that converts model lengths to the recording's unit.
+        """
         scaled = TrackSums()
         for found, true in self._found:
             scaled.add(scale * found, true, pixels_of(self._camera, found), pixels_of(self._camera, true))
@@ -195,41 +211,43 @@ class FollowedPoints:
 
 
 MOST_PIXELS = 8192
-"""Pixels of a frame that are compared, spread evenly: what is kept does not grow with the pictures."""
+"""Maximum number of evenly spaced pixels compared per frame, to bound memory."""
 Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class EndPointErrors:
-    """Distances between where the pixels' tissue is said to go and where it goes, until the next frame, over all compared pixels."""
+    """End-point errors of the motion to the next frame, over all compared pixels."""
 
     median_px: float
     mean_px: float
     median_mm: float | None
-    """None where the recording knows no scene flow, as `mean_mm`. In the recording's unit."""
+    """Errors of the scene flow in the recording's unit; None (as `mean_mm`) without true scene
+    flow.
+    """
     mean_mm: float | None
 
 
 @dataclass(frozen=True)
 class FlowErrors:
-    """Motion from frame to frame, at the pixels of tissue whose true motion is known."""
+    """Errors of frame-to-frame motion at tissue pixels with known true motion."""
 
     model: EndPointErrors
     scaled: EndPointErrors
     """After all of the model's lengths were multiplied by the one factor of the sequence's depth."""
     still: EndPointErrors
-    """No motion: how far the tissue goes."""
+    """Baseline without motion; equals the magnitude of the true motion."""
     frames: int
 
 
 @dataclass(frozen=True)
 class _Started:
-    """Some pixels of a frame whose next one has not come yet."""
+    """Compared pixels of a frame, kept until the next frame arrives."""
 
     seq: int
     time_s: float
     points: Values
-    """Where the model has them in the world [P, 3]."""
+    """Positions of the pixels' surface points in the model's world, [P, 3]."""
     pixels: Values
     here: NDArray[np.bool_]
     """[H, W]: which pixels they are."""
@@ -239,13 +257,17 @@ class _Started:
 
 
 class FlowSums:
-    """Takes frames in order, all of them: `arrive` ends what `begin` began with the frame before."""
+    """Flow errors accumulated over all frames in order.
+
+    `begin` samples the pixels of a frame. `arrive` compares their motion when the next frame
+    arrives.
+    """
 
     def __init__(self, model: Model, camera: Camera, files: MotionFiles) -> None:
         self._model, self._camera, self._files = model, camera, files
         self._started: _Started | None = None
         self._px: list[Values] = []
-        """Of each compared frame [2, P]: errors of the model and of no motion."""
+        """Errors of the model and of the static baseline for each compared frame, [2, P]."""
         self._mm: list[tuple[Values, Values]] = []
         """The model's motion and the true one [P, 3], in the axes of the left camera."""
 
@@ -276,14 +298,14 @@ class FlowSums:
         there = pixels_of(own, moved(own.world_to_camera, started.points + motion))
         true = started.true.flow[started.here]
         off = np.linalg.norm(there - started.pixels - true, axis=1)
-        seen = np.isfinite(off)  # not what is said to go behind the camera, which is no place in the picture
+        seen = np.isfinite(off)  # Points that the model moves behind the camera have no pixel.
         self._px.append(np.stack([off[seen], np.linalg.norm(true, axis=1)[seen]]))
         if started.true.scene_flow is not None:
             found = motion @ started.own.world_to_camera[:3, :3].T
             self._mm.append((found, started.true.scene_flow[started.here] @ started.true_pose[:3, :3].T))
 
     def _motion(self, started: _Started, next_s: float) -> Values:
-        """The motion of what each pixel shows [H, W, 3], in the model's world."""
+        """Return the motion [H, W, 3] of each pixel's surface point, in the model's world."""
         now, then = self._model.at(started.time_s), self._model.at(next_s)
         viewmat, intrinsics = started.own.matrices(now.device, now.dtype)
         with torch.inference_mode():
@@ -294,7 +316,11 @@ class FlowSums:
         return np.asarray((blended / alpha.clamp(min=1e-6))[0].double().cpu().numpy())
 
     def errors(self, scale: float) -> FlowErrors | None:
-        """What they come to; `scale`: the factor that a model's lengths lack. None where nothing was compared."""
+        """Return the flow errors, or None if nothing was compared.
+
+        Args:
+            scale: factor that converts model lengths to the recording's unit.
+        """
         if not self._px:
             return None
         px, still_px = np.concatenate(self._px, axis=1)

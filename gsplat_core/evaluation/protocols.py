@@ -60,7 +60,7 @@ class PictureMaker:
         with torch.inference_mode():
             if model is not self._prepared:
                 self._renderer.prepare(model if self._reads_snapshots else model.as_model())
-                # A snapshot's slot is free for training only when nobody holds it.
+                # Keeping a snapshot would block its slot for training.
                 self._prepared = model if isinstance(model, Model) else None
             output = self._renderer.render(camera, frame.time_s).result()
             picture = output.image
@@ -81,14 +81,14 @@ OUTSIDE = "outside of the model's time"
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What a model scores on the held-out frames."""
+    """Scores of a model on the held-out frames."""
 
     score: Score
-    """Of the pictures as displayed, rounded to 8 bits: what EndoGaussian measures after it has written PNG files."""
+    """Score of the pictures rounded to 8 bits, as EndoGaussian measures its PNG files."""
     unrounded_db: float | None
     """Mean tissue PSNR of the pictures before they are rounded."""
     depth: DepthErrors | None
-    """None where the recording has no depth."""
+    """None if the recording has no depth."""
 
 
 def evaluate_heldout(
@@ -98,13 +98,17 @@ def evaluate_heldout(
     window_s: tuple[float, float],
     record: Record | None = None,
 ) -> HeldOut:
-    """Score the frames with (i - 1) mod 8 = 0, counted from 0 by `Frame.seq`; the others are not rendered.
+    """Score the held-out frames, those with (seq - 1) mod 8 = 0; no other frame is rendered.
 
     Args:
-        frames: of the recording, in order.
-        picture_of: what the model shows for a frame.
-        window_s: the times that the model has seen, with what is tolerated around them; frames outside are left out and counted.
-        record: given each scored frame's figures.
+        frames: frames of the recording in order.
+        picture_of: callback that renders the model for a frame.
+        window_s: first and last time in seconds that the model was trained on, plus tolerance.
+            Frames outside are counted as left out.
+        record: callback that receives the figures of each scored frame.
+
+    Returns:
+        Image and depth scores.
     """
     sums, unrounded, depth = ScoreSums(), ScoredMean(), DepthSums()
     for frame in frames:
@@ -137,7 +141,7 @@ def evaluate_heldout(
 
 
 class Learner(Protocol):
-    """What learns from frames as they come: a `Reconstructor`."""
+    """Interface of an online learner such as `Reconstructor`."""
 
     def observe(self, frame: Frame, *, train: bool = True) -> object:
         """Take the next frame and train on it; with `train=False` only move on to its time."""
@@ -147,7 +151,10 @@ class Learner(Protocol):
 
 
 def published(learner: Learner, frame: Frame) -> Model | Snapshot:
-    """The model as it is before `frame` was seen; it is rendered at that frame's time, where its motion goes on as the model has it."""
+    """Return the model before it has seen `frame`.
+
+    The caller renders it at the frame's time, to which the model extrapolates its motion.
+    """
     return learner.publish()
 
 
@@ -164,16 +171,21 @@ def evaluate_causal(
     predict: Callable[[Learner, Frame], Model | Snapshot] = published,
     record: Record | None = None,
 ) -> Score:
-    """Run the learner over the frames; each is predicted and scored before it is learned from. The first one has no prediction.
+    """Predict, score, then train on each frame in order. The first frame has no prediction.
 
-    A damaged or withheld frame is neither scored nor learned from; a frame without tissue is learned from and not scored.
+    Damaged and withheld frames are neither scored nor trained on. Frames without tissue are trained
+    on but not scored.
 
     Args:
-        frames: in order; the first ones are skipped until there is one that may be trained on.
-        learner: has seen nothing yet.
-        picture_of: what a model shows for a frame.
-        predict: what is to show a frame that was not seen; the frame that it gets has a black picture.
-        record: given each scored frame's figures.
+        frames: frames in order; leading frames unfit for training are skipped.
+        learner: untrained learner.
+        picture_of: callback that renders a model for a frame.
+        predict: callback that returns the model to render for an unseen frame. The frame passed to
+            it has a black image.
+        record: callback that receives the figures of each scored frame.
+
+    Returns:
+        Mean scores of the predictions.
     """
     sums = ScoreSums()
     started = False
@@ -208,7 +220,10 @@ NEAR_SHARE = 0.05
 """Two positions are one place when they are nearer than this share of the greatest distance between any two; a scale need not be known."""
 NEAR_DEGREES = 10.0
 AWAY = 3.0
-"""In between, the scope must have been this many times as far away, or turned as much."""
+"""Least distance of the scope from a place between two stays, in units of "same place".
+
+The distance is the larger of the position and the angle measure of `_distances`.
+"""
 MAX_POSES = 2048
 """Poses that are kept; of a longer stream every second, fourth, ... one is."""
 Range = tuple[float, float]
@@ -269,7 +284,9 @@ class PlaceFinder:
 
 
 def _last_stay(apart: NDArray[np.float64]) -> int | None:
-    """The newest earlier moment at the same place from which the scope has been away since; None where there is none."""
+    """Return the index of the newest earlier stay at the same place with an absence
+    since, or None.
+    """
     away = np.flatnonzero(apart >= AWAY)
     if not len(away):
         return None
@@ -278,7 +295,11 @@ def _last_stay(apart: NDArray[np.float64]) -> int | None:
 
 
 def _distances(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far apart each two poses [K, 4, 4] are [K, K], where 1 is the edge of "the same place": the larger of position and direction."""
+    """Return pairwise distances [K, K] of poses [K, 4, 4]; 1 is the limit of the same place.
+
+    The distance is the larger of the position and the viewing-direction difference, each divided by
+    its own limit.
+    """
     rotations, translations = poses[:, :3, :3], poses[:, :3, 3]
     centres = -np.einsum("kij,ki->kj", rotations, translations)
     between = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
@@ -291,7 +312,7 @@ def _distances(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 LAST_S = 5.0
 FOUND_DB = 33.0
-"""From this tissue PSNR on a place that was left counts as found again."""
+"""Tissue PSNR in dB from which a revisited place counts as recovered."""
 FIRST_FRAMES = 3
 
 
@@ -306,10 +327,10 @@ class PlaceScore:
 
 @dataclass(frozen=True)
 class Retention:
-    """What the final model scores on frames that it saw long ago."""
+    """Scores of the final model on frames from earlier in the stream."""
 
     last: Score
-    """On the last seconds of the stream."""
+    """Score on the last seconds of the stream."""
     last_range_s: Range
     frozen: BaselineScore
     """The stream's last frame shown for all of these seconds."""
@@ -325,17 +346,21 @@ def evaluate_retention(
     places: Sequence[Visits] = (),
     record: Record | None = None,
 ) -> Retention:
-    """Render frames again with the final model and compare; reads the frames twice.
+    """Render earlier frames with the final model and score them; iterates over the frames twice.
 
     Args:
-        frames: of the recording, in order, each time they are iterated.
-        picture_of: what the final model shows for a frame.
-        window_s: first and last time that the model has seen; the last seconds are the end of it.
-        last_s: how many seconds.
-        places: stays at places, as `PlaceFinder` finds them.
-        record: given the figures of each scored frame of the last seconds.
+        frames: frames of the recording, in order on each iteration.
+        picture_of: callback that renders the final model for a frame.
+        window_s: first and last time in seconds that the model was trained on.
+        last_s: length of the scored end of the window in seconds.
+        places: revisited places found by `PlaceFinder`.
+        record: callback that receives the figures of each scored frame of the last seconds.
 
-    Raises InvalidInput when `frames` can be read only once.
+    Returns:
+        Scores of the last seconds and of the revisited places.
+
+    Raises:
+        InvalidInput: if `frames` is an iterator, which can be read only once.
     """
     if isinstance(frames, Iterator):
         raise InvalidInput("evaluate_retention reads the frames twice: pass the recording itself, not an iterator")
@@ -384,7 +409,7 @@ def find_places(frames: Iterable[Frame]) -> list[Visits]:
 
 @dataclass(frozen=True)
 class Return:
-    """How soon a place was found again when the scope came back, in another protocol's figures."""
+    """Recovery of a revisited place, in the figures of another protocol."""
 
     visits: Visits
     first_db: tuple[float | None, ...]
@@ -416,7 +441,7 @@ def _within(frame: Frame, times: Range) -> bool:
 
 
 def _frozen(frames: Iterable[Frame], shown: Frame | None, tail: Range) -> BaselineScore:
-    """What one picture scores on every frame of a range of time but itself."""
+    """Return the score of one still picture on all other frames of a time range."""
     tissue, whole = ScoredMean(), ScoredMean()
     for frame in frames if shown is not None else ():
         assert shown is not None

@@ -18,26 +18,29 @@ Record = Callable[[Entry], None]
 
 @dataclass(frozen=True)
 class Score:
-    """What the frames of one protocol score: means over frames, PSNR averaged in decibels; None where no frame has the measure."""
+    """Image quality of the frames of one protocol, averaged over frames.
+
+    PSNR is averaged in decibels. A measure is None if no frame has it.
+    """
 
     psnr_tissue_db: float | None
     psnr_frame_db: float | None
     ssim: float | None
     frames: int
-    """How many frames were scored."""
+    """Number of scored frames."""
     worst_db: float | None
     """The lowest tissue PSNR of a frame."""
     worst_seq: int | None
-    """Which frame that was."""
+    """Sequence number of the frame with the lowest score."""
     left_out: Mapping[str, int]
     """Frames that were not scored, by reason."""
 
 
 def why_left_out(frame: Frame) -> str | None:
-    """Why nothing is measured against a frame; None where it is.
+    """Return the reason to exclude a frame from scoring, or None to score it.
 
-    A damaged frame is in part the decoder's guess, a withheld one is blurred, smoky or outside of the body, and where there is no tissue
-    there is nothing to compare.
+    Damaged frames contain guesses of the decoder. Withheld frames are blurred, smoky or outside the
+    body. Frames without tissue pixels offer nothing to compare.
     """
     if frame.status is FrameStatus.DAMAGED:
         return "damaged"
@@ -49,7 +52,7 @@ def why_left_out(frame: Frame) -> str | None:
 
 
 class ScoreSums:
-    """Takes frames one at a time; `score` is what they come to."""
+    """Streaming accumulator of frame scores; the result is `score`."""
 
     def __init__(self) -> None:
         self._quality = QualityTracker()
@@ -58,7 +61,15 @@ class ScoreSums:
         self._worst_seq: int | None = None
 
     def add(self, frame: Frame, picture: ImageLike) -> FrameQuality:
-        """Compare a picture, [H, W, 3] uint8 or floats in 0..1, with the frame that it stands for. Raises InvalidInput for another size."""
+        """Compare a picture with its frame and add the result.
+
+        Args:
+            frame: reference frame.
+            picture: [H, W, 3], uint8 or float in 0..1.
+
+        Raises:
+            InvalidInput: if the sizes differ.
+        """
         quality = frame_quality(frame.seq, picture, frame.image, frame.mask)
         self.take(quality)
         return quality
@@ -75,7 +86,7 @@ class ScoreSums:
 
     @property
     def score(self) -> Score:
-        """What the frames so far come to."""
+        """Mean scores of all frames so far."""
         worst = None if self._worst_seq is None else self._worst
         means = self._quality.means()
         return Score(

@@ -1,7 +1,8 @@
-"""How far an estimated way of the scope is from the true one: the absolute trajectory error (ATE), beside a scope that is said to stand still.
+"""Absolute trajectory error (ATE) of an estimated scope trajectory.
 
-Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems" (2012); alignment after Umeyama, "Least-squares estimation of
-transformation parameters between two point patterns" (1991).
+The error of a static scope serves as baseline. ATE: Sturm et al., "A Benchmark for the Evaluation
+of RGB-D SLAM Systems" (2012). Alignment: Umeyama, "Least-squares estimation of transformation
+parameters between two point patterns" (1991).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class TrajectoryErrors:
     similarity_share: float
     """After the best rotation, shift and scale: of the shape of the way alone."""
     still_share: float
-    """Of a scope that stands still in the middle of the true way."""
+    """Baseline: error of a static scope at the mean of the true positions."""
     rigid_rmse: float
     """`rigid_share` in the unit of the true path."""
     rotation_deg: float
@@ -70,7 +71,7 @@ def evaluate_trajectory(estimated: Poses, true: Poses) -> TrajectoryErrors | Non
 
 
 def _centres(poses: Poses) -> Poses:
-    """Where cameras are [N, 3]."""
+    """Return the camera centres [N, 3] of world-to-camera poses [N, 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]))
 
 

@@ -58,7 +58,15 @@ class NovelViewSums:
         self._seen, self._frames = 0.0, 0
 
     def add(self, view: Frame, seen: NDArray[np.bool_], picture: Any, left: Any, shifted: Any) -> None:
-        """Score a picture of the model and both baselines against what the view's camera saw, where `seen`."""
+        """Score a rendered picture and both baselines against the view, over the pixels in `seen`.
+
+        Args:
+            view: frame of the novel view's camera.
+            seen: bool [H, W], pixels whose tissue training has observed.
+            picture: picture rendered by the model [H, W, 3].
+            left: baseline: the left picture seen by the view's camera.
+            shifted: baseline: the left picture reprojected at one typical distance.
+        """
         share = float(seen.mean())
         sums = (self._model, self._left, self._shifted)
         if share < LEAST_SEEN:
@@ -83,10 +91,17 @@ class NovelViewSums:
 def seen_by_both(
     left_camera: Camera, left: Frame, left_depth: NDArray[Any] | None, camera: Camera, view: Frame
 ) -> NDArray[np.bool_]:
-    """The pixels of a view [H, W] whose tissue the left camera sees in the same frame. `camera`'s pose leads from the left camera's
-    coordinates to its own.
+    """Return the mask [H, W] of view pixels whose tissue the left camera sees in the same frame.
 
-    By depth where both have it. Where the view has none, by the left one's depth carried over; without any depth all of the view counts.
+    With depth of both cameras, the depths are compared. Without depth of the view, the left depth
+    is projected into the view. Without any depth, all tissue pixels of the view count.
+
+    Args:
+        left_camera: camera of `left`.
+        left: frame of the left camera.
+        left_depth: depth [H, W] of `left`, or None.
+        camera: camera of the view; its pose maps left-camera coordinates to its own.
+        view: frame of the view.
     """
     tissue = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask != 0
     trained = np.ones(left.image.shape[:2], bool) if left.mask is None else left.mask != 0
@@ -123,19 +138,29 @@ def moved_picture(left_camera: Camera, image: NDArray[np.uint8], camera: Camera,
 
 Pose = NDArray[np.float64]
 Shown = Callable[[Camera, Frame], Picture]
-"""What a model shows of a frame's time and exposure from a camera in its own world."""
+"""Callback that renders a model at a frame's time and exposure from a camera in model space."""
 
 
 class ViewSums:
-    """Takes frames in any order; a model whose lengths are to be multiplied by `scale` is seen from positions divided by it."""
+    """Novel-view scores accumulated over frames in any order.
+
+    Camera positions are divided by `scale`, the factor that converts model lengths to the
+    recording's unit.
+    """
 
     def __init__(self, camera: Camera, shown: Shown, truth: GroundTruth, scale: float = 1.0) -> None:
-        """camera: of the frames."""
+        """Create an empty accumulator for frames of `camera`."""
         self._camera, self._shown, self._truth, self._scale = camera, shown, truth, scale
         self._sums: dict[str, NovelViewSums] = {}
 
     def add(self, frame: Frame, own: Camera, depth: NDArray[Any] | None) -> None:
-        """Score each view of a frame. own: the model's camera. depth: what the model shows from there, where that is at hand."""
+        """Score each novel view of a frame.
+
+        Args:
+            frame: frame of the training camera.
+            own: camera of the frame in model space.
+            depth: depth [H, W] rendered by the model from `own`, if already available.
+        """
         true = self._truth.depth_of(frame)
         for name, camera, view in _views_of(frame, self._truth):
             seen = seen_by_both(self._camera, frame, true, camera, view)
@@ -150,7 +175,9 @@ class ViewSums:
     def _distance(
         self, frame: Frame, own: Camera, true: NDArray[Any] | None, depth: NDArray[Any] | None
     ) -> float | None:
-        """How far away tissue typically is: by the true depth, or by the model's where that is not known."""
+        """Return the median tissue distance, from true depth if known, otherwise from the model's
+        depth.
+        """
         known = np.zeros(0) if true is None else true[(true > 0) & (True if frame.mask is None else frame.mask != 0)]
         if not known.size:
             shows = self._shown(own, frame).depth if depth is None else depth
@@ -164,7 +191,7 @@ class ViewSums:
 
 
 def _views_of(frame: Frame, truth: GroundTruth) -> Iterator[tuple[str, Camera, Frame]]:
-    """The further cameras of a frame, and what they saw."""
+    """Yield name, camera and picture of each additional camera of a frame."""
     if frame.right_image is not None and frame.right_camera is not None:
         yield "right", frame.right_camera, Frame(frame.seq, frame.pts_ns, frame.right_image)
     for view in truth.views:
@@ -172,12 +199,12 @@ def _views_of(frame: Frame, truth: GroundTruth) -> Iterator[tuple[str, Camera, F
 
 
 EVERY = 10
-"""One frame of so many is scored."""
+"""Sampling interval in frames; one frame in `EVERY` is scored."""
 BORDER_PX = 10
 """Left out all around, in a picture of `BORDER_OF_PX` columns or more; in proportion in a smaller one."""
 BORDER_OF_PX = 360
 BEYOND_TYPICAL = 1.3
-"""The columns that only one eye sees, where nobody says how many: so many times the typical disparity."""
+"""Width of the columns visible only to one eye, in typical disparities, if not given."""
 SEARCHED = 0.07
 """Semi-global matching looks so far, as a share of the width, to both sides of the typical disparity."""
 MODEL = "model"
@@ -186,12 +213,16 @@ SHIFTED, MATCHED, RIGHT_BEFORE = "left_shifted", "semi_global_matching", "previo
 
 @dataclass(frozen=True)
 class SecondEye:
-    """What a model scores in the right eye."""
+    """Score of a model in the right eye's view."""
 
     score: Score
     """`psnr_tissue_db` is the PSNR over the pixels that count; the other measures do not exist here."""
     baselines: Mapping[str, BaselineScore]
-    """By name: the left picture shifted by the typical disparity, warped by semi-global matching, and the right picture of the frame before."""
+    """Scores by baseline name.
+
+    The baselines are the left picture shifted by the typical disparity, the left picture warped by
+    semi-global matching, and the previous right picture.
+    """
     left_out_px: int
     """Columns at the right edge that were left out."""
 
@@ -205,15 +236,20 @@ def evaluate_second_eye(
     left_out_px: int | None = None,
     record: Record | None = None,
 ) -> SecondEye | None:
-    """Score every tenth frame's right view; None where no frame has a right picture and its camera.
+    """Score the right view of every tenth frame.
 
     Args:
-        frames: of the recording, in order; all of them, for the picture before is a baseline.
-        camera: the left eye's.
-        right_view_of: what a model shows for a frame to the right eye's camera, whose pose leads from the world: RGB [H, W, 3], uint8 or 0..1.
-        window_s: the times that the model has seen.
-        left_out_px: columns at the right edge, which only the right eye sees; None: `BEYOND_TYPICAL` times the typical disparity.
-        record: given each scored frame's figures.
+        frames: all frames of the recording in order; the previous right picture is a baseline.
+        camera: camera of the left eye.
+        right_view_of: callback that renders a frame with the right eye's camera, whose pose maps
+            from the world. Returns RGB [H, W, 3], uint8 or float in 0..1.
+        window_s: first and last time in seconds that the model was trained on.
+        left_out_px: number of excluded columns at the right edge, visible only to the right eye.
+            None selects `BEYOND_TYPICAL` times the typical disparity.
+        record: callback that receives the figures of each scored frame.
+
+    Returns:
+        Scores and baselines, or None if no frame has a right picture with a camera.
     """
     sums = _Sums()
     before: NDArray[np.uint8] | None = None
@@ -251,7 +287,7 @@ def evaluate_second_eye(
 
 
 class _Sums:
-    """Of the frames that were scored."""
+    """Means of the model and its baselines over the scored frames."""
 
     def __init__(self) -> None:
         self._means: dict[str, ScoredMean] = {}
@@ -282,8 +318,11 @@ class _Sums:
 
 
 def matched_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """By how many pixels the left eye sees farther to the right what the right eye sees at each of its pixels [H, W]: by semi-global matching, and
-    the typical disparity where that finds nothing."""
+    """Return the disparity [H, W] in pixels of each right-eye pixel by semi-global matching.
+
+    Disparity is the column in the left picture minus the column in the right picture. Unmatched
+    pixels get the median disparity.
+    """
     width = left.shape[1]
     reach = 8 * math.ceil(2 * SEARCHED * width / 16)
     least = round(typical_shift(left, right) * width) - reach
@@ -297,7 +336,10 @@ def matched_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDAr
 
 
 def warped_by_disparity(left: NDArray[np.uint8], disparity: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The left picture as the right eye sees it where its pixels have this disparity [H, W]; its edge goes on where nothing is known."""
+    """Warp the left picture to the right eye by the right eye's disparity [H, W] in pixels.
+
+    Columns beyond the left picture repeat its edge.
+    """
     height, width = left.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     found = cv2.remap(left, columns + disparity, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -314,7 +356,16 @@ def _counted(frame: Frame, camera: Camera, eye: Camera, disparity_px: float, lef
 
 
 def line_psnr_db(shown: NDArray[Any], true: NDArray[np.uint8], counted: NDArray[np.bool_]) -> float:
-    """PSNR of a picture, in whatever unit, over the counted pixels [H, W] after the best straight line for each channel; NaN where nothing counts."""
+    """Return the PSNR in dB after the best linear fit per channel, over the counted pixels.
+
+    Args:
+        shown: picture [H, W, 3] in any unit.
+        true: reference uint8 [H, W, 3].
+        counted: bool [H, W].
+
+    Returns:
+        PSNR, NaN if no pixel counts.
+    """
     if not counted.any():
         return math.nan
     squared = 0.0

@@ -28,7 +28,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
 PIECE_BYTES = 1 << 22
-"""Who hashes or writes one piece lets other threads run meanwhile, and again after it."""
+"""Piece size in bytes for hashing and writing; other threads run between two pieces."""
 ALIGNMENT = 8
 
 
@@ -74,7 +74,8 @@ def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor],
         size += len(piece)
     manifest = manifest_bytes(model, size, digest.hexdigest())
     try:
-        parse_manifest(manifest, MANIFEST)  # what could not be read again is not written
+        # refuse to write a manifest that could not be read again
+        parse_manifest(manifest, MANIFEST)
     except BundleCorrupt as error:
         raise BundleError(
             f"the model was not saved to {folder}, because it could not be read again: {error}"
@@ -93,14 +94,21 @@ def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor],
 
 
 def load_bundle(folder: str | Path) -> Model:
-    """Read a model and check all of it.
+    """Load a model and verify all of its content.
 
-    Raises UnknownFormatVersion (a later format), BundleCorrupt (a value out of its range, digest, truncation, wrong tensors, NaN or
-    infinity) or BundleError (not there, not readable, not a plain file, more than fits into memory); each names the file and what to do.
+    Args:
+        folder: bundle folder.
+
+    Raises:
+        UnknownFormatVersion: if a later version wrote the bundle.
+        BundleCorrupt: for out-of-range values, wrong digest, truncation, wrong tensors, NaN or
+            infinity.
+        BundleError: if the file is missing, unreadable, not a regular file, or larger than the
+            available memory.
     """
     folder = Path(folder)
     path = folder / TENSORS
-    if os.path.isfile(folder):  # False for a name that no file can have; opening it below says what is wrong
+    if os.path.isfile(folder):  # False for impossible names, which the open below reports
         raise BundleError(
             f"{folder} is a file, and a model is a folder with {TENSORS} and {MANIFEST}; give that folder"
         )

@@ -37,7 +37,7 @@ INTRINSICS = {"fx": FOCAL_PX, "fy": FOCAL_PX, "cx": CENTRE_PX, "cy": CENTRE_PX}
 
 @dataclass(frozen=True, eq=False)
 class Waypoint:
-    """Where the camera is at a time."""
+    """Camera pose at a time."""
 
     time_s: float
     camera_to_world: NDArray[np.float64]
@@ -82,7 +82,11 @@ class CameraPath:
 
 
 def read_camera_path(path: Path) -> CameraPath:
-    """The path that a file describes. Raises InvalidSetting, which names the file, what is wrong and where."""
+    """Read a camera path from a JSON file.
+
+    Raises:
+        InvalidSetting: if the file cannot be read or is invalid; the message names the location.
+    """
     try:
         text = read_regular(path, MOST_BYTES)
     except OSError as error:
@@ -119,7 +123,9 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _turned(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """The rotation that lies `share` of the way from one to the other, round one axis (Rodrigues' formula)."""
+    """Interpolate between two rotations [3, 3] by `share` along the geodesic
+    (Rodrigues' formula).
+    """
     import cv2  # a process that reads no path needs none
 
     between, _ = cv2.Rodrigues(first.T @ second)

@@ -95,7 +95,7 @@ def remove_unfinished() -> None:
 
 @contextlib.contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """While entered, `remove_unfinished` removes `path` too."""
+    """Register `path` for removal by `remove_unfinished` during the context."""
     _unfinished.add(path)
     try:
         yield
@@ -104,15 +104,24 @@ def unfinished(path: Path) -> Iterator[None]:
 
 
 class PartialFile:
-    """A file that is written beside `target` and gets its name when it is complete.
+    """Temporary file next to `target` that is renamed to `target` when complete.
 
-    `file` is open for reading and writing bytes; `path` is for libraries that open a file by its name (it has the target's suffix, by
-    which they choose a format). Use as a context manager, which finishes the file or, after an exception, removes it; or call `finish()` or
-    `discard()`. Raises OSError when the folder does not take the file.
+    `file` is open for reading and writing bytes. `path` serves libraries that open files by name;
+    it has the target's suffix, which they use to select a format. As a context manager, the object
+    finishes the file, or removes it after an exception. Alternatively call `finish()` or
+    `discard()`.
+
+    Raises:
+        OSError: if the file cannot be created or written.
     """
 
     def __init__(self, target: Path, *, overwrite: bool = True) -> None:
-        """overwrite: whether a file that lies at `target` when this one is finished is replaced; if not, FileExistsError."""
+        """Create the temporary file.
+
+        Args:
+            target: final path.
+            overwrite: replace an existing `target`; otherwise `finish` raises FileExistsError.
+        """
         self.target, self.overwrite = target, overwrite
         self.path = beside(target, ".part" + target.suffix[:16])
         self.file: BinaryIO = os.fdopen(_create(self.path), "w+b")
@@ -138,7 +147,7 @@ class PartialFile:
         _unfinished.discard(self.path)
 
     def discard(self) -> None:
-        """Remove what was written, unless it has its name already."""
+        """Remove the temporary file unless it is finished."""
         if self.path not in _unfinished:
             return
         with contextlib.suppress(OSError):  # buffered bytes of a full disk: they are given up anyway
@@ -157,7 +166,10 @@ class PartialFile:
 
 
 class PartialFolder:
-    """A folder that is filled beside `target` and then takes its place. Use as a context manager, which removes it unless `finish()` was called."""
+    """Temporary folder next to `target` that replaces it when complete.
+
+    As a context manager, the object removes the folder unless `finish()` was called.
+    """
 
     def __init__(self, target: Path) -> None:
         self.target = target
@@ -166,9 +178,11 @@ class PartialFolder:
         _unfinished.add(self.path)
 
     def finish(self) -> Path | None:
-        """Give the folder its name, in one step where the system can exchange two names.
+        """Move the folder to `target`, atomically if the system can exchange two names.
 
-        Returns where the folder is now that lay at `target` before, for the caller to remove; None when there was none.
+        Returns:
+            New path of the folder previously at `target`, to be removed by the caller; None if
+                there was none.
         """
         earlier = None
         if os.path.lexists(self.target):
@@ -198,9 +212,10 @@ def beside(target: Path, suffix: str) -> Path:
 
 
 def write_durably(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
-    """Write a new file and force it to the disk; when that fails the file is removed and the OSError passed on.
+    """Write a new file and sync it to disk.
 
-    A file or link that is there already is removed first, never written through.
+    An existing file or link is removed first and never written through. After an OSError the
+    incomplete file is removed.
     """
     path.unlink(missing_ok=True)
     try:
@@ -262,7 +277,7 @@ def _exchanged(first: Path, second: Path) -> bool:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it; what cannot be removed stays."""
+    """Remove a file or folder tree, ignoring failures."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

@@ -13,7 +13,10 @@ MAX_NESTING = 16
 
 
 class JsonObject:
-    """One object of a document, read by name; a value that is missing or out of its range is BundleCorrupt with the place and the value."""
+    """JSON object with typed, validated access by key.
+
+    A missing or out-of-range value raises BundleCorrupt with its location and value.
+    """
 
     def __init__(self, values: object, name: str) -> None:
         if not isinstance(values, dict):
@@ -68,7 +71,7 @@ class JsonObject:
         return start, end
 
     def choice(self, key: str, choices: tuple[str, ...]) -> str:
-        """One of some strings."""
+        """Return a string value, restricted to `choices`."""
         value = self.values.get(key)
         if not isinstance(value, str) or value not in choices:
             raise BundleCorrupt(f"{self.name}: {key} must be one of {', '.join(choices)}, got {shortened(value)}")

@@ -1,4 +1,4 @@
-"""The manifest of a model bundle: what is in the tensor file, checked value by value before any tensor is read."""
+"""Manifest of a model bundle: the description of its tensors, validated before any is read."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ COUNT = IntegerIn(0, 50_000_000)
 SH_DEGREE = IntegerIn(0, MAX_SH_DEGREE)
 TIME_S = NumberIn(-1e10, 1e10)
 LONGEST_WINDOW_S = 86_400.0
-"""A day: what a model has seen."""
+"""Longest time window of a model: one day."""
 LONGEST_FIELD_WINDOW_S = 4 * LONGEST_WINDOW_S
-"""A field's window reaches ahead of what was seen."""
+"""Longest time window of a deformation field, which may extend beyond the observed window."""
 SIDE_PX = IntegerIn(1, 16_384)
 MOST_PIXELS = 1 << 26
 FOCAL_PX = NumberIn(1e-3, 1e7)
 INTRINSICS_PX = NumberIn(-1e7, 1e7)
 POSE = NumberIn(-1e9, 1e9)
 ROTATION_TOLERANCE = 2e-3
-"""How far the pose's rotation times its transpose may be from the identity, and its determinant from 1."""
+"""Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
 DEPTH_ORIGINS = tuple(origin.value for origin in DepthOrigin)
@@ -50,7 +50,7 @@ UNITS = {"length": ("mm",), "time": ("s",)}
 
 @dataclass(frozen=True)
 class Manifest:
-    """A manifest whose values have been checked."""
+    """Validated manifest."""
 
     version: int
     count: int
@@ -64,7 +64,7 @@ class Manifest:
     parameters: int | None
     depth_source: DepthSource | None = None
     right_eye: bool = False
-    """Whether the right eye sees other colours."""
+    """True if the Gaussians have separate colours for the right eye."""
     scope_path: ScopePath | None = None
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
@@ -162,7 +162,8 @@ def _camera(reader: JsonObject) -> Camera:
 
 def _check_rigid(pose: np.ndarray) -> None:
     """InvalidInput unless the upper left 3x3 of a pose is a rotation."""
-    rotation = np.clip(pose[:3, :3], -2, 2)  # keeps the products finite; what it changes is no rotation either way
+    # Clipping keeps the products finite. Clipped values are never part of a rotation.
+    rotation = np.clip(pose[:3, :3], -2, 2)
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     error = max(error, abs(float(np.linalg.det(rotation)) - 1))
     if error > ROTATION_TOLERANCE:

@@ -12,12 +12,18 @@ from gsplat_core.memory import available_bytes, in_gib
 
 
 def open_model_file(path: Path, folder: Path | None = None) -> BinaryIO:
-    """The plain file `path`, opened for reading.
+    """Open the regular file `path` for reading.
 
     Args:
-        folder: links in the name must not lead out of it; None: they may lead anywhere.
+        path: file to open.
+        folder: folder that symbolic links must not leave; None allows any target.
 
-    Raises BundleError for what is missing, is not readable, is no plain file (a pipe, a device, a socket, a folder) or leads out.
+    Returns:
+        Binary stream.
+
+    Raises:
+        BundleError: if the file is missing, unreadable, not a regular file (a pipe, device, socket
+            or folder), or outside `folder`.
     """
     try:
         real = os.path.realpath(path, strict=True)
@@ -32,7 +38,12 @@ def open_model_file(path: Path, folder: Path | None = None) -> BinaryIO:
 
 
 def check_memory(path: Path, needed: int) -> None:
-    """Raise BundleError when `needed` bytes, for what `path` holds, are more than there are."""
+    """Raise BundleError if loading `path` needs more than the available memory.
+
+    Args:
+        path: file named in the message.
+        needed: size in bytes.
+    """
     available = available_bytes()
     if available is not None and needed > available:
         raise BundleError(

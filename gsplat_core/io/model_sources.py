@@ -69,13 +69,14 @@ def is_scene_file(path: Path) -> bool:
 
 
 def load_model(path: Path) -> Model:
-    """Return the model at a path.
+    """Load a model from a bundle or a splat file.
 
     Args:
-        path: A bundle's folder, or a `.ply` or `.splat` file, which becomes a scene that does not move, seen by a camera that shows all of it.
+        path: bundle folder, or a `.ply` or `.splat` file. A splat file becomes a static scene with
+            a camera that shows all of it.
 
     Raises:
-        BundleError: Nothing usable is there; as `load_bundle` and `load_ply`.
+        BundleError: if no usable model is found; see `load_bundle` and `load_ply`.
     """
     if not is_scene_file(path):
         if path.exists() and not path.is_dir():
@@ -98,7 +99,11 @@ def load_model(path: Path) -> Model:
 
 
 def _camera_for(gaussians: Gaussians, path: Path) -> Camera:
-    """Return a camera that looks along z at all Gaussians but the outermost. Raises BundleCorrupt for a scene that lies before its near plane."""
+    """Return a camera that looks along z at all Gaussians except outliers.
+
+    Raises:
+        BundleCorrupt: if the scene is too small for the camera's near plane.
+    """
     means: NDArray[np.float64] = gaussians.means.numpy().astype(np.float64)
     centre = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), SHOWN_SHARE))

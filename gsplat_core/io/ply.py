@@ -114,7 +114,11 @@ def _columns(rows: NDArray[np.void], names: tuple[str, ...] | list[str], path: P
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[np.dtype[np.void], int]:
-    """The layout of one vertex and how many there are; the file is left at the first one."""
+    """Parse the header and leave the file at the first vertex.
+
+    Returns:
+        Structured dtype of one vertex, and the number of vertices.
+    """
     lines = _header_lines(file, path)
     if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
         raise BundleCorrupt(
@@ -129,7 +133,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[np.dtype[np.void], int]:
             case ["element", "vertex", number] if count is None and number.isdecimal() and len(number) < 12:
                 count = int(number)
             case ["element", _, _] if count is not None:
-                break  # what follows the vertices is not read
+                break  # elements after the vertices are not read
             case ["property", kind, name] if count is not None and kind in SCALAR_TYPES:
                 properties.append((name, SCALAR_TYPES[kind]))
             case _:

@@ -1,7 +1,8 @@
-"""Triangle meshes of other programs: `.ply` (ASCII and binary), `.stl` (ASCII and binary) and `.obj`, plain ones: positions and faces.
+"""Reader of triangle meshes (positions and faces) from `.ply`, `.stl` and `.obj` files.
 
-Faces with more than three corners become fans. What is not needed (normals, colours, texture) is skipped. A file may come from anyone: sizes are checked
-before memory is taken, and nothing in it is executed.
+`.ply` and `.stl` may be ASCII or binary. Faces with more than three corners become triangle fans.
+Normals, colours and textures are skipped. Files are untrusted: sizes are validated before memory is
+allocated, and nothing is executed.
 """
 
 from __future__ import annotations

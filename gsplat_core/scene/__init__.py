@@ -1,1 +1,1 @@
-"""What is rendered and who looks at it: Gaussians, cameras, frames, models."""
+"""Scene types shared by training and rendering: Gaussians, cameras, frames, models."""

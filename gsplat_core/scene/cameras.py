@@ -91,7 +91,10 @@ class Camera:
         return torch.tensor(self.K, dtype=torch.float32)
 
     def matrices(self, device: torch.device, dtype: torch.dtype | None = None) -> tuple[Tensor, Tensor]:
-        """World-to-camera [4, 4] and K [3, 3] on `device`, float32 unless said otherwise; the host does not wait for the copies."""
+        """Return the world-to-camera matrix [4, 4] and K [3, 3] on `device`.
+
+        The copies are asynchronous. The dtype is float32 by default.
+        """
         import torch
 
         # One copy for both. CUDA takes so few bytes at once, so that they need not stay where they are.
@@ -107,20 +110,20 @@ class Camera:
         return np.asarray(-np.linalg.solve(rotation, translation))
 
     def scaled(self, factor: float) -> Camera:
-        """The same view at another resolution; the intrinsics follow the rounded size exactly."""
+        """Return the camera at another resolution; intrinsics match the rounded size exactly."""
         if not factor > 0:
             raise InvalidInput(f"camera: the scale factor must be positive, got {factor}")
         return self.resized(max(1, round(self.width_px * factor)), max(1, round(self.height_px * factor)))
 
     def resized(self, width_px: int, height_px: int) -> Camera:
-        """The same view in pictures of another size; where the aspect ratio differs, it is stretched to them."""
+        """Return the camera for pictures of another size, stretched if the aspect ratio differs."""
         K = self.K.copy()
         K[0] *= width_px / self.width_px
         K[1] *= height_px / self.height_px
         return replace(self, K=K, width_px=width_px, height_px=height_px)
 
     def with_pose(self, world_to_camera: ArrayLike) -> Camera:
-        """The same camera somewhere else."""
+        """Return the camera with another world-to-camera pose [4, 4]."""
         return replace(self, world_to_camera=np.asarray(world_to_camera, dtype=np.float64))
 
     def right_eye(self, baseline: float) -> Camera:

@@ -1,4 +1,4 @@
-"""Where a model's depth comes from, and with that whether its lengths have a unit."""
+"""Origin of a model's depth, which determines whether its lengths are metric."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 
 @dataclass(frozen=True)
 class DepthSource:
-    """Of the frames that a model was trained on."""
+    """Depth source of the frames that a model was trained on."""
 
     origin: DepthOrigin
-    """Of the first frame's depth, on which the scene started."""
+    """Origin of the first frame's depth, from which the scene was initialised."""
     metric: bool
-    """Whether the unit of all of it is known: then the model's lengths are millimetres."""
+    """True if the unit of all depth is known; the model's lengths are then millimetres."""
 
     @staticmethod
     def of_first(frame: Frame) -> DepthSource | None:
-        """Of a scene that starts with this frame; None where it has no depth: the scene starts on a plane, at a distance that means nothing."""
+        """Return the source for a scene initialised from `frame`.
+
+        None without depth; the scene then starts on a plane at an arbitrary distance.
+        """
         if frame.depth is None:
             return None
         return DepthSource(frame.depth_origin or DepthOrigin.MEASURED, frame.depth_is_metric)

@@ -1,4 +1,4 @@
-"""One frame of endoscopic video with what is known about it."""
+"""One frame of endoscopic video with its sensor data and metadata."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsplat_core.scene.cameras import Camera
 
 
 class FrameStatus(Enum):
-    """Where a frame's picture comes from."""
+    """Origin of a frame's picture."""
 
     LIVE = "live"
     REPLAY = "replay"
@@ -25,23 +25,23 @@ class FrameStatus(Enum):
 
 
 class DepthOrigin(Enum):
-    """Where a frame's depth comes from, and with that what it may be used for."""
+    """Origin of a frame's depth, which determines its permitted uses."""
 
     MEASURED = "measured"
-    """By a sensor, or given with the recording."""
+    """Depth sensor, or depth supplied with the recording."""
     STEREO = "stereo"
     """Matched between the two eyes: metric where the baseline is."""
     PARALLAX = "parallax"
     """Matched between times at which the scope was elsewhere: in the unit of its poses."""
     LIGHT = "light"
-    """From how bright tissue is in the scope's own light: relative, never metric."""
+    """Estimated from brightness under the scope's own light: relative, never metric."""
     LEARNED = "learned"
-    """By a network of the user's, from one picture: relative, never metric."""
+    """Predicted from one picture by a user-supplied network: relative, never metric."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame; operators add fields on its way and never change the ones it has."""
+    """One frame; operators replace it by copies with further fields and never modify it."""
 
     seq: int
     """Number in the stream, from 0; it increases from frame to frame, and numbers may be missing where frames were lost."""
@@ -52,34 +52,39 @@ class Frame:
     right_image: NDArray[np.uint8] | None = None
     """The right eye of a rectified stereo pair, RGB uint8 [H, W, 3]."""
     right_camera: Camera | None = None
-    """The camera of `right_image`; its pose leads from the left camera's coordinates to its own. None: not known, or there is no right eye."""
+    """Camera of `right_image`; its pose maps left-camera coordinates to its own. None
+    if unknown.
+    """
     depth: NDArray[np.float32] | None = None
     """z in millimetres [H, W]; 0 = unknown."""
     depth_confidence: NDArray[np.float32] | None = None
     """[H, W], 0 to 1: how far each pixel's depth is to be believed. None: all of it that is known."""
     depth_origin: DepthOrigin | None = None
-    """Where `depth` comes from; None where there is none."""
+    """Origin of `depth`; None without depth."""
     mask: NDArray[np.uint8] | None = None
     """[H, W]; 1 = tissue (keep), 0 = tool."""
     pose: NDArray[np.float64] | None = None
     """World-to-camera [4, 4], OpenCV axes."""
     status: FrameStatus = FrameStatus.REPLAY
     damage: str | None = None
-    """What is wrong with a damaged frame."""
+    """Description of the damage; None for an intact frame."""
     arrived_ns: int | None = None
-    """When a live frame came in, in nanoseconds of `time.monotonic_ns`; None where time plays no part."""
+    """Arrival time of a live frame in nanoseconds of `time.monotonic_ns`; None if not live."""
     loss_mask: NDArray[np.uint8] | None = None
     """[H, W]; 0 = left out of the loss though it may be tissue: outside of the field of view, a recorder's strip. None: nothing is left out."""
     rehearsal_mask: NDArray[np.uint8] | None = None
-    """[H, W]; 0 = left out of the loss of what lasts, and still shown: highlights, which move with the light and not with the tissue."""
+    """uint8 [H, W]; 0 excludes a pixel from the rehearsal loss but not from display.
+
+    Used for highlights, which move with the light instead of the tissue.
+    """
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """How bright red, green and blue of this picture are beside the scene's own colours, which are those of the stream's first frames."""
+    """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
     withheld: str | None = None
     """Why the frame is kept from training, in a word or two ("blur", "out of body"); None: it may be trained on."""
     new_scene: str | None = None
-    """Why the scene is another one from this frame on ("cut", "resized"); None: it goes on."""
+    """Reason for a scene change at this frame ("cut", "resized"); None if the scene continues."""
     scene: int = 0
-    """Number of the frame's scene in its stream, where that is counted: whoever misses the frame that began it sees it by this."""
+    """Scene id; lets a consumer that missed the first frame of a scene detect the change."""
 
     def __post_init__(self) -> None:
         image = self.image
@@ -115,8 +120,12 @@ class Frame:
 
     @property
     def depth_is_metric(self) -> bool:
-        """Whether the unit of `depth` is known. What is matched between the eyes has the unit of the distance between them, if that is known; what
-        follows from poses has theirs, whatever it is. Of a frame whose depth was dropped to save memory, `depth_origin` still says it."""
+        """True if the unit of `depth` is known.
+
+        Stereo depth is metric if the baseline between the eyes is known. Measured depth is metric.
+        The answer stays valid after `depth` was dropped to save memory, because `depth_origin` is
+        kept.
+        """
         if self.depth_origin is None:
             return self.depth is not None
         matched = self.depth_origin is DepthOrigin.STEREO and self.right_camera is not None

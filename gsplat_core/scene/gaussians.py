@@ -34,7 +34,7 @@ class Gaussians:
     sh: Tensor
     """Spherical-harmonics coefficients [N, K, 3], K = (degree + 1)²; the colour is their sum plus 0.5, at least 0."""
     right_sh: Tensor | None = None
-    """What the right eye of a stereo scope sees otherwise: to be added to `sh` for it, of the same shape. None: nothing."""
+    """Difference of the right eye's SH coefficients to `sh`, same shape; None for equal colours."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.dim() else -1
@@ -60,7 +60,7 @@ class Gaussians:
 
     @property
     def count(self) -> int:
-        """How many Gaussians there are."""
+        """Number of Gaussians."""
         return int(self.means.shape[0])
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """Device of the tensors."""
         return self.means.device
 
     @property
@@ -93,7 +93,7 @@ class Gaussians:
         return self.means.dtype
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name, in the order of the fields; five, and `right_sh` where there is one."""
+        """Return the tensors by field name: five, plus `right_sh` if present."""
         right = {} if self.right_sh is None else {"right_sh": self.right_sh}
         return {
             "means": self.means,
@@ -110,11 +110,11 @@ class Gaussians:
         return self.means, self.quats, self.log_scales, self.logit_opacities, self.sh
 
     def seen_by_right(self) -> Gaussians:
-        """As the right eye sees them: Gaussians whose `sh` is what it sees."""
+        """Return the Gaussians with the right eye's colours in `sh`."""
         return self if self.right_sh is None else replace(self, sh=self.sh + self.right_sh, right_sh=None)
 
     def with_right(self, wanted: bool = True) -> Gaussians:
-        """With a `right_sh`, 0 where there was none; or without it."""
+        """Return the Gaussians with `right_sh` (zeros if missing), or without it."""
         if (self.right_sh is not None) == wanted:
             return self
         return replace(self, right_sh=torch.zeros_like(self.sh) if wanted else None)
@@ -124,7 +124,7 @@ class Gaussians:
         return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> Gaussians:
-        """The same values outside of the autograd graph, sharing memory."""
+        """Return the Gaussians detached from the autograd graph, sharing memory."""
         return self.map(Tensor.detach)
 
     def clone(self) -> Gaussians:
@@ -146,8 +146,13 @@ class Gaussians:
         return self.map(lambda tensor: tensor[index])
 
     def append(self, other: Gaussians) -> Gaussians:
-        """These followed by the others; both must have the same SH degree, dtype and device. `right_sh` is there where these have it, 0 where the
-        others do not."""
+        """Concatenate these Gaussians and `other`.
+
+        `right_sh` is kept if these Gaussians have it; missing values of `other` become 0.
+
+        Raises:
+            InvalidInput: if SH degree, dtype or device differ.
+        """
         if other.sh_degree != self.sh_degree:
             raise InvalidInput(f"gaussians: cannot append SH degree {other.sh_degree} to degree {self.sh_degree}")
         if (other.dtype, other.device) != (self.dtype, self.device):

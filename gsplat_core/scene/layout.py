@@ -1,7 +1,8 @@
-"""The layout of a Gaussian's row of raw parameters: deformation deltas [N, 16] are added in it, and their gradient has it too.
+"""Layout of the raw-parameter rows [N, 16] that hold deformation deltas and their gradients.
 
-Raw parameters are what training changes: scales as logarithms, opacities as logits, colours as the coefficient of the constant basis
-function of the spherical harmonics. `gsplat_core/native/raw_layout.h` has the same numbers for the kernels.
+Raw parameters are those that the optimiser changes: log-scales, opacity logits, and the coefficient
+of the constant spherical harmonic as colour. `gsplat_core/native/raw_layout.h` defines the same
+numbers for the kernels.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ OPACITY = slice(13, 14)
 
 
 def width_of(*groups: slice) -> int:
-    """How many columns these groups have together."""
+    """Return the total number of columns of the groups."""
     return sum(group.stop - group.start for group in groups)
 
 
 BASIS_GROUPS = (POSITION, ROTATION, LOG_SCALE, COLOUR)
-"""What the basis-function field moves: the first `BASIS_CHANNELS` columns."""
+"""Parameters deformed by the basis-function field: the first `BASIS_CHANNELS` columns."""
 BASIS_CHANNELS = width_of(*BASIS_GROUPS)
 
 HEAD_GROUPS = (POSITION, LOG_SCALE, ROTATION, OPACITY)
-"""What the HexPlane field's network puts out, in this order: G-SHARP's, which has log-scales before the rotation."""
+"""Output order of the HexPlane field's network, with log-scales before rotation as in G-SHARP."""
 HEAD_COLUMNS = tuple(column for group in HEAD_GROUPS for column in range(group.start, group.stop))
 """The raw column of every output of that network."""

@@ -32,10 +32,12 @@ def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One immutable version of a reconstruction; may be read by several threads.
+    """One immutable version of a reconstruction; safe to read from several threads.
 
-    The publisher hands over tensors of their own (detached copies) and never changes them afterwards. Raises InvalidInput when
-    a tensor still requires a gradient, or when the field was made for another number of Gaussians.
+    The publisher passes detached copies of the tensors and never changes them afterwards.
+
+    Raises:
+        InvalidInput: if a tensor requires a gradient, or the field has another number of Gaussians.
     """
 
     version: int
@@ -43,7 +45,7 @@ class Model:
     gaussians: Gaussians
     """The canonical Gaussians."""
     field: DeformationField | None
-    """How they deform; None for a scene that does not move."""
+    """Deformation field; None for a static scene."""
     camera: Camera
     """The camera of the recording's first frame."""
     time_window_s: tuple[float, float]
@@ -51,14 +53,17 @@ class Model:
     training_digest: str | None = None
     """SHA-256 of the recording that it was trained on, where known."""
     unseen_s: Tensor | None = None
-    """How long each Gaussian had not been seen, float64 [N] in seconds of the stream, when that was looked at last, which is every few frames
-    of a live reconstruction; 0: it was seen. None: it is not known. It is neither saved nor part of the digest."""
+    """Time since each Gaussian was last visible, float64 [N], in seconds of the stream.
+
+    Live training updates it every few frames; 0 means visible. None if unknown. Neither saved nor
+    part of the digest.
+    """
 
     depth_source: DepthSource | None = None
-    """Where the depth that it was trained on comes from; None: it had none, or a bundle of an earlier version does not say."""
+    """Source of the training depth; None without depth or in bundles of earlier versions."""
 
     scope_path: ScopePath | None = None
-    """Where the scope was while it learned; None: it is not known, as after training frame by frame."""
+    """Scope trajectory during training; None if unknown, as after training frame by frame."""
 
     _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
     _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
@@ -93,7 +98,7 @@ class Model:
         return sum(tensor.numel() for tensor in self.tensors().values())
 
     def to(self, device: torch.device | str) -> Model:
-        """The same version on `device`: itself when it is there, else a copy."""
+        """Return the model on `device`: itself if already there, otherwise a copy."""
         if self.gaussians.device == torch.device(device):
             return self
         field = None if self.field is None else self.field.detached_copy().to(device)
@@ -102,17 +107,17 @@ class Model:
 
     @property
     def metric(self) -> bool:
-        """Whether lengths are known to be millimetres; otherwise they are relative, right up to one factor."""
+        """True if lengths are millimetres; otherwise they are known up to one factor."""
         return self.depth_source is not None and self.depth_source.metric
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """Device of the tensors."""
         return self.gaussians.device
 
     @property
     def gaussian_count(self) -> int:
-        """How many Gaussians there are."""
+        """Number of Gaussians."""
         return self.gaussians.count
 
     def as_model(self) -> Model:
@@ -124,7 +129,7 @@ class Model:
         check_seen_at(time_s, self.time_window_s)
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the time window, or into what the field continues after it."""
+        """Clamp `time_s` to the time window, extended by the field's extrapolation range."""
         return clamp_time(time_s, continued_window(self.time_window_s, self.field))
 
     def at(self, time_s: float) -> Gaussians:
@@ -144,14 +149,20 @@ class Model:
         return deformed
 
     def seen_by_right(self) -> Model:
-        """As the right eye of a stereo scope sees it: itself, unless both eyes were trained on, which see other colours."""
+        """Return the model with the right eye's colours; itself if the right eye was
+        not trained.
+        """
         if self.gaussians.right_sh is None:
             return self
         return dataclasses.replace(self, gaussians=self.gaussians.seen_by_right())
 
     def seen_from(self, camera: Camera, time_s: float) -> Model:
-        """As `camera` sees it at `time_s`, for that time alone: highlights lie where the scope's light makes them for this camera, as far as that is
-        known. Where it is not, and where the scope's left eye was itself, what that eye sees. The first call takes as long as some dozens of pictures."""
+        """Return a static model of time `time_s` with the highlights that `camera` would see.
+
+        Highlights are moved to where the scope's light would cause them. If the scope's position is
+        unknown, the highlights of the scope's left eye are kept. The first call takes as long as
+        some dozens of renderings.
+        """
         if not self._elsewhere:
             self._elsewhere.append(SeenFromElsewhere.of(self))
         seen = self._elsewhere[0]
@@ -175,9 +186,9 @@ class Model:
         return render_surface(gaussians, camera or self.camera, certain)
 
     def description(self) -> dict[str, Any]:
-        """All of the model but its tensors and version, as JSON-able values."""
+        """Return everything except tensors and version as JSON-serialisable values."""
         source = self.depth_source
-        # Left out where it is not known: such a model has the digest that it had before this was kept.
+        # Omitted if unknown, which preserves the digest of models of earlier versions.
         depth = {} if source is None else {"depth": {"origin": source.origin.value, "metric": source.metric}}
         right = {} if self.gaussians.right_sh is None else {"right_eye": True}
         scope = {} if self.scope_path is None else {"scope_path": self.scope_path.description()}

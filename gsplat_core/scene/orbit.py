@@ -1,4 +1,4 @@
-"""A virtual camera that goes round what another camera looks at."""
+"""Virtual camera that orbits the point viewed by another camera."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
 
 @dataclass(frozen=True)
 class Orbit:
-    """Where a virtual camera is, beside the one that it starts from. Raises InvalidSetting for a value out of its range."""
+    """Pose of a virtual camera relative to a start camera.
+
+    Raises:
+        InvalidSetting: if a value is out of range.
+    """
 
     azimuth_deg: float = 0.0
-    """To the right, round the point in the middle of the picture."""
+    """Rotation to the right around the point at the centre of the picture, in degrees."""
     elevation_deg: float = 0.0
     """Upwards, likewise."""
     zoom: float = 1.0
-    """How many times closer to that point."""
+    """Factor by which the camera is closer to that point."""
 
     def __post_init__(self) -> None:
         for name, value in (("azimuth", self.azimuth_deg), ("elevation", self.elevation_deg)):

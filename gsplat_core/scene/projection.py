@@ -21,7 +21,7 @@ def pixel_rays(camera: Camera) -> Points:
 
 
 def points_of(camera: Camera, depth: NDArray[Any]) -> Points:
-    """Where the pixels with a depth z [H, W] are [H, W, 3]."""
+    """Unproject a depth map z [H, W] to camera-space points [H, W, 3]."""
     return pixel_rays(camera) * np.asarray(depth, np.float64)[..., None]
 
 
@@ -36,7 +36,7 @@ def moved(pose: NDArray[np.float64], points: Points) -> Points:
 
 
 def pixels_of(camera: Camera, points: Points) -> Points:
-    """Where points [..., 3] appear [..., 2]; not finite, or far away, where they are not in front of the camera."""
+    """Project camera-space points [..., 3] to pixels [..., 2]; NaN for points not in front."""
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes = points[..., :2] / np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
     return np.asarray(slopes * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2])

@@ -1,7 +1,8 @@
-"""Gaussians as the first rows of larger tensors: they join and leave while every tensor stays where it is.
+"""Gaussians stored in the first rows of preallocated tensors, so that addresses stay fixed.
 
-A captured CUDA graph holds addresses and sizes, so a scene whose tensors grow has to be captured again. Here the tensors are as large as the
-scene may become. The rows in use come first; those behind them are inert: opacity 0, in no tile list, without a gradient.
+A captured CUDA graph holds addresses and sizes, so growing tensors would require another capture.
+The tensors therefore have the capacity of the largest scene. Rows after those in use are inert:
+their opacity is 0, they are in no tile list, and they receive no gradient.
 """
 
 from __future__ import annotations
@@ -19,16 +20,19 @@ from gsplat_core.scene.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class RowMoves:
-    """How the rows in use stay the first ones when some of them leave: the last ones that stay move into the gaps."""
+    """Row moves that keep the rows in use contiguous after removals.
+
+    The last remaining rows move into the gaps.
+    """
 
     to: Tensor
     """Rows that others move into, int64 [M]."""
     source: Tensor
     """Rows that move there [M]. None of them is in `to`."""
     count: int
-    """How many rows are in use afterwards."""
+    """Number of rows in use after the removal."""
     before: int
-    """How many were in use before."""
+    """Number of rows in use before the removal."""
 
     @staticmethod
     def without(removed: Tensor) -> RowMoves:
@@ -41,7 +45,9 @@ class RowMoves:
 
     @property
     def order(self) -> Tensor:
-        """The same as one selection: for each row in use afterwards, the row in which it was before, int64 [count]."""
+        """Return the moves as one gather index: the old row of each remaining row,
+        int64 [count].
+        """
         order = torch.arange(self.count, device=self.to.device)
         order[self.to] = self.source
         return order
@@ -67,14 +73,14 @@ class GaussianRows:
         if gaussians.count > capacity:
             raise InvalidInput(f"{gaussians.count} Gaussians do not fit into {capacity} rows")
         self.all = inert_gaussians(gaussians, capacity)
-        """Every row: what a captured graph reads and changes."""
+        """All rows, as read and changed by captured graphs."""
         self.used = self.all
         """The rows in use, in the same memory."""
         self.replace(gaussians)
 
     @property
     def capacity(self) -> int:
-        """How many Gaussians there is room for."""
+        """Capacity in Gaussians."""
         return self.all.count
 
     def replace(self, gaussians: Gaussians) -> None:
@@ -99,7 +105,7 @@ class GaussianRows:
         self._use(moves.count)
 
     def _beside(self, others: Gaussians) -> Iterator[tuple[Tensor, Tensor]]:
-        """Each tensor in use beside that of others."""
+        """Yield pairs of each tensor in use and the corresponding tensor of `others`."""
         others = others.with_right(self.used.right_sh is not None)
         return zip(self.used.tensors().values(), others.tensors().values(), strict=True)
 

@@ -1,4 +1,4 @@
-"""Where the scope was while a model learned: its left eye, and with it the light."""
+"""Trajectory of the scope's left eye, and thereby of its light, during training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput
 
 MOST_TIMES = 24
-"""Times that are kept, spread evenly over what was learned from."""
+"""Maximum number of stored times, spread evenly over the training window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class ScopePath:
         return np.asarray(self.world_to_camera[number % len(self.world_to_camera)])
 
     def centre_at(self, time_s: float) -> NDArray[np.float64]:
-        """Where the eye is at a time [3]: on straight lines between those that are kept."""
+        """Return the position [3] of the eye at a time, interpolated linearly."""
         rotations, shifts = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
         centres = -np.einsum("tji,tj->ti", rotations, shifts)
         if len(centres) == 1:
@@ -61,5 +61,5 @@ class ScopePath:
         return np.array([np.interp(time_s, self.times_s, axis) for axis in centres.T])
 
     def description(self) -> dict[str, Any]:
-        """As JSON-able values."""
+        """Return the path as JSON-serialisable values."""
         return {"times_s": list(self.times_s), "world_to_camera": self.world_to_camera.tolist()}

@@ -1,8 +1,10 @@
-"""Snapshots of a scene that is being learned, published without new memory and without a wait of the host.
+"""Snapshots of a scene in training, published without allocation or host synchronisation.
 
-A publisher on a GPU owns a few slots: tensors at fixed addresses with capacity for more Gaussians and bumps than there are. Each snapshot is
-copied into a free slot on the stream. A renderer that has captured a CUDA graph for a slot replays it for every snapshot that comes to lie
-there. A slot is free when nobody holds its snapshot any more; what a GPU still has to read from it then is waited for on the stream.
+On a GPU, the publisher owns a few slots: tensors at fixed addresses with spare capacity for
+Gaussians and bumps. Each snapshot is copied into a free slot on the current stream. A renderer that
+captured a CUDA graph for a slot replays it for every later snapshot in that slot. A slot becomes
+free when its snapshot has no references left. Pending GPU reads are awaited on the stream before
+the slot is overwritten.
 """
 
 from __future__ import annotations
@@ -35,11 +37,11 @@ class SnapshotSlot:
     """Memory for one snapshot. Made and written by `SnapshotSlots`; read inside `Snapshot.reading`."""
 
     def __init__(self, number: int, device: torch.device, rows: int = 0) -> None:
-        """`rows` are the fewest that it has room for from the start."""
+        """Create an empty slot with capacity for at least `rows` Gaussians."""
         self.number = number
         self._fewest_rows = rows
         self.layout = 0
-        """Counts up when the tensors are replaced by larger ones: what was captured for the old ones is void then."""
+        """Generation of the tensors; a change invalidates graphs captured for the previous ones."""
         self._gaussians: Gaussians | None = None
         self._field: FieldSlot | None = None
         self._count = 0
@@ -50,7 +52,7 @@ class SnapshotSlot:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rows. Those beyond the snapshot's count have opacity 0 (a logit of minus infinity) and are in no tile list."""
+        """All rows. Rows beyond the count have an opacity logit of -inf and are in no tile list."""
         assert self._gaussians is not None
         return self._gaussians
 
@@ -61,17 +63,19 @@ class SnapshotSlot:
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in all tensors of what was written last, without the spare capacity."""
+        """Number of parameters last written, without spare capacity."""
         own = sum(tensor[:1].numel() for tensor in self.gaussians.tensors().values()) * self._count
         return own + (0 if self._field is None else self._field.parameter_count)
 
     @property
     def is_free(self) -> bool:
-        """Whether nobody holds the snapshot that lies here."""
+        """True if the snapshot in the slot has no references left."""
         return self._holder is None or self._holder() is None
 
     def write(self, gaussians: Gaussians, field: DeformationField | None) -> None:
-        """Queue the copy of a scene's state on the current stream, behind what is still to be read from the old one."""
+        """Enqueue the copy of a scene on the current stream, after pending reads of the old
+        content.
+        """
         self._order.before_writing()
         with torch.no_grad():
             if not self._overwrite(gaussians, field):
@@ -108,9 +112,9 @@ class SnapshotSlot:
 
 
 class Snapshot:
-    """One published state of a scene in a slot. It stays as it is for as long as anybody holds this object.
+    """One published state of a scene in a slot, valid while this object is referenced.
 
-    Reading threads keep a reference for the time of reading; on a GPU they read inside `reading`.
+    Reading threads keep a reference during the read. On a GPU, they read inside `reading`.
     """
 
     def __init__(
@@ -133,7 +137,7 @@ class Snapshot:
         self.training_digest = training_digest
         self._unseen_s = unseen_s
         self.depth_source = depth_source
-        """Where the depth that it was trained on comes from."""
+        """Source of the training depth."""
         self.parameter_count = slot.parameter_count
         """Numbers in all tensors, without the slot's spare capacity."""
         self.slot = slot
@@ -143,12 +147,15 @@ class Snapshot:
 
     @property
     def device(self) -> torch.device:
-        """Where the slot is."""
+        """Device of the slot."""
         return self.slot.gaussians.device
 
     @contextmanager
     def reading(self) -> Iterator[SnapshotSlot]:
-        """The slot, for what is queued on the current stream inside: after the slot was written, before it is written again."""
+        """Provide the slot to kernels enqueued on the current stream within the context.
+
+        The stream waits for the write of the slot. The next write waits for the enqueued reads.
+        """
         self.slot._order.before_reading()
         try:
             yield self.slot
@@ -156,7 +163,7 @@ class Snapshot:
             self.slot._order.after_reading()
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the time window, or into what the field continues after it."""
+        """Clamp `time_s` to the time window, extended by the field's extrapolation range."""
         return clamp_time(time_s, continued_window(self.time_window_s, self.slot.field))
 
     def at(self, time_s: float) -> Gaussians:
@@ -168,13 +175,14 @@ class Snapshot:
             return gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
 
     def unseen_s(self) -> Tensor | None:
-        """How long each Gaussian had not been seen (`Model.unseen_s`), in memory of its own."""
+        """Copy of the time since each Gaussian was last visible; see `Model.unseen_s`."""
         if self._unseen_s is None:
             return None
         with self.reading():
             seen = self._unseen_s.clone()
             if seen.is_cuda:
-                # It lies in no slot: whoever published it may let go of it before this stream has read it.
+                # This tensor is in no slot. The publisher may free it before this stream has read
+                # it.
                 self._unseen_s.record_stream(torch.cuda.current_stream(self.device))
             return seen
 
@@ -195,7 +203,14 @@ class SnapshotSlots:
     """The slots of one publisher. One thread publishes; any threads hold snapshots."""
 
     def __init__(self, device: torch.device | str, most: int = MOST_SLOTS, rows: int = 0) -> None:
-        """`rows`: Gaussians that every slot has room for from the start; 0: a quarter more than it gets first."""
+        """Create slots on demand.
+
+        Args:
+            device: device of the slots.
+            most: maximum number of slots.
+            rows: initial capacity of each slot in Gaussians; 0 selects 1.25 times the first scene's
+                count.
+        """
         self._device = torch.device(device)
         self._rows = rows
         self._most = most
@@ -208,7 +223,7 @@ class SnapshotSlots:
 
     @staticmethod
     def can_hold(field: DeformationField | None) -> bool:
-        """Whether snapshots of this kind of field can lie in slots."""
+        """Return True if this kind of field can be stored in a slot."""
         return field is None or field.slot_type is not None
 
     def publish(
@@ -223,10 +238,13 @@ class SnapshotSlots:
         unseen_s: Tensor | None = None,
         depth_source: DepthSource | None = None,
     ) -> Snapshot:
-        """Queue a copy of a scene's state on the current stream; the originals may be changed on that stream at once. `unseen_s` is not
-        copied and must stay as it is (`Model.unseen_s`).
+        """Enqueue a copy of a scene on the current stream and return its snapshot.
 
-        Raises InvalidInput when all slots are held, or for a field that cannot lie in one.
+        The originals may be changed on that stream immediately. `unseen_s` is not copied and must
+        stay unchanged.
+
+        Raises:
+            InvalidInput: if all slots are in use, or the field cannot be stored in a slot.
         """
         if not self.can_hold(field):
             raise InvalidInput(f"a {type(field).__name__} cannot lie in a slot; publish it as a Model")
@@ -257,7 +275,7 @@ class SnapshotSlots:
 
 
 class _DeviceOrder:
-    """Orders the writing and the reading of one piece of device memory between streams. On the CPU there is nothing to order."""
+    """Ordering of writes and reads of a memory region across CUDA streams; a no-op on the CPU."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

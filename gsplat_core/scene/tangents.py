@@ -1,7 +1,8 @@
-"""How a surface that bends and turns lies at each of its points: two tangents that go with the tissue.
+"""Tangent frames of a deforming surface at material points.
 
-A plane of the picture in which the surface was seen first gives every point its coordinates on the tissue. How places change with these coordinates is fitted
-locally, over some cells of a coarse grid: single points are not followed exactly enough to tell how tissue turns.
+The pixel coordinates at which the points were first seen parameterise the tissue. The derivatives
+of position by these coordinates are fitted locally over cells of a coarse grid, because the motion
+of single points is too noisy to reveal rotation.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ Array = NDArray[np.float64]
 CELLS = 20
 """Cells along the longer side of the picture."""
 BEYOND = 0.5
-"""How far the grid goes beyond the picture, as a share of its longer side; what lies farther out belongs to its edge."""
+"""Margin of the grid around the picture, as a share of its longer side.
+
+Points farther outside are assigned to the grid's edge.
+"""
 REACH = 1.0
 """Standard deviation, in cells, of the weights with which other cells take part in a fit."""
 LEAST_SPREAD = 1e-3
@@ -24,10 +28,16 @@ LEAST_SPREAD = 1e-3
 
 
 class Tangents:
-    """Of N points whose coordinates never change."""
+    """Tangent frames of N points with fixed surface coordinates."""
 
     def __init__(self, pixels: Array, weights: Array, longer_px: float) -> None:
-        """pixels: [N, 2] where the points were seen. weights [N]: how much each says. longer_px: of the picture's sides."""
+        """Precompute the local fits.
+
+        Args:
+            pixels: surface coordinates [N, 2]: pixels in which the points were first seen.
+            weights: weight [N] of each point in the fit.
+            longer_px: longer side of the picture in pixels.
+        """
         low, high = -BEYOND * CELLS, (1 + BEYOND) * CELLS
         self._size = size = int(high - low)
         at = np.nan_to_num(pixels * (CELLS / longer_px), nan=low, posinf=high, neginf=low) - low

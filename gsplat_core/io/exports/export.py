@@ -36,10 +36,21 @@ LONG_AGO = (1980, 1, 1, 0, 0, 0)
 
 
 def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool = False) -> int:
-    """Write the file, which is whole or not there; returns its size. The same model and wish give the same bytes.
+    """Export a model to a file, written atomically. The same model and wish give the same bytes.
 
-    Raises InvalidSetting for a time outside of the model's window, ExportError for a model that the format cannot hold, OSError where the
-    file cannot be written.
+    Args:
+        model: model to export.
+        path: target file.
+        wish: format, and the time or number of times to export.
+        overwrite: replace an existing file.
+
+    Returns:
+        File size in bytes.
+
+    Raises:
+        InvalidSetting: if the time is outside the model's window.
+        ExportError: if the format cannot represent the model.
+        OSError: if the file cannot be written.
     """
     times_s = wish.times_in(model.time_window_s)
     if model.gaussians.count == 0:
@@ -67,7 +78,7 @@ def _pieces(format_name: str, gaussians: Gaussians, time_s: float) -> Iterator[b
 
 
 def _surface_pieces(format_name: str, model: Model, time_s: float) -> Iterator[bytes]:
-    rows_of(model.at(time_s))  # refuses what is not finite
+    rows_of(model.at(time_s))  # raises for non-finite values
     mesh = mesh_of(model, time_s)
     unit = "millimetre" if model.metric else "relative"
     if format_name == "mesh-glb":
@@ -77,7 +88,7 @@ def _surface_pieces(format_name: str, model: Model, time_s: float) -> Iterator[b
 
 
 def with_unit_rotations(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians on the host, their quaternions of length 1."""
+    """Return the Gaussians on the CPU in float32 with normalised quaternions."""
     on_host = gaussians.to("cpu", torch.float32)
     return replace(on_host, quats=torch.from_numpy(unit_rotations(on_host.quats.numpy())))
 
@@ -90,7 +101,7 @@ def _write_sequence(model: Model, file: BinaryIO, times_s: list[float]) -> None:
         archive.writestr(zipfile.ZipInfo(TIMES_FILE, LONG_AGO), json.dumps(said, indent=1))
         for name, time_s in zip(names, times_s, strict=True):
             gaussians = model.at(time_s)
-            rows_of(gaussians)  # refuses what is not finite
+            rows_of(gaussians)  # raises for non-finite values
             with archive.open(zipfile.ZipInfo(name, LONG_AGO), "w", force_zip64=True) as entry:
                 for piece in ply_pieces(with_unit_rotations(gaussians)):
                     entry.write(piece)

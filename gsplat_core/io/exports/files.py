@@ -93,7 +93,11 @@ MOST_BYTES = 2**32 - 1
 
 
 def glb_pieces(rows: Rows, name: str, time_s: float) -> Iterator[bytes]:
-    """The file's content, piece by piece. Raises ExportError for what the format cannot hold."""
+    """Yield the bytes of a `.glb` file piece by piece.
+
+    Raises:
+        ExportError: if the format cannot represent the Gaussians.
+    """
     attributes = dict(_attributes(rows))
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -120,7 +124,9 @@ def packed(document: dict[str, Any], arrays: list[NDArray[Any]]) -> Iterator[byt
 
 
 def _attributes(rows: Rows) -> Iterator[tuple[str, NDArray[Any]]]:
-    """By name; each row is a multiple of four bytes long."""
+    """Yield the vertex attributes by glTF semantic; the size of a row is a multiple of
+    four bytes.
+    """
     count = len(rows.means)
     if count == 0:
         raise ExportError("the model has no Gaussians; glTF cannot hold an empty one")

@@ -21,9 +21,9 @@ class ExportFormat:
     suffix: str
     media_type: str
     is_surface: bool = False
-    """It holds the surface that the model's camera sees, and not the Gaussians."""
+    """True if the file contains the surface seen by the model's camera instead of the Gaussians."""
     is_sequence: bool = False
-    """It holds the model at several times of its window, and not at one."""
+    """True if the file contains the model at several times instead of one."""
 
 
 FORMATS: Mapping[str, ExportFormat] = {
@@ -41,7 +41,11 @@ FORMATS: Mapping[str, ExportFormat] = {
 
 
 def format_named(name: str) -> ExportFormat:
-    """Raises InvalidSetting for a name that there is not."""
+    """Return the format of this name.
+
+    Raises:
+        InvalidSetting: if the format does not exist.
+    """
     if name not in FORMATS:
         raise InvalidSetting(f"there is no format {name!r:.60}; choose {', '.join(FORMATS)}")
     return FORMATS[name]
@@ -58,13 +62,17 @@ def format_of(path: Path) -> ExportFormat:
 
 @dataclass(frozen=True)
 class ExportWish:
-    """What is wanted of a model. Raises InvalidSetting."""
+    """Requested format and times of an export.
+
+    Raises:
+        InvalidSetting: if the fields do not fit together or are out of range.
+    """
 
     format: ExportFormat
     time_s: float | None = None
-    """Which time of the model; None: the end of its window."""
+    """Exported time in seconds; None selects the end of the model's window."""
     times: int | None = None
-    """Of a sequence: how many times of the window, evenly spaced."""
+    """Number of evenly spaced times of a sequence; None selects `DEFAULT_TIMES`."""
 
     def __post_init__(self) -> None:
         if self.format.is_sequence and self.time_s is not None:
@@ -77,7 +85,11 @@ class ExportWish:
             raise InvalidSetting(f"the time is {self.time_s:g} s; give seconds of the model's window")
 
     def times_in(self, window_s: tuple[float, float]) -> list[float]:
-        """The times that are exported of a model with such a window. Raises InvalidSetting for one that lies outside."""
+        """Return the times in seconds to export from a model with this time window.
+
+        Raises:
+            InvalidSetting: if the requested time is outside the window.
+        """
         start_s, end_s = window_s
         if not self.format.is_sequence:
             time_s = end_s if self.time_s is None else self.time_s

@@ -12,10 +12,16 @@ ITEMS_AHEAD = 2
 
 
 def read_ahead(items: Generator[T, None, None], name: str, ahead: int = ITEMS_AHEAD) -> Generator[T, None, None]:
-    """The items in order, of which at most `ahead` are made and not yet taken.
+    """Yield the items in order, produced by a thread at most `ahead` items in advance.
 
-    What the iterator raises is raised here after the items that came before it. Closing this generator ends the thread, called `name`,
-    and waits for it; the iterator is closed in that thread. A daemon thread: a disk that does not answer keeps no program from ending.
+    An exception of the iterator is raised here after the preceding items. Closing this generator
+    stops the thread and joins it; the iterator is closed in that thread. The thread is a daemon, so
+    a blocked disk does not prevent the program from ending.
+
+    Args:
+        items: generator to run in the thread.
+        name: thread name.
+        ahead: maximum number of items produced but not yet consumed.
     """
     made = _Made[T](ahead)
     thread = threading.Thread(target=made.fill, args=(items,), name=name, daemon=True)

@@ -36,7 +36,10 @@ DEFAULT_FOCAL_FACTOR = 0.9
 """Focal length in units of the longer image side where nothing is known: 58° across, as common endoscopes have."""
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_LENGTH = 1e9
-"""Largest coordinate of a camera, in the recording's unit, and largest focal length in pixels: float32 keeps room to calculate."""
+"""Largest camera coordinate in the recording's unit, and largest focal length in pixels.
+
+Keeps products within the range of float32.
+"""
 MIN_FOCAL_PX = 1e-3
 _ROTATION_TOLERANCE = 1e-3
 
@@ -47,10 +50,10 @@ class Calibration:
 
     camera: Camera
     poses: NDArray[np.float64] | None
-    """World-to-camera [N, 4, 4]; None = not known (the camera of frame 0 stands for all)."""
+    """World-to-camera poses [N, 4, 4]; None if unknown, then frame 0's camera is used for all."""
     source: str
     assumed: bool = False
-    """Whether nothing is known of the camera's intrinsics, and they are a guess."""
+    """True if the intrinsics are a guess because the recording does not contain any."""
 
 
 def default_calibration(
@@ -189,7 +192,8 @@ def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Fin
             path, f"the camera of frame {index} is at {translation[index].tolist()}", f"Lengths go up to {MAX_LENGTH:g}"
         )
         return None
-    bounded = np.clip(rotation, -2, 2)  # keeps the products finite, and what it changes is no rotation either way
+    # Clipping keeps the products finite. Clipped values are never part of a rotation.
+    bounded = np.clip(rotation, -2, 2)
     skew = np.abs(bounded @ bounded.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     skew = np.maximum(skew, np.abs(np.linalg.det(bounded) - 1))
     if skew.max() > _ROTATION_TOLERANCE:
@@ -226,7 +230,7 @@ _POSES_ADVICE = "Save [N, 4, 4] numbers: for each frame the pose from camera to 
 
 
 def read_poses(path: Path, frame_count: int, findings: Findings) -> NDArray[np.float64] | None:
-    """World-to-camera [N, 4, 4]; None where there is a problem."""
+    """Read and check world-to-camera poses [N, 4, 4]; None after a problem."""
 
     def wrong(header: ArrayHeader) -> str | None:
         if len(header.shape) != 3 or header.shape[1:] != (4, 4):
@@ -267,7 +271,11 @@ class _Unusable(Exception):
 
 
 def read_stereo_calibration(folder: Path, findings: Findings) -> tuple[StereoCalibration, tuple[Path, ...]] | None:
-    """The calibration in a recording's folder and the files that it was read from; None where there is none, or it has a problem."""
+    """Read the stereo calibration in a recording's folder.
+
+    Returns:
+        The calibration and the files it was read from, or None if it is missing or has a problem.
+    """
     for names, read in _LAYOUTS.items():
         paths = tuple(folder / name for name in names)
         if not paths[0].is_file():
@@ -291,7 +299,7 @@ def read_stereo_calibration(folder: Path, findings: Findings) -> tuple[StereoCal
 
 @dataclass(frozen=True)
 class RectifiedBy:
-    """How a recording's pair is rectified, and its left camera then."""
+    """Rectification of a recording's stereo pair and the resulting left camera."""
 
     by: Rectification
     calibration: Calibration
@@ -302,8 +310,18 @@ class RectifiedBy:
 def rectified_by_file(
     folder: Path, size: tuple[int, int], calibration: Calibration | None, findings: Findings
 ) -> RectifiedBy | None:
-    """The rectification of a recording by the file in its folder. calibration: what is known of its left camera without it; the poses of the
-    camera are turned with it."""
+    """Build the rectification of a recording from the calibration file in its folder.
+
+    Args:
+        folder: folder of the recording.
+        size: width and height in pixels.
+        calibration: known calibration of the left camera; its poses are rotated to the rectified
+            camera.
+        findings: collector of problems and warnings.
+
+    Returns:
+        Rectification, or None if the folder has no usable stereo calibration.
+    """
     read = read_stereo_calibration(folder, findings)
     if read is None:
         return None

@@ -1,4 +1,4 @@
-"""What a recording's files hold, whatever their layout: images, sidecars, cameras."""
+"""Contents of a recording independent of its layout: images, sidecars and cameras."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class FrameImages(Protocol):
     width_px: int
     height_px: int
     times: Sequence[float] | None
-    """When each frame was taken, in frame durations from the first one on; None: one after the other."""
+    """Capture times in frame durations since the first frame; None if evenly spaced."""
     fps: float | None
-    """None where the files do not say."""
+    """Frame rate in Hz; None if the files do not state it."""
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Frame after frame; None where one cannot be read at all."""
@@ -45,7 +45,7 @@ class FrameImages(Protocol):
 
 
 class _Beside(NamedTuple):
-    """What lies beside one image, and what is wrong with it."""
+    """Sidecar data of one image, and the problems found in them."""
 
     right: Picture | None = None
     depth: NDArray[np.float32] | None = None
@@ -65,7 +65,7 @@ class Contents:
     right: FrameImages | None = None
     masks: MaskFiles | None = None
     valid_mask: NDArray[np.uint8] | None = None
-    """[H, W]; 1 inside the scope's circle. What lies outside is not tissue in any frame."""
+    """uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue."""
     depth: DepthFiles | None = None
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
@@ -87,17 +87,22 @@ class Contents:
 
     @cached_property
     def right_camera(self) -> Camera | None:
-        """The right eye's, as in `Frame`; None where there is no right eye, or its distance from the left one is not known."""
+        """Camera of the right eye, as in `Frame`; None without right eye or known baseline."""
         if self.right is None or self.stereo_baseline_mm is None:
             return None
         if self.rectification is not None:
             return self.rectification.right_camera
         return self.calibration.camera.right_eye(self.stereo_baseline_mm)
 
-    def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
-        """Frame after frame at full size, decoded when asked for; None where one has a problem.
+    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+        """Yield frames at full size, decoded on demand; None for a frame with a problem.
 
-        What lies beside the images is read a few frames ahead, in a thread of its own, while the images are decoded in the caller's.
+        A background thread reads the sidecars a few frames ahead while the caller's thread decodes
+        the images.
+
+        Args:
+            findings: collector of problems and warnings.
+            limit: number of frames to read; None reads all.
         """
         pictures = islice(self.images.frames(findings), limit)
         with closing(self._beside()) as beside:
@@ -109,7 +114,7 @@ class Contents:
                 yield self._frame(index, picture, right, depth, mask)
 
     def _beside(self) -> Generator[_Beside, None, None]:
-        """What lies beside each image."""
+        """Return an iterator over the sidecar data of each image."""
         if self.right is None and self.masks is None and self.depth is None:
             return (_Beside() for _ in range(self.images.frame_count))
         return read_ahead(self._read_beside(), f"read what lies beside the images of {printable(self.root.name)}")
@@ -134,7 +139,7 @@ class Contents:
     ) -> Frame:
         damage = picture.damage or (right.damage if right else None)
         if damage is not None:
-            # No pixel of it is known to be tissue: whoever trains or scores by the mask leaves the frame out.
+            # No pixel is known to be tissue, so training and scoring skip the frame.
             mask = np.zeros(picture.image.shape[:2], np.uint8)
         elif self.valid_mask is not None:
             mask = self.valid_mask if mask is None else mask & self.valid_mask
@@ -165,7 +170,7 @@ class Contents:
         return sorted({*self.other_files, *(path for part in parts if part for path in part.files)})
 
     def digest(self) -> str:
-        """As `digest_of` all its files."""
+        """Return the digest of all files; see `digest_of`."""
         return digest_of(self.root, self.files())
 
 

@@ -30,8 +30,11 @@ _H265_PICTURES = range(32)
 
 
 class Ticket:
-    """A packet's number, which its picture carries too. Each packet has an object of its own: PyAV tells them apart by their identity,
-    and would mix up equal integers of two packets that are decoded at the same time."""
+    """Packet number that FFmpeg passes on to the decoded picture.
+
+    PyAV identifies opaque values by object identity, so each packet needs an object of its own.
+    Equal integers of two packets in flight would be confused.
+    """
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -61,13 +64,13 @@ class OverrunProbe:
                 self._pictures[frame.opaque.number] = checksum(frame)
 
     def differs(self, number: int, frame: av.VideoFrame) -> bool:
-        """Whether the second decoder has made another picture of a packet."""
+        """Return True if the second decoder produced a different picture for a packet."""
         mine = self._pictures.pop(number, None)
         return mine is not None and mine != checksum(frame)
 
 
 def checksum(frame: av.VideoFrame) -> int:
-    """CRC-32 over the samples of the planes, without what fills up their rows."""
+    """Return the CRC-32 of the samples of all planes, without row padding."""
     crc = 0
     sample_bytes = 2 if max(component.bits for component in frame.format.components) > 8 else 1
     for plane in frame.planes:
@@ -77,7 +80,12 @@ def checksum(frame: av.VideoFrame) -> int:
 
 
 def padded_packet(data: bytes, length_bytes: int) -> bytes:
-    """A packet with bytes added behind its last part of a picture; `length_bytes` before each unit, 0 where there are none."""
+    """Append padding bytes to the last picture unit of a packet.
+
+    Args:
+        data: packet.
+        length_bytes: size of the length prefix of each unit; 0 if units have no prefix.
+    """
     if not length_bytes:
         return data + _BEHIND
     at, last = 0, None
@@ -98,7 +106,7 @@ def padded_packet(data: bytes, length_bytes: int) -> bytes:
 
 _DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9", "av1": "libdav1d"}
 _OPTIONS = {
-    # Every check that the decoders have; what they find is reported, and they go on with the next picture.
+    # Enable all checks of the decoders. Errors are reported, and decoding continues.
     "err_detect": "crccheck+bitstream+buffer+careful+compliant+aggressive",
     "max_pixels": str(MAX_PIXELS),
 }
@@ -111,7 +119,10 @@ _QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
 
 @contextmanager
 def captured_log() -> Iterator[list[tuple[int, str, str]]]:
-    """FFmpeg's error messages (level, who, text) of this thread, kept off the terminal."""
+    """Capture FFmpeg's error messages (level, component, text) of this thread.
+
+    Captured messages are not printed.
+    """
     if av.logging.get_level() != av.logging.ERROR:
         logger = logging.getLogger("libav")
         logger.addHandler(logging.NullHandler())
@@ -123,14 +134,14 @@ def captured_log() -> Iterator[list[tuple[int, str, str]]]:
 
 
 class PictureDecoder:
-    """Decodes one stream, and says which packets are damaged."""
+    """Decoder of one video stream that identifies damaged packets."""
 
     def __init__(self, stream: av.VideoStream, *, probe: bool = True) -> None:
         """probe: decode twice where only that shows some kinds of damage (H.265, VP8), which takes twice as long."""
         known = stream.codec_context
         name = known.codec.canonical_name
         self.doubts: dict[int, str] = {}
-        """What spoke against a packet, by its number; whoever has dealt with a packet takes its entry out."""
+        """Reason for suspecting a packet, by packet number; consumers remove handled entries."""
         self._check = packet_check(name, known.extradata)
         self._at_once = name in _WITHOUT_DELAY
         self._context = _context(known, _DECODERS.get(name))
@@ -214,6 +225,6 @@ class PictureConverter:
 
 
 def frame_rate(stream: av.VideoStream) -> float:
-    """Frames per second as the container tells it; 0 where it does not."""
+    """Return the container's frame rate in Hz, or 0 if unknown."""
     rate = stream.guessed_rate or stream.average_rate or Fraction(0)
     return float(rate)

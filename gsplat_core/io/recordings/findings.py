@@ -1,4 +1,4 @@
-"""What is wrong with a recording: found once, raised by `open_recording`, listed by `validate_recording`."""
+"""Problems found in a recording, raised by `open_recording` or listed by `validate_recording`."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ from gsplat_core.errors import RecordingInvalid, RecordingMissing
 
 
 def printable(name: Path | str) -> str:
-    """A name that can be written as UTF-8 whatever its bytes are: those that are no UTF-8 become question marks."""
+    """Return a name encodable as UTF-8; undecodable bytes become question marks."""
     return str(name).encode("utf-8", "replace").decode("utf-8")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing wrong with one file."""
+    """Problem or warning about one file."""
 
     file: str
     message: str
-    """What is wrong, with the value that was seen."""
+    """Description of the defect with the observed value."""
     advice: str
-    """What to do about it."""
+    """Remedy."""
     missing: bool = False
-    """The file or folder is not there (RecordingMissing), rather than wrong (RecordingInvalid)."""
+    """True if the file does not exist (RecordingMissing), False if it is wrong
+    (RecordingInvalid).
+    """
 
     def __str__(self) -> str:
         return f"{self.file}: {self.message}. {self.advice}."
@@ -31,7 +33,10 @@ class Finding:
 
 @dataclass
 class Findings:
-    """Collects what the checks find. A strict one raises at the first problem; the checks themselves do not know."""
+    """Collector of problems and warnings; with `strict`, the first problem is raised.
+
+    Checks are written independently of `strict`.
+    """
 
     strict: bool = False
     problems: list[Finding] = field(default_factory=list)
@@ -46,13 +51,15 @@ class Findings:
         self.warnings.append(Finding(printable(file), printable(message), advice))
 
     def add(self, others: Findings) -> None:
-        """Note what another collector has found, in its order; a strict one raises at the first problem."""
+        """Append the findings of another collector in order; a strict collector raises the first
+        problem.
+        """
         self.warnings.extend(others.warnings)
         for finding in others.problems:
             self._add_problem(finding)
 
     def taken(self) -> Findings:
-        """What was found since the last call, in a collector of its own; this one is empty then."""
+        """Move all findings into a new collector, leaving this one empty."""
         found = Findings(problems=self.problems, warnings=self.warnings)
         self.problems, self.warnings = [], []
         return found
@@ -65,10 +72,12 @@ class Findings:
 
 @dataclass(frozen=True)
 class ValidationReport:
-    """What `validate_recording` saw."""
+    """Result of `validate_recording`."""
 
     facts: dict[str, object]
-    """JSON-able: frames, size, fps, which sidecars there are, where the calibration comes from, …"""
+    """JSON-serialisable facts: frames, size, fps, available sidecars, source of the
+    calibration, …
+    """
     problems: list[Finding]
     warnings: list[Finding]
 

@@ -32,7 +32,7 @@ MAX_TOOL_SHARE = 0.5
 
 
 class ImageFiles:
-    """One image file for each frame."""
+    """Reader of recordings with one image file per frame."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class ImageFiles:
 
 
 class MaskFiles:
-    """Tool masks: 255 (or 1) = tool in the files, 1 = tissue in what is read."""
+    """Reader of tool masks. Files mark tools with 255 or 1; returned masks mark tissue with 1."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         self.files = tuple(files)
@@ -144,7 +144,8 @@ class DepthFiles:
             return None if header.shape == self._shape else self._other_shape(header.shape)
 
         try:
-            with np.errstate(over="ignore"):  # what does not fit is infinite then, and refused as that
+            # values that overflow become infinite and are rejected as such
+            with np.errstate(over="ignore"):
                 return read_array(path, wrong).astype(np.float32)
         except UnreadableFile as error:
             findings.problem(path, str(error), _DEPTH_ADVICE)
@@ -173,7 +174,17 @@ _DEPTH_ADVICE = "Give one grey 8- or 16-bit PNG, or float .npy [H, W] in millime
 def check_sizes(
     files: Sequence[Path], size: tuple[int, int] | None, what: str, findings: Findings
 ) -> tuple[int, int] | None:
-    """All files are of one size (that of the images where it is given); from the headers alone."""
+    """Check from the headers that all files have the same size.
+
+    Args:
+        files: image or `.npy` files.
+        size: required width and height in pixels; None accepts the most common size.
+        what: noun for one file in messages.
+        findings: collector of problems.
+
+    Returns:
+        Width and height, or None after a problem.
+    """
     sizes: dict[Path, tuple[int, int]] = {}
     for path in files:
         try:
@@ -209,7 +220,7 @@ def _npy_size(path: Path) -> tuple[int, int]:
 def check_pairing(
     numbers: Sequence[int | None], files: Sequence[Path], folder: Path, what: str, findings: Findings
 ) -> bool:
-    """As many files as frames; and, where both are numbered, none skipped."""
+    """Check that the files match the frames in number, and in numbering if both are numbered."""
     if len(files) != len(numbers):
         findings.problem(
             folder,
@@ -243,7 +254,7 @@ def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDAr
 
 
 def resize_nearest(plane: NDArray, width_px: int, height_px: int) -> NDArray:
-    """A mask or depth map at another size: no value that was not there (the pixel whose centre is nearest)."""
+    """Resize a mask or depth map by nearest-neighbour sampling, which creates no new values."""
     return cv2.resize(plane, (width_px, height_px), interpolation=cv2.INTER_NEAREST_EXACT)
 
 

@@ -61,17 +61,21 @@ _RIGHT = re.compile(r"(?<![a-z])(right|r)(?![a-z])", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Eyes:
-    """Files by the eye that their names say."""
+    """Image files grouped by the eye that their names state."""
 
     left: tuple[Path, ...]
     right: tuple[Path, ...]
-    """As many, each the one of the left file at its place."""
+    """Right-eye files, in the order of the corresponding left-eye files."""
     others: tuple[Path, ...]
-    """Of neither eye."""
+    """Files of neither eye."""
 
 
 def split_eyes(files: Sequence[Path]) -> Eyes | None:
-    """The files of either eye, in their order; None where there are no pairs, or a file of one eye lacks that of the other."""
+    """Split files into left and right eye by their names.
+
+    Returns:
+        Paired files in order, or None if no pairs exist or a file lacks its counterpart.
+    """
     lefts = {_key(_LEFT, path): path for path in files if _LEFT.search(path.stem)}
     rights = {_key(_RIGHT, path): path for path in files if _RIGHT.search(path.stem) and not _LEFT.search(path.stem)}
     if not lefts or lefts.keys() != rights.keys():
@@ -90,10 +94,13 @@ def _key(eye: re.Pattern[str], path: Path) -> str:
 
 
 def frame_times(files: Sequence[Path], findings: Findings) -> tuple[float, ...] | None:
-    """When each image was taken, in frame durations from the first one on; None: one after the other.
+    """Return the capture time of each image in frame durations since the first one.
 
-    The most common step between two numbers is one frame's duration, so that every tenth frame of a longer recording is evenly
-    spaced. A gap is kept as a gap in time, with a note. Two images with one number are a problem.
+    The most common step between file numbers is one frame duration, so a recording of every tenth
+    frame is evenly spaced. Gaps are kept and noted. A repeated or decreasing number is a problem.
+
+    Returns:
+        Times [N], or None for evenly spaced images.
     """
     numbers = [number for path in files if (number := frame_number(path)) is not None]
     if len(numbers) < len(files) or len(set(numbers)) < 2:
@@ -207,7 +214,15 @@ _LAYOUTS = "a video, a folder with video.mp4, with images/ (EndoNeRF), with imag
 
 
 def inspect(path: Path, findings: Findings) -> Contents | SessionContents | None:
-    """Recognise the layout and make every check that needs no decoding of all frames; None where there is a problem."""
+    """Recognise the layout and run every check that needs no full decoding.
+
+    Args:
+        path: video file or folder.
+        findings: collector of problems and warnings.
+
+    Returns:
+        Contents of the recording, or None if a problem was found.
+    """
     try:
         is_file, is_folder = path.is_file(), path.is_dir()
     except (OSError, RuntimeError, ValueError) as error:
@@ -228,7 +243,7 @@ def inspect(path: Path, findings: Findings) -> Contents | SessionContents | None
 def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContents | None:
     names = sorted(entry.name for entry in path.iterdir())
     if "session.json" in names:
-        # Only now: most recordings are none, and what checks a session's log takes a while to load.
+        # Imported lazily: most recordings are not sessions, and the session reader loads slowly.
         from gsplat_core.io.sessions.contents import session_contents
 
         return session_contents(path, findings)
@@ -311,12 +326,15 @@ def _with_sidecars(
     findings: Findings,
     right_eye: FrameImages | None = None,
 ) -> Contents | None:
-    """Add what lies beside the images. What is not there is left out; what is there and cannot be used is a problem."""
+    """Add the sidecar files to the images.
+
+    Missing sidecars are skipped. A present but unusable sidecar is a problem.
+    """
     if images is None:
         return None
     known = len(findings.problems)
     size = (images.width_px, images.height_px)
-    # A video that is given itself has nothing beside it.
+    # A video given as a file has no sidecars.
     beside = Beside(root if root.is_dir() else None, images, findings)
     described = beside.description()
     if calibration is None:
@@ -360,7 +378,7 @@ def _with_sidecars(
 
 
 class _Calibrated(NamedTuple):
-    """What is known of the cameras."""
+    """Camera calibration assembled from all sources."""
 
     calibration: Calibration
     baseline_mm: float | None
@@ -371,7 +389,16 @@ class _Calibrated(NamedTuple):
 def _calibrated(
     root: Path, size: tuple[int, int], found: Calibration | None, beside: Beside, findings: Findings, *, stereo: bool
 ) -> _Calibrated:
-    """The cameras, from all that lies beside the images. found: what one file says of the left one. stereo: whether there is another eye."""
+    """Combine all calibration sources of a recording.
+
+    Args:
+        root: folder or video of the recording.
+        size: width and height in pixels.
+        found: calibration of the left camera from the image layout, if any.
+        beside: sidecar files.
+        findings: collector of problems and warnings.
+        stereo: True if the recording has a right eye.
+    """
     described, poses = beside.description(), beside.poses_alone()
     rectified = rectified_by_file(root, size, found, findings) if stereo and root.is_dir() else None
     stated = described.get("camera")
@@ -394,7 +421,12 @@ def _calibrated(
 
 
 def _fits_eyes(root: Path, eyes: _Calibrated, stereo: bool, has_depth: bool, findings: Findings) -> bool:
-    """Whether depth can be that of the left eye; a warning where it cannot be found in millimetres."""
+    """Check that depth and stereo data fit the calibration.
+
+    Returns:
+        False if depth maps belong to unrectified pictures, which is a problem. A stereo pair
+            without a baseline only causes a warning.
+    """
     if eyes.rectification is not None and has_depth:
         findings.problem(
             root, "it has depth for pictures that are not rectified", "Rectify pictures and depth, or remove depth/"

@@ -19,12 +19,21 @@ _CRC32 = 0xBF
 _TIMESTAMP = 0xE7
 _BLOCK = 1 << 20
 _MOST_OTHERS = 10_000
-"""Elements beside clusters: a file of nothing but empty ones would take minutes to walk."""
+"""Maximum number of elements other than clusters; bounds the time to walk a file of empty ones."""
 _MAX_ID_BYTES, _MAX_LENGTH_BYTES = 4, 8
 
 
 def check_matroska(stream: BinaryIO, size: int) -> tuple[int | None, list[tuple[int, int]]]:
-    """The byte at which the segment ends (None where the file does not say), and the clusters [begin, end) with a wrong CRC-32."""
+    """Walk the top-level elements of a Matroska file and verify the CRC-32 of its clusters.
+
+    Args:
+        stream: seekable file.
+        size: file size in bytes.
+
+    Returns:
+        End of the segment as a byte position (None if its size is unknown), and the byte ranges
+            [begin, end) of clusters with a wrong CRC-32.
+    """
     at, segment_end = 0, None
     damaged: list[tuple[int, int]] = []
     while at < size:
@@ -45,12 +54,12 @@ def check_matroska(stream: BinaryIO, size: int) -> tuple[int | None, list[tuple[
 
 
 class Cluster(NamedTuple):
-    """A cluster that is there from its first byte to its last."""
+    """Cluster that is complete in the file."""
 
     end: int
     """The byte behind it."""
     time: int
-    """Its timestamp, in the file's unit, which FFmpeg makes a millisecond."""
+    """Cluster timestamp in the file's unit; FFmpeg writes milliseconds."""
     intact: bool
     """False: its CRC-32 is wrong."""
 
@@ -79,7 +88,10 @@ def whole_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterator
 
 
 def _timestamp(stream: BinaryIO, body: int, end: int) -> int | None:
-    """The timestamp of the cluster whose body is [body, end): its first element, or the second one behind a CRC-32."""
+    """Return the timestamp of a cluster with body [begin, end), or None if it has none.
+
+    The timestamp is the first element, or the second one after a CRC-32.
+    """
     at = body
     for _ in range(2):
         element = _element(stream, at)
@@ -96,7 +108,12 @@ def _timestamp(stream: BinaryIO, body: int, end: int) -> int | None:
 
 
 def _element(stream: BinaryIO, at: int) -> tuple[int, int, int | None] | None:
-    """Identifier, start of the body and its length (None: unknown) of the element at a byte; None where there is none."""
+    """Parse an EBML element header at a byte position.
+
+    Returns:
+        Identifier, start of the body, and length of the body (None if unknown); None instead of the
+            tuple if no complete header follows.
+    """
     stream.seek(at)
     head = stream.read(_MAX_ID_BYTES + _MAX_LENGTH_BYTES)
     identifier = _number(head, _MAX_ID_BYTES)
@@ -122,7 +139,7 @@ def _number(data: bytes, most_bytes: int) -> tuple[int, int] | None:
 
 
 def _crc_holds(stream: BinaryIO, body: int, length: int) -> bool:
-    """Whether the body's CRC-32 is right, or there is none."""
+    """Return True if the body's CRC-32 matches or the body has none."""
     first = _element(stream, body)
     if first is None or first[0] != _CRC32 or first[2] != 4 or length < 6:
         return True
@@ -150,7 +167,7 @@ class Container:
     demuxer: str
     """FFmpeg's name of the one demuxer that may read it."""
     damaged_bytes: tuple[tuple[int, int], ...] = ()
-    """Parts of the file [begin, end) whose checksum is wrong."""
+    """Byte ranges [begin, end) of the file whose checksum is wrong."""
 
 
 def recognise(stream: BinaryIO) -> Container:
@@ -213,7 +230,7 @@ def _riff_chunks(stream: BinaryIO, size: int) -> Iterator[tuple[bytes, int]]:
         stream.seek(at)
         header = stream.read(8)
         if header[:4] != b"RIFF" and at:
-            return  # what follows the last chunk is not ours to judge
+            return  # bytes after the last chunk belong to no chunk
         end = at + 8 + int.from_bytes(header[4:8], "little")
         yield header[:4], end
         at = end + end % 2
@@ -226,13 +243,21 @@ _H265_PICTURES = frozenset(range(32))
 # Inside a unit an encoder puts 3 after two zeros, so that none of these can occur (H.264 7.4.1, H.265 7.4.2.1).
 _FORBIDDEN = (b"\0\0\0", b"\0\0\1", b"\0\0\2")
 _HOLE_BYTES = 64
-"""So many zeros one after the other are a hole: arithmetic coding makes them of nothing but a large picture without any change."""
+"""Length of a run of zero bytes that counts as lost data.
+
+An arithmetic coder emits such a run only for a large picture without any change.
+"""
 PacketCheck = Callable[[bytes], str | None]
-"""What is wrong with a packet's bytes; None for nothing."""
+"""Callback that describes the damage of a packet, or returns None for an intact one."""
 
 
 def packet_check(codec: str, extradata: bytes | None) -> PacketCheck | None:
-    """The check for a codec; None where there is none."""
+    """Return the damage check of a codec, or None if no check exists for it.
+
+    Args:
+        codec: FFmpeg codec name.
+        extradata: codec configuration record of the container, if any.
+    """
     if codec in ("h264", "hevc"):
         width = length_bytes(codec, extradata)
         pictures, kind = (_H264_PICTURES, _h264_kind) if codec == "h264" else (_H265_PICTURES, _h265_kind)
@@ -250,7 +275,10 @@ def _check_hole(data: bytes) -> str | None:
 
 
 def is_shown(codec: str, data: bytes) -> bool:
-    """Whether a packet gives a picture to show. VP8 and VP9 have packets that only serve as references."""
+    """Return True if decoding the packet yields a displayed picture.
+
+    VP8 and VP9 also contain packets that serve only as references.
+    """
     if codec == "vp8":
         return bool(data[0] & 0x10)
     if codec == "vp9":

@@ -47,7 +47,7 @@ def open_plain(path: Path) -> BinaryIO:
 
 
 def check_plain(path: Path) -> None:
-    """Raise UnreadableFile for what is no plain file, or is not there."""
+    """Raise UnreadableFile unless `path` is an existing regular file."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError as error:
@@ -59,9 +59,12 @@ def check_plain(path: Path) -> None:
 
 
 def stays_inside(root: Path, path: Path, findings: Findings) -> bool:
-    """Whether `path`, all of its links followed, lies inside the recording's folder; a problem where it does not."""
+    """Return True if `path`, with all links resolved, is inside the recording's folder.
+
+    A path that leads outside, or cannot be resolved, is reported to `findings`.
+    """
     if not os.path.lexists(path):
-        return True  # what is not there leads nowhere; whoever needs it says that it is missing
+        return True  # a missing path cannot lead outside; its reader reports the missing file
     try:
         real = os.path.realpath(path, strict=True)
     except OSError as error:
@@ -88,13 +91,13 @@ _NUMBER_KINDS = "fiu"
 _HEADER_READERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}
 
 
-# What NumPy's reading of a header as a Python literal can end in.
+# Exceptions that NumPy can raise while parsing a header as a Python literal.
 _HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError, OverflowError)
 
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """What a `.npy` file announces."""
+    """Header fields of a `.npy` file."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -110,7 +113,11 @@ class ArrayHeader:
 
 
 def read_header(path: Path) -> ArrayHeader:
-    """The header alone. Raises UnreadableFile for what is no complete plain array of numbers."""
+    """Read the header alone.
+
+    Raises:
+        UnreadableFile: if the file is not a complete plain array of numbers.
+    """
     with open_plain(path) as stream:
         return _header(stream)
 
@@ -157,12 +164,12 @@ def _header(stream: BinaryIO) -> ArrayHeader:
 
 
 DEPENDS = "it may depend on a damaged frame"
-"""How the damage of a picture begins that was decoded without error, from pictures with errors."""
+"""Prefix of the damage text of pictures decoded without error from damaged references."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One decoded picture."""
+    """Decoded picture with the damage found in it."""
 
     image: NDArray[np.uint8]
     """RGB uint8 [H, W, 3]."""
@@ -171,7 +178,7 @@ class Picture:
 
 
 class DamagedFrames:
-    """Which frames of a recording are damaged, as runs of frame numbers: the first `MAX_RUNS` of them, and how many in all."""
+    """Damaged frames of a recording: the first `MAX_RUNS` runs of frame numbers, and the count."""
 
     MAX_RUNS = 20
 
@@ -183,7 +190,7 @@ class DamagedFrames:
             self.add(number)
 
     def add(self, number: int) -> None:
-        """One more damaged frame; numbers rise."""
+        """Record a damaged frame; numbers must be increasing."""
         self.count += 1
         if self._runs and self._runs[-1][1] == number - 1 and not self._more:
             self._runs[-1] = self._runs[-1][0], number
@@ -198,7 +205,7 @@ class DamagedFrames:
         return ", ".join(runs + ["…"] * self._more)
 
     def sentence(self, frames: int) -> str:
-        """What a reader of the results must know."""
+        """Return the sentence that reports damaged frames to a reader of the results."""
         are = "frame is" if self.count == 1 else "frames are"
         return (
             f"{self.count} of {frames} {are} damaged ({self.numbers()}): shown, but neither trained on nor scored; "
@@ -210,8 +217,15 @@ _RGB_SPACES = frozenset({"RGB", "YCbCr", "Gray"})
 
 
 def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str | None] | None:
-    """RGB [H, W, 3] and what libjpeg had to repair (None: nothing). None where it can decode nothing, or where the colours
-    are neither grey nor RGB nor YCbCr."""
+    """Decode a JPEG with libjpeg.
+
+    Args:
+        data: JPEG bytes.
+
+    Returns:
+        RGB uint8 [H, W, 3] and libjpeg's description of repaired damage (None if intact). None if
+            nothing can be decoded, or if the colour space is not grey, RGB or YCbCr.
+    """
     try:
         space = simplejpeg.decode_jpeg_header(data)[2]
         if space not in _RGB_SPACES:
@@ -227,7 +241,7 @@ def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str | None] | None:
 
 
 def jpeg_damage(data: bytes) -> str | None:
-    """What libjpeg would have to repair in a JPEG; None for nothing, and for what it does not decode at all."""
+    """Return libjpeg's description of repairable damage; None if intact or not decodable at all."""
     try:
         simplejpeg.decode_jpeg(data, "GRAY", strict=True)
     except ValueError as error:
@@ -250,7 +264,10 @@ class UnreadableImage(UnreadableFile):
 
 
 class _QuietDecoders:
-    """How many threads keep OpenCV's log silent. The level is the whole process's: the first one takes it down, the last one restores it."""
+    """Counter of the threads that request a silent OpenCV log.
+
+    The log level is global to the process. The first thread lowers it and the last one restores it.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -276,7 +293,7 @@ _quiet_decoders = _QuietDecoders()
 
 @contextmanager
 def quiet_decoder() -> Iterator[None]:
-    """OpenCV's own log lines stay off the terminal: the finding says what is wrong."""
+    """Suppress OpenCV's log output, because findings report decoding failures."""
     _quiet_decoders.enter()
     try:
         yield

@@ -43,7 +43,7 @@ class Recording(Protocol):
     notes: tuple[str, ...]
     """Fallbacks that were taken, in sentences."""
     fields: frozenset[str]
-    """Which of mask, depth, right_image and pose the frames have."""
+    """Optional frame fields that are present: any of mask, depth, right_image and pose."""
     stereo_baseline_mm: float | None
     """Distance of the right eye along the camera's x axis, where it is known."""
 
@@ -62,7 +62,7 @@ class Recording(Protocol):
 
 
 class FileRecording:
-    """A recording on disk, seen at a scale. Holds a few frames at a time, whatever its length."""
+    """Recording on disk, read at a scale. Memory use does not depend on its length."""
 
     def __init__(
         self, contents: Contents | SessionContents, scale: float, max_frames: int | None, notes: tuple[str, ...]
@@ -72,7 +72,7 @@ class FileRecording:
         self.name = printable(contents.root.name or contents.root.resolve().name)
         self.camera = contents.calibration.camera.scaled(scale)
         self.camera_is_assumed = contents.calibration.assumed
-        """Whether nothing is known of the camera's intrinsics, and they are a guess."""
+        """True if the intrinsics are a guess because the recording does not contain any."""
         self.width_px, self.height_px = self.camera.width_px, self.camera.height_px
         self.frame_count = min(contents.images.frame_count, max_frames or contents.images.frame_count)
         self.fps = contents.fps
@@ -82,7 +82,7 @@ class FileRecording:
 
     @cached_property
     def digest(self) -> str:
-        """sha256 of the input files: all of them, whatever scale and number of frames are read."""
+        """Return the sha256 of all input files, independent of scale and frame limit."""
         return self._contents.digest()
 
     def __iter__(self) -> Iterator[Frame]:
@@ -105,14 +105,22 @@ class FileRecording:
 
 
 def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_frames: int | None = None) -> FileRecording:
-    """Open a recording; its layout is recognised by what is there (see `layouts`).
+    """Open a recording, with its layout recognised from the files (see `layouts`).
 
-    path: a video, or a folder. scale: images by the mean over areas, masks and depth by the nearest pixel, the camera
-    along with them. max_frames: read only the beginning.
+    Counts, header sizes, calibration and mask polarity are checked here. Frame data are checked
+    during iteration.
 
-    Counts, header sizes, calibration and mask polarity are checked here, each frame's data while iterating.
-    Raises RecordingMissing or RecordingInvalid, naming the file, the value that is wrong, and what to do; InvalidSetting
-    for a scale that is not positive or leads to too large or too small frames, or max_frames below 1.
+    Args:
+        path: video file or folder.
+        scale: factor on the picture size. Images are area-averaged, masks and depth use the nearest
+            pixel, and the camera is scaled accordingly.
+        max_frames: read only the first frames; None reads all.
+
+    Raises:
+        RecordingMissing: if a file does not exist; the message names the file and the remedy.
+        RecordingInvalid: if a file is wrong; the message names the file, the value and the remedy.
+        InvalidSetting: if `scale` is not positive or leads to unsupported frame sizes, or
+            `max_frames` is below 1.
     """
     if not 0 < scale < float("inf"):
         raise InvalidSetting(f"scale must be a positive number, got {scale}")
@@ -140,7 +148,7 @@ def _check_scaled_size(width_px: int, height_px: int, scale: float) -> None:
 
 
 def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
-    """Read a recording from the first frame to the last and list what is wrong. Never raises for a bad recording."""
+    """Read an entire recording and list its problems; never raises for a bad recording."""
     findings = Findings()
     contents = inspect(Path(path), findings)
     if contents is None:

@@ -1,7 +1,8 @@
-"""What lies beside the images of a recording, each of it optional: masks, depth, the right eye, poses, a description.
+"""Optional sidecars of a recording's images: masks, depth, right eye, poses, description.
 
-Absent means that nothing has that name. Whatever has it and cannot be used (a file in place of a folder, a link that leads to
-nothing or out of the recording, an empty folder) is a problem: a mask that is overlooked lets tools be learned as tissue.
+A sidecar is absent if no entry has its name. An entry with its name that cannot be used is a
+problem: a file in place of a folder, a dangling link, a link out of the recording, or an empty
+folder. Ignoring a broken mask would let tools be learned as tissue.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _FILES = (DESCRIPTION_FILE, POSES_FILE, "poses_bounds.npy", "cameras.json", "val
 
 
 class Beside:
-    """The sidecars in a recording's folder; None in place of the folder: there are none."""
+    """Reader of the sidecars in a recording's folder; `folder=None` means that it has none."""
 
     def __init__(self, folder: Path | None, images: FrameImages, findings: Findings) -> None:
         self._folder = folder
@@ -50,7 +51,7 @@ class Beside:
         self._findings = findings
 
     def files(self) -> tuple[Path, ...]:
-        """The single files that are there."""
+        """Existing single-file sidecars."""
         found = (self._file(name) for name in _FILES)
         return tuple(path for path in found if path is not None)
 
@@ -65,7 +66,7 @@ class Beside:
         return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
 
     def poses_alone(self) -> NDArray[np.float64] | None:
-        """Those of `poses.npy`, world-to-camera [N, 4, 4]."""
+        """Read `poses.npy`: world-to-camera [N, 4, 4], or None."""
         path = self._file(POSES_FILE)
         return read_poses(path, self._images.frame_count, self._findings) if path else None
 
@@ -98,7 +99,9 @@ class Beside:
         return _read_valid_mask(path, self._size, self._findings) if path else None
 
     def _file(self, name: str) -> Path | None:
-        """A file that is there. One that leads nowhere or outside is a problem."""
+        """Return an existing file; a link that dangles or leads outside is reported as
+        a problem.
+        """
         path = self._there(name)
         return path if path is not None and stays_inside(path.parent, path, self._findings) else None
 

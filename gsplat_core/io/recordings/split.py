@@ -9,5 +9,5 @@ HELDOUT_STRIDE = 8
 
 
 def is_heldout(index: int) -> bool:
-    """Whether a frame, counted from 0, is kept from training."""
+    """Return True if the frame with this 0-based index is held out from training."""
     return (index - 1) % HELDOUT_STRIDE == 0

@@ -51,24 +51,26 @@ VIEWS_FILE = "views.json"
 VIEWS_FORMAT = "intrasplat-views"
 VIEWS_VERSION = 1
 MOST_VIEWS = 16
-"""Cameras beside the recording's own."""
+"""Maximum number of additional cameras."""
 
 
 @dataclass(frozen=True)
 class RecordedView:
-    """A camera that is fixed to the recording's own one, and what it saw."""
+    """Additional camera rigidly attached to the recording's own camera, with its pictures."""
 
     name: str
     camera: Camera
-    """Its pose leads from the coordinates of the recording's own camera to its own, as `Frame.right_camera`'s does."""
+    """Camera; its pose maps from the recording's own camera, as that of `Frame.right_camera`."""
     files: tuple[Path, ...]
     masks: MaskFiles | None
     depth: DepthFiles | None
 
     def read(self, index: int) -> Frame:
-        """What it saw at a frame of the recording, at `camera`'s size: image, and mask and depth where they are known.
+        """Read the view of a recording's frame at `camera`'s size, with mask and depth if
+        available.
 
-        Raises RecordingInvalid.
+        Raises:
+            RecordingInvalid: if a file cannot be used.
         """
         findings = Findings(strict=True)
         picture = next(ImageFiles(self.files[index : index + 1], 0, 0).frames(findings))
@@ -85,8 +87,16 @@ class RecordedView:
 
 
 def open_views(folder: Path, frame_count: int, scale: float = 1.0) -> tuple[RecordedView, ...]:
-    """The further cameras of a recording's folder, seen at a scale; none where it has no `views.json`. Raises RecordingInvalid for what cannot
-    be read, or has too few pictures for `frame_count` frames."""
+    """Open the additional cameras listed in `views.json`; empty without that file.
+
+    Args:
+        folder: folder of the recording.
+        frame_count: number of frames that each view must cover.
+        scale: factor on the picture size.
+
+    Raises:
+        RecordingInvalid: if a file cannot be read, or a view has too few pictures.
+    """
     path = folder / VIEWS_FILE
     if not folder.is_dir() or not path.exists():
         return ()
@@ -156,7 +166,7 @@ def _pose(path: Path, described: dict[str, Any]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TrueMotion:
-    """From one frame to the next, at the size at which the frame was read; NaN where it is not known."""
+    """Motion from one frame to the next at the size of the frame; NaN where unknown."""
 
     flow: NDArray[np.float32]
     """[H, W, 2], pixels."""
@@ -166,14 +176,18 @@ class TrueMotion:
 
 @dataclass(frozen=True)
 class MotionFiles:
-    """One file for each frame, in order."""
+    """Motion files of all frames, in order."""
 
     flow: tuple[Path, ...]
     scene_flow: tuple[Path, ...]
-    """As many, or none."""
+    """Scene-flow files; as many as `flow`, or none."""
 
     def of(self, frame: Frame) -> TrueMotion | None:
-        """How the pixels of a frame move; None where no file says so. Raises RecordingInvalid for a file that cannot be read."""
+        """Read the motion of a frame's pixels; None if no file covers the frame.
+
+        Raises:
+            RecordingInvalid: if a file cannot be read.
+        """
         if frame.seq >= len(self.flow):
             return None
         flow = _read_motion(self.flow[frame.seq], 2, frame)
@@ -256,7 +270,7 @@ class TissueBehindTools:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """What a recording knows beyond what a camera gives; the parts that it has not are None or empty."""
+    """Ground truth of a recording beyond camera data; missing parts are None or empty."""
 
     views: tuple[RecordedView, ...] = ()
     tracks: Tracks | None = None
@@ -265,7 +279,7 @@ class GroundTruth:
     behind: TissueBehindTools | None = None
 
     def depth_of(self, frame: Frame) -> NDArray[np.float32] | None:
-        """The true depth of a frame of the recording, at the frame's size; the frame's own where there is no other."""
+        """Return the true depth at the frame's size; the frame's own depth if there is no other."""
         if self.true_depth is None or frame.seq >= len(self.true_depth.files):
             return frame.depth
         depth = self.true_depth.read(frame.seq, Findings(strict=True))
@@ -274,9 +288,15 @@ class GroundTruth:
 
 
 def open_truth(folder: Path, frame_count: int, scale: float = 1.0) -> GroundTruth:
-    """What the folder of a recording knows about its first `frame_count` frames. scale: at which they are read, and the views with them.
+    """Open the ground truth of a recording's first `frame_count` frames.
 
-    Raises RecordingInvalid for what is there and cannot be read.
+    Args:
+        folder: folder of the recording.
+        frame_count: number of frames.
+        scale: factor on the picture size of the additional cameras.
+
+    Raises:
+        RecordingInvalid: if an existing file cannot be read.
     """
     if not folder.is_dir():
         return GroundTruth()
@@ -287,9 +307,10 @@ def open_truth(folder: Path, frame_count: int, scale: float = 1.0) -> GroundTrut
 
 
 def open_behind(folder: Path, frame_count: int) -> TissueBehindTools | None:
-    """Return the tissue behind the tools of a recording's first `frame_count` frames; None where the recording does not know it.
+    """Open the tissue behind the tools for the first `frame_count` frames; None without the data.
 
-    Raises RecordingInvalid for what is there and cannot be read.
+    Raises:
+        RecordingInvalid: if an existing file cannot be read.
     """
     depth = _depth_files(folder, "behind/depth", frame_count)
     if depth is None:
@@ -315,7 +336,7 @@ def _tracks(folder: Path, frame_count: int) -> Tracks | None:
 
 
 def _array(path: Path, frame_count: int, dimensions: int) -> NDArray[Any] | None:
-    """An array with as many rows as there are frames, or more; None where there is no such file."""
+    """Read an array with at least `frame_count` rows; None if the file does not exist."""
     if not path.exists():
         return None
     stays_inside(path.parent, path, Findings(strict=True))

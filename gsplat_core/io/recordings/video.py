@@ -23,22 +23,26 @@ _MAX_LOST = 10_000
 
 @dataclass(frozen=True)
 class VideoIndex:
-    """The packets of a video stream, numbered from 0 as they lie in the file."""
+    """Packets of a video stream, numbered from 0 in file order."""
 
     positions: array
-    """For each packet, the position of its picture in the order of showing; -1 for one that is not shown."""
+    """Display position of each packet's picture; -1 if not displayed."""
     key_packets: bytes
-    """For each packet, 1 where decoding can begin."""
+    """For each packet, 1 if decoding can start there, else 0."""
     damaged: dict[int, str]
-    """What the container says against a packet."""
+    """Damage reported by the container, by packet number."""
     frame_count: int
     """Pictures that are shown, those included that a damaged container has lost."""
     ordered: bool
-    """Whether `positions` can be trusted; without timestamps and with reordered pictures only the decoder knows."""
+    """True if `positions` is reliable.
+
+    False for streams without timestamps whose pictures are reordered; only the decoder knows the
+    order.
+    """
 
 
 def is_picture(packet: av.Packet) -> bool:
-    """Whether a packet holds data: an empty one stands for the end, or repeats the picture before it."""
+    """Return True if a packet holds data. An empty packet marks the end or repeats a picture."""
     return packet.size > 0
 
 
@@ -166,7 +170,7 @@ class VideoFrames:
                     yield None
                     due += 1
                     continue
-                image = last.image  # what a damaged header says of the size counts for nothing
+                image = last.image  # the size in a damaged header is unreliable
             last = Picture(image, damage)
             yield last
             due += 1
@@ -178,7 +182,7 @@ class VideoFrames:
             )
 
     def look_at_first(self) -> Picture | None:
-        """The first frame, whose size is that of all; None where there is none."""
+        """Decode the first frame, which determines the size of all frames; None if none decodes."""
         decoded = self._decoded(DamageSpread(self._index))
         position, first = next(decoded, (0, None))
         decoded.close()
@@ -203,8 +207,12 @@ class VideoFrames:
 
 
 class DamageSpread:
-    """Which pictures are damaged: those that something speaks against, and all that may have been predicted from them, which is
-    every later one up to the next key frame, and those behind it in the file that are shown before it."""
+    """Propagation of packet damage to dependent pictures.
+
+    A picture is damaged if its own packet is suspect, or if it may be predicted from a damaged
+    picture. The latter are all later pictures up to the next key frame, including those stored
+    after the key frame but displayed before it.
+    """
 
     def __init__(self, index: VideoIndex) -> None:
         self._index = index
@@ -215,9 +223,9 @@ class DamageSpread:
         self._next = 0
 
     def follow(self, doubts: dict[int, str], last: int) -> None:
-        """Take in what the decoder doubts, up to packet `last`."""
-        self._own = doubts | self._own  # what was said first explains most
-        begin = min([self._next, *doubts])  # what is found out late is judged again from there on
+        """Merge the decoder's doubts about packets up to number `last`."""
+        self._own = doubts | self._own  # the first reason is usually the most specific
+        begin = min([self._next, *doubts])  # reclassify pictures from a late doubt on
         doubts.clear()
         self._next = min(last + 1, len(self._index.positions))
         for number in range(begin, self._next):
@@ -239,7 +247,7 @@ class DamageSpread:
             self._damage.setdefault(position, f"{DEPENDS} before the key frame that follows it")
 
     def damage(self, position: int) -> str | None:
-        """What is known against the picture at a position in the order of showing; asked once."""
+        """Return and remove the damage of the picture at a display position; None if intact."""
         return self._damage.pop(position, None)
 
 
@@ -254,7 +262,7 @@ def _numbered(container: av.container.InputContainer, stream: av.VideoStream) ->
     number = 0
     packets = iter(container.demux(stream))
     while True:
-        with captured_log():  # the index has noted what the container complains of
+        with captured_log():  # container errors are already recorded in the index
             try:
                 packet = next(packets, None)
             except av.FFmpegError:
@@ -268,7 +276,7 @@ def _numbered(container: av.container.InputContainer, stream: av.VideoStream) ->
 
 
 def open_video(path: Path, findings: Findings) -> VideoFrames | None:
-    """Check the container and the first frame; None where there is a problem."""
+    """Check the container and the first frame; None after a problem."""
     try:
         with open_plain(path) as file:
             container = recognise(file)
@@ -324,12 +332,12 @@ def _duration_s(opened: av.container.InputContainer, stream: av.VideoStream) -> 
 
 
 def _is_edited(index: VideoIndex) -> bool:
-    """Whether some packets are there only to be decoded: an edit list shows less than what is stored."""
+    """Return True if some packets are decoded but not displayed, as with an edit list."""
     return any(position < 0 for position in index.positions)
 
 
 def _rotation(path: Path, container: Container) -> int:
-    """By how many degrees, counter-clockwise, the container says that pictures are to be turned."""
+    """Return the counter-clockwise display rotation in degrees stated by the container."""
     with _opened(path, container) as (opened, stream), captured_log():
         try:
             frame = next(opened.decode(stream), None)

@@ -1,4 +1,7 @@
-"""Recordings of live sessions: what came in, what was done with it, what was shown. docs/design/sessions.md describes the files."""
+"""Recordings of live sessions: received frames, training schedule and displayed pictures.
+
+docs/design/sessions.md documents the file format.
+"""
 
 from gsplat_core.io.sessions.reader import SessionReader, is_session
 from gsplat_core.io.sessions.records import SessionInfo

@@ -24,7 +24,7 @@ _ADVICE = "What can be read is played"
 
 @dataclass(frozen=True)
 class SessionImages:
-    """How many frames there are, of which size."""
+    """Number and size of a session's frames."""
 
     frame_count: int
     width_px: int
@@ -33,7 +33,10 @@ class SessionImages:
 
 @dataclass(frozen=True)
 class SessionContents:
-    """What `Contents` is for other layouts. A recording has one size: frames of another one than the first are left out."""
+    """Contents of a session; counterpart of `Contents` for other layouts.
+
+    A recording has a single picture size. Frames of another size than the first one are skipped.
+    """
 
     root: Path
     reader: SessionReader
@@ -73,7 +76,7 @@ class SessionContents:
         return self.reader.files()
 
     def digest(self) -> str:
-        """As `digest_of` all its files."""
+        """Return the digest of all files; see `digest_of`."""
         return digest_of(self.root, self.files())
 
     def _fits(self, line: FrameLine) -> bool:
@@ -81,7 +84,7 @@ class SessionContents:
 
 
 def session_contents(path: Path, findings: Findings) -> SessionContents | None:
-    """Open the recording of a session; None where there is a problem."""
+    """Open the recording of a session; None after a problem."""
     try:
         reader = SessionReader(path)
     except RecordingInvalid as error:
@@ -118,7 +121,10 @@ def session_contents(path: Path, findings: Findings) -> SessionContents | None:
 
 
 def _of_size(reader: SessionReader, size: tuple[int, int]) -> tuple[int, int, NDArray[np.float64] | None]:
-    """How many frames have this size, how many another one, and the poses of the former where all of them have one."""
+    """Return the numbers of frames with and without this size, and the poses [N, 4, 4].
+
+    The poses are None unless every frame of this size has one.
+    """
     poses: list[NDArray[np.float64]] = []
     count = others = 0
     for line in reader.frame_lines():

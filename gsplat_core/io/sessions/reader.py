@@ -37,14 +37,17 @@ _SEGMENT = re.compile(r"\d{6,9}")
 
 
 def is_session(folder: Path) -> bool:
-    """Whether a folder holds the recording of a session."""
+    """Return True if the folder contains a recorded session."""
     return (folder / SESSION_FILE).is_file()
 
 
 class SessionReader:
-    """A session's recording as far as it can be read: a file that is cut ends what is read of its segment there.
+    """Reader of the intact part of a recorded session; a truncated file ends its segment early.
 
-    Opening reads all logs and looks where the pictures lie; it decodes nothing. Raises RecordingInvalid where `session.json` is not one.
+    Opening reads all logs and indexes the tracks without decoding.
+
+    Raises:
+        RecordingInvalid: if `session.json` is missing or invalid.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -59,14 +62,14 @@ class SessionReader:
         self.first = playable[0].first if playable else None
         """The line of the first frame that can be read."""
         self.fields = frozenset(FIELDS).intersection(*(segment.fields for segment in playable))
-        """Which of the optional fields every frame that can be read has."""
+        """Optional fields that every readable frame has."""
         self.notes: list[str] = []
-        """What is missing, in sentences."""
+        """Sentences that describe missing data."""
         self._take_notes()
 
     @property
     def frame_count(self) -> int:
-        """How many frames can be read."""
+        """Number of readable frames."""
         return sum(len(segment.seqs) for segment in self.segments)
 
     def lines(self) -> Iterator[tuple[SegmentReader, Line]]:
@@ -81,8 +84,11 @@ class SessionReader:
             yield from _of(segment)
 
     def frames(self) -> Iterator[tuple[FrameLine, Frame | None]]:
-        """The frames that came in, in order, each with its line. A frame that turns out to be damaged says so in its status; None in its
-        place: its image cannot be decoded at all."""
+        """Yield the received frames in order, each with its log line.
+
+        A damaged frame has the status `DAMAGED`. The frame is None if its image cannot be decoded
+        at all.
+        """
         for segment in self.segments:
             with segment.open() as pictures:
                 for line in _of(segment):
@@ -109,7 +115,7 @@ class SessionReader:
 
     @property
     def prepared_count(self) -> int:
-        """How many frames `prepared` gives, unless pictures turn out to be damaged."""
+        """Number of frames that `prepared` yields if no picture proves damaged."""
         count = 0
         arrived: set[int] = set()
         for segment in self.segments:
@@ -121,13 +127,17 @@ class SessionReader:
         return count
 
     def schedule(self) -> Iterator[ScheduleLine | LostLine]:
-        """What was trained, in order; lost depth in the place where training was given it."""
+        """Yield the training schedule in order, including markers of lost depth at
+        their position.
+        """
         for _, line in self.lines():
             if isinstance(line, SCHEDULE_LINES) or (isinstance(line, LostLine) and line.what == "depth"):
                 yield line
 
     def late_depths(self) -> Iterator[dict[str, Any] | None]:
-        """For each `take_depth` line, in order, what its frame has besides: its fields by name. None: its pictures cannot be read."""
+        """Yield the fields of each `take_depth` line by name; None if its pictures are
+        unreadable.
+        """
         for segment in self.segments:
             with segment.open() as pictures:
                 for line in segment.lines():
@@ -140,7 +150,10 @@ class SessionReader:
 
     @property
     def made(self) -> ReconstructorMade | None:
-        """How the session's first reconstructor was made; None where that, or what came before, is not there any more."""
+        """Return the line that created the first reconstructor.
+
+        None if the line, or any data before it, has been deleted.
+        """
         if not self.segments or int(self.segments[0].folder.name) != 0:
             return None
         return next((line for line in self.segments[0].lines() if isinstance(line, ReconstructorMade)), None)
@@ -186,7 +199,10 @@ def frame_of(line: FrameLine, pictures: SegmentPictures) -> Frame | None:
 
 
 def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -> Frame | None:
-    """What training was given of a frame, damaged where a part of it, or the frame itself, is; None where there is no image at all."""
+    """Return the frame as passed to training.
+
+    The frame is damaged if the received frame or one of its own planes is. None without any image.
+    """
     planes, damage = pictures.of(line)
     for track in line.same:
         plane = getattr(arrived, track, None)
@@ -212,7 +228,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
         return None
     status = FrameStatus.REPLAY if line.status == "live" else FrameStatus(line.status)
     if damage is not None and damage != line.damage:
-        # What the file says was lost since: no pixel of it is known to be tissue.
+        # Damaged after recording, so no pixel is known to be tissue.
         status, planes = FrameStatus.DAMAGED, {**planes, "mask": mask_of_nothing(*image.shape[:2])}
     try:
         return Frame(

@@ -42,18 +42,18 @@ Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterV
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
-"""For each track that has a picture for this line, the time in milliseconds at which it lies in the track's file."""
+"""Timestamp in milliseconds within the track's file, for each track with a picture of this line."""
 Origin = Literal["measured", "stereo", "parallax", "light"]
 """See `gsplat_core.scene.frames.DepthOrigin`."""
 
 
 class Record(BaseModel):
-    """One line of a log; frozen, and checked whoever wrote it."""
+    """One line of a session log; immutable and validated on construction and on reading."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 
     def line(self) -> bytes:
-        """As it is written, the end of the line included."""
+        """Return the JSON line as bytes, including the newline."""
         return self.model_dump_json(exclude_none=True).encode() + b"\n"
 
 
@@ -76,11 +76,11 @@ class SegmentBegins(Record):
     event: Literal["segment"] = "segment"
     number: Count
     why: Text
-    """What ended the segment before: "begin", "bytes", "seconds"."""
+    """Reason for ending the previous segment: "begin", "bytes" or "seconds"."""
     utc: Text
     """Date and time of day by the machine's clock, for people: ISO 8601."""
     monotonic_ns: Nanoseconds
-    """The same moment on the clock of `arrived_ns` and `shown_ns`."""
+    """The same moment on the monotonic clock of `arrived_ns` and `shown_ns`."""
 
 
 class _FrameLine(Record):
@@ -97,7 +97,7 @@ class _FrameLine(Record):
     right_camera: CameraRecord | None = None
     """The right eye's; its pose leads from the left camera's coordinates to its own."""
     depth_origin: Origin | None = None
-    """Absent where there is no depth, or in recordings of earlier versions."""
+    """None if the frame has no depth, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
     exposure: tuple[Positive, Positive, Positive] | None = None
     withheld: Text | None = None
@@ -105,13 +105,16 @@ class _FrameLine(Record):
 
 
 class FrameLine(_FrameLine):
-    """A frame as it came in: behind the out-of-body gate and what looks at the picture beside it."""
+    """Frame as received, after the out-of-body gate and the concurrent image checks."""
 
     event: Literal["frame"] = "frame"
 
 
 class PreparedLine(_FrameLine):
-    """The same frame as training was given it. A track that is missing here and there in `same` is that of the frame as it came in."""
+    """Frame as passed to training.
+
+    A plane without a track here, but listed in `same`, equals that of the received frame.
+    """
 
     event: Literal["prepared"] = "prepared"
     same: tuple[TrackName, ...]
@@ -122,23 +125,28 @@ class ShownLine(Record):
 
     event: Literal["shown"] = "shown"
     seq: Count
-    """The frame whose content it shows."""
+    """Sequence number of the frame whose content is shown."""
     width_px: Side
     height_px: Side
     model_version: Count
     sha256: Digest | None = None
-    """Of the RGB bytes of the rendered picture, before state and age are drawn into it; absent: the picture was there before, and only its
-    state or age has changed."""
+    """SHA-256 of the rendered RGB bytes before the status overlay.
+
+    None if the picture was already on the screen and only its status or age changed.
+    """
     shown_ns: Nanoseconds | None = None
     age_ns: Nanoseconds | None = None
-    """From the arrival of the newest frame that it shows until it was shown."""
+    """Time from the arrival of the newest frame in the picture until its display."""
     state: Text | None = None
     tracks: Tracks
     """`shown`: the picture as it was on the screen."""
 
 
 class LostLine(Record):
-    """Something that should stand here and does not, because writing was too slow for it, or because no line can hold it."""
+    """Marker for a record that was not written.
+
+    Reasons are writing that was too slow, or a record that does not fit into a line.
+    """
 
     event: Literal["lost"] = "lost"
     seq: Count
@@ -166,9 +174,12 @@ class SegmentEnds(Record):
 
     event: Literal["end"] = "end"
     why: Text
-    """"bytes" and "seconds": the next segment goes on; anything else: why the recording ends."""
+    """Reason for ending the segment.
+
+    After "bytes" and "seconds" another segment follows. Any other reason ended the recording.
+    """
     frames: Count
-    """How many `frame` lines the segment has."""
+    """Number of `frame` lines in the segment."""
 
 
 Steps = Annotated[int, Field(ge=0, le=10_000_000)]
@@ -187,7 +198,7 @@ class ReconstructorMade(Record):
     """The fields of `LiveTraining`."""
     camera: CameraRecord
     stereo: bool = False
-    """Whether it was prepared for frames of two eyes."""
+    """True if the reconstructor was created for stereo frames."""
 
 
 class SceneBegun(Record):
@@ -215,7 +226,7 @@ class DepthTaken(Record):
     width_px: Side
     height_px: Side
     tracks: Tracks
-    """`depth`, and `depth_confidence` where there is any."""
+    """`depth`, and `depth_confidence` if available."""
 
 
 class Grown(Record):
@@ -256,11 +267,12 @@ class LogWriter:
         data = line.line()
         written = self._file.write(data)
         self.bytes += written
-        if written != len(data):  # a disk that fills up takes the beginning; the next write says why
+        # a disk that fills up accepts a part; the next write raises the error
+        if written != len(data):
             self.bytes += self._file.write(data[written:])
 
     def sync(self) -> None:
-        """Force what was written to the disk."""
+        """Force written data to the disk."""
         os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
@@ -269,9 +281,13 @@ class LogWriter:
 
 
 def read_log(path: Path) -> Iterator[Line]:
-    """The lines in order, up to the first one that is cut off or is not what a log holds. Lines of an unknown kind are left out.
+    """Yield the lines of a log up to the first truncated or invalid one.
 
-    Raises UnreadableFile, OSError.
+    Lines with an unknown event are skipped.
+
+    Raises:
+        UnreadableFile: if the log is not a regular file.
+        OSError: if reading fails.
     """
     with open_plain(path) as file:
         while True:
@@ -300,15 +316,15 @@ class SessionInfo(Record):
     format: Literal["intrasplat-session"] = "intrasplat-session"
     version: Literal[1] = 1
     source: Text
-    """Where the frames came from, in words."""
+    """Human-readable description of the frame source."""
     utc: Text
-    """When the recording began: ISO 8601."""
+    """Start of the recording in ISO 8601."""
     fps: float = Field(gt=0, le=10_000)
     """Nominal frames per second."""
     camera: CameraRecord
     """The camera of the first frame."""
     fields: tuple[Literal["mask", "depth", "right_image", "pose"], ...] = ()
-    """What every frame of the source has."""
+    """Optional fields that every frame of the source has."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """The settings of the run, for people and programs that know them."""
     keeps_bytes: Count | None = None
@@ -339,13 +355,22 @@ def camera_of(record: CameraRecord) -> Camera:
 
 
 def write_session_file(folder: Path, info: SessionInfo) -> None:
-    """Write it whole, in a folder where there is none yet. Raises FileExistsError, OSError."""
+    """Write the session file atomically.
+
+    Raises:
+        FileExistsError: if the folder already contains a session file.
+        OSError: if writing fails.
+    """
     with PartialFile(folder / SESSION_FILE, overwrite=False) as partial:
         partial.file.write(info.model_dump_json(indent=1, exclude_none=True).encode() + b"\n")
 
 
 def read_session_file(folder: Path) -> SessionInfo:
-    """Raises RecordingInvalid for what is no such file."""
+    """Read and validate the session file.
+
+    Raises:
+        RecordingInvalid: if the file is missing, unreadable or invalid.
+    """
     path = folder / SESSION_FILE
     try:
         if os.path.islink(path):

@@ -32,8 +32,11 @@ from gsplat_core.io.sessions.records import (
 from gsplat_core.io.sessions.tracks import CODINGS, Coding, TrackIndex, TrackReader, TrackWriter
 
 Stage = Literal["", "prepared_", "late_"]
-"""How the names of track files begin: "" for what came in and what was shown, "prepared_" for what training was given, "late_" for what it was given
-of a frame later."""
+"""Name prefix of track files.
+
+"" marks received and displayed pictures, "prepared_" those passed to training, and "late_" depth
+passed to training later.
+"""
 MOST_FILES = 64
 """Tracks and sizes; a segment that needs more of them ends."""
 
@@ -61,16 +64,18 @@ class SegmentWriter:
 
     @property
     def bytes(self) -> int:
-        """How much it takes on the disk."""
+        """Current size of the segment on disk in bytes."""
         return self._log.bytes + sum(track.bytes for track in self._tracks.values())
 
     @property
     def full(self) -> bool:
-        """Whether a picture of another size may find no place for a file."""
+        """True if the limit on track files is reached, so that a new picture size
+        cannot be added.
+        """
         return len(self._tracks) >= MOST_FILES
 
     def picture(self, stage: Stage, track: str, picture: NDArray[Any], pts_ns: int) -> int:
-        """Add a picture to a track; returns the time at which it lies in the file, in milliseconds."""
+        """Append a picture to a track and return its timestamp in the file in milliseconds."""
         if self._start_ns is None:
             self._start_ns = pts_ns
         height, width = picture.shape[:2]
@@ -92,7 +97,9 @@ class SegmentWriter:
         self._log.sync()
 
     def close(self, why: str) -> None:
-        """Finish all files: the log's last line says that they are whole, so that it comes last."""
+        """Finish all files. The log is closed last, because its final line marks the tracks as
+        complete.
+        """
         for track in self._tracks.values():
             track.close()
         self._log.write(SegmentEnds(why=why, frames=self.frames))
@@ -101,13 +108,16 @@ class SegmentWriter:
         self._closed = True
 
     def abandon(self, why: str) -> None:
-        """Let go of the files as they are; the log says why where there is still room for it. Without effect after `close`."""
+        """Release the files without finishing them, logging the reason if possible.
+
+        Without effect after `close`.
+        """
         if self._closed:
             return
         self._closed = True
         for track in self._tracks.values():
             track.abandon()
-        with suppress(OSError):  # as above: whoever abandons knows that the disk does not take it
+        with suppress(OSError):  # a failing disk is the usual reason for abandoning
             self._log.write(SegmentEnds(why=why, frames=self.frames))
         self._log.close()
 
@@ -127,7 +137,7 @@ class SegmentReader:
         self.folder = folder
         self.begins: SegmentBegins | None = None
         self.ends: SegmentEnds | None = None
-        """None where the log is cut off, or the recording goes on."""
+        """Last line of the log; None if the log is truncated or still being written."""
         self.named = 0
         """Frames that the log names."""
         self.seqs = array("q")
@@ -135,12 +145,12 @@ class SegmentReader:
         self.first: FrameLine | None = None
         """The line of the first of them."""
         self.fields = frozenset(FIELDS)
-        """Which of the optional fields all of them have."""
+        """Optional fields that all frames have."""
         self._indices: dict[str, TrackIndex | None] = {}
         self._look(after_seq)
 
     def lines(self) -> Iterator[Line]:
-        """All lines, in order, as far as the log can be read."""
+        """Yield the readable lines in order."""
         if self.folder.joinpath(LOG_FILE).is_symlink():
             return
         try:
@@ -149,7 +159,7 @@ class SegmentReader:
             return  # as a log that is cut off at its first byte
 
     def there(self, line: PictureLine) -> bool:
-        """Whether every picture that a line names is in its file, whole."""
+        """Return True if all pictures of a line are complete in their files."""
         return all(
             (index := self._index(_file(line, track))) is not None and time in index
             for track, time in line.tracks.items()
@@ -164,7 +174,9 @@ class SegmentReader:
         return sorted([self.folder / LOG_FILE, *(index.path for index in self._indices.values() if index is not None)])
 
     def _look(self, after_seq: int) -> None:
-        """Read the log once: how it begins and ends, which files it names, and which of its frames are there."""
+        """Read the log once to find its first and last line, its track files and its complete
+        frames.
+        """
         lines = self.lines()
         first = next(lines, None)
         if not isinstance(first, SegmentBegins):
@@ -195,7 +207,7 @@ class SegmentReader:
             if line.seq <= after_seq or "image" not in line.tracks or line.height_px * line.width_px > MAX_PIXELS:
                 continue
             if not self.there(line):
-                break  # it plays up to there; what was written later is not whole either
+                break  # later pictures are incomplete as well
             after_seq = line.seq
             self.seqs.append(line.seq)
             self.first = self.first or line
@@ -221,7 +233,11 @@ class SegmentPictures:
         self._readers.clear()
 
     def of(self, line: PictureLine) -> tuple[dict[str, NDArray[Any]], str | None]:
-        """The pictures of a line by track, and what is wrong with them; a picture that cannot be read at all is left out."""
+        """Decode the pictures of a line.
+
+        Returns:
+            Pictures by track, without unreadable ones, and the first damage or None.
+        """
         pictures: dict[str, NDArray[Any]] = {}
         damage: str | None = None
         for track, time in line.tracks.items():
@@ -254,5 +270,5 @@ def _file(line: PictureLine, track: str) -> str:
 
 
 def mask_of_nothing(height_px: int, width_px: int) -> NDArray[np.uint8]:
-    """No pixel of a damaged frame is known to be tissue."""
+    """Return a tissue mask of zeros [H, W] for a damaged frame."""
     return np.zeros((height_px, width_px), np.uint8)

@@ -40,7 +40,7 @@ CODINGS: Mapping[str, Coding] = {
     "depth_confidence": "float",
     "shown": "colour",
 }
-"""How each track is coded; `shown` may be vp9."""
+"""Coding of each track; `shown` may also be vp9."""
 PIXEL_FORMATS: Mapping[Coding, str] = {"colour": "bgr0", "grey": "gray", "float": "gray", "vp9": "yuv420p"}
 ENCODERS: Mapping[Coding, str] = {"colour": "ffv1", "grey": "ffv1", "float": "ffv1", "vp9": "libvpx-vp9"}
 _VP9 = {
@@ -59,7 +59,7 @@ def encoder_options(coding: Coding, height_px: int, width_px: int) -> dict[str, 
     """The encoder's options for pictures that are coded with these sides."""
     if coding == "vp9":
         return _VP9
-    # Four slices limit what a flipped bit destroys; a picture smaller than that has no room for them.
+    # Four slices limit the damage of a flipped bit. Tiny pictures cannot be split into four.
     slices = "4" if min(height_px, width_px) >= 8 else "1"
     return {"level": "3", "slices": slices, "slicecrc": "1", "g": "1"}
 
@@ -96,7 +96,7 @@ def encoded(coding: Coding, picture: NDArray[Any]) -> av.VideoFrame:
 
 
 def decoded(coding: Coding, frame: av.VideoFrame, height_px: int, width_px: int) -> NDArray[Any] | None:
-    """The picture [height_px, width_px]; None where the frame is not what this coding makes of such a picture."""
+    """Decode a picture [height_px, width_px]; None if the frame does not fit the coding or size."""
     if frame.format.name != PIXEL_FORMATS[coding] or (frame.height, frame.width) != coded_size(
         coding, height_px, width_px
     ):
@@ -121,7 +121,7 @@ def _require(picture: NDArray[Any], dtype: type, dimensions: int) -> None:
 
 
 def _pixels(frame: av.VideoFrame, channels: int) -> NDArray[np.uint8]:
-    """The first plane [H, W, channels], as it lies in the frame's memory."""
+    """Return the first plane [H, W, channels] as a view of the frame's memory."""
     plane = frame.planes[0]
     rows = np.frombuffer(memoryview(plane), np.uint8)[: plane.line_size * frame.height].reshape(
         frame.height, plane.line_size
@@ -133,8 +133,9 @@ MOST_MS_AHEAD = 3_600_000
 """A clock that jumps further ahead is followed so far: the log has the true times, the file's are for players."""
 _MS = Fraction(1, 1000)
 _MUXER = {
-    # Every packet leaves the process when it is muxed, as a cluster of its own with its CRC-32: a file that is cut loses only what
-    # comes after the cut. FFmpeg writes a cluster when the next one begins, so that one picture is always on its way.
+    # Each packet is written as a cluster of its own with a CRC-32, so a truncated file loses only
+    # the data after the cut. FFmpeg writes a cluster when the next one begins, so one picture is
+    # always pending.
     "flush_packets": "1",
     "cluster_time_limit": "0",
 }
@@ -146,7 +147,7 @@ class TrackWriter:
     def __init__(self, path: Path, coding: Coding, height_px: int, width_px: int, fps: float) -> None:
         self.path, self.coding = path, coding
         self.bytes = 0
-        """How much was written; the index that closing adds is not counted."""
+        """Number of bytes written, without the index that closing appends."""
         self._last_ms = -1
         self._file = path.open("xb", buffering=0)
         self._container = av.open(self._file, mode="w", format="matroska", options=_MUXER)
@@ -158,7 +159,7 @@ class TrackWriter:
         self._stream.pix_fmt = PIXEL_FORMATS[coding]
         context = self._stream.codec_context
         context.time_base = _MS
-        # One thread: coding goes on beside the graph and must not take more than its share.
+        # One thread, so that encoding does not take processor time from the graph.
         context.thread_count = 1
         if coding == "vp9":
             context.gop_size = max(1, round(2 * fps))
@@ -166,7 +167,15 @@ class TrackWriter:
         context.open()
 
     def write(self, picture: NDArray[Any], wanted_ms: int) -> int:
-        """Add a picture; returns the time in milliseconds at which it lies in the file: `wanted_ms`, but always after the one before it."""
+        """Append a picture.
+
+        Args:
+            picture: picture in the track's coding.
+            wanted_ms: requested timestamp.
+
+        Returns:
+            Timestamp in the file in milliseconds: `wanted_ms`, adjusted to exceed the previous one.
+        """
         frame = encoded(self.coding, np.ascontiguousarray(picture))
         self._last_ms += min(max(1, wanted_ms - self._last_ms), MOST_MS_AHEAD)
         frame.pts, frame.time_base = self._last_ms, _MS
@@ -174,7 +183,7 @@ class TrackWriter:
         return self._last_ms
 
     def sync(self) -> None:
-        """Force what was written to the disk."""
+        """Force written data to the disk."""
         os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
@@ -199,15 +208,29 @@ class TrackWriter:
 _CODECS = ("ffv1", "vp9")
 _MOST_MS = 2**62
 MOST_PICTURES = 1_000_000
-"""In one file: nine hours at 30 pictures/s, where segments last minutes."""
+"""Maximum number of pictures read from one file.
+
+Corresponds to nine hours at 30 pictures/s; segments last minutes.
+"""
 
 
 class TrackIndex:
-    """Which pictures of a track's file can be decoded: those in clusters that are whole, up to the first one that is not."""
+    """Index of a track file's decodable pictures: those in complete clusters up to the first bad
+    one.
+    """
 
     def __init__(self, path: Path, *, check_sums: bool) -> None:
-        """check_sums: whether it ends before the first cluster whose checksum is wrong, too; that reads the whole file. Without it, such
-        clusters are noticed when they are decoded. Raises UnreadableFile, OSError."""
+        """Index the clusters of a file.
+
+        Args:
+            path: track file.
+            check_sums: also stop at the first wrong checksum, which reads the whole file. Otherwise
+                such clusters are noticed on decoding.
+
+        Raises:
+            UnreadableFile: if the file is a link or not a regular file.
+            OSError: if reading fails.
+        """
         self.path, self.checked = path, check_sums
         self.end = 0
         self._times = array("q")
@@ -223,13 +246,18 @@ class TrackIndex:
                 self.end = cluster.end
 
     def __contains__(self, time_ms: object) -> bool:
-        """Whether there is a picture at a time."""
+        """Return True if a picture with this timestamp exists."""
         assert isinstance(time_ms, int)
         at = bisect_left(self._times, time_ms)
         return at < len(self._times) and self._times[at] == time_ms
 
     def damaged(self) -> frozenset[int]:
-        """The times of pictures whose checksum is wrong. Raises UnreadableFile, OSError."""
+        """Return the timestamps of pictures with a wrong checksum.
+
+        Raises:
+            UnreadableFile: if the file is not a regular file.
+            OSError: if reading fails.
+        """
         if self.checked:
             return frozenset()
         with open_plain(self.path) as file:
@@ -247,7 +275,16 @@ class TrackReader:
         self._next: tuple[int, NDArray[Any] | None, str | None] | None = None
 
     def picture(self, time_ms: int) -> tuple[NDArray[Any] | None, str | None]:
-        """The picture at a time, or None; and what is wrong with it. Raises UnreadableFile, OSError, av.FFmpegError."""
+        """Decode the picture with this timestamp; timestamps must increase between calls.
+
+        Returns:
+            Picture or None, and a description of the damage or None.
+
+        Raises:
+            UnreadableFile: if the file is not a regular file.
+            OSError: if reading fails.
+            av.FFmpegError: if the file cannot be opened as a video.
+        """
         if self._pictures is None:
             self._pictures = self._decode()
             self._next = next(self._pictures, None)
@@ -294,7 +331,7 @@ class TrackReader:
 
 
 def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet | None]:
-    """The packets that hold data, and None at the end. What cannot be read ends them."""
+    """Yield the packets with data, then None. An unreadable packet ends the sequence."""
     packets = iter(container.demux(stream))
     while True:
         with captured_log():

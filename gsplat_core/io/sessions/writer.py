@@ -40,7 +40,7 @@ from gsplat_core.io.sessions.tracks import Coding
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
 DELETING = ".deleted-"
-"""How the name of a folder begins that is being removed."""
+"""Name prefix of folders that are being deleted."""
 _NAMED_AFTER_ITS_TIME = re.compile(r"\d{8}T\d{6}Z(-\d+)?")
 
 
@@ -51,27 +51,33 @@ class KeptPart:
     folder: Path
     bytes: int
     ended_ns: int
-    """By the writer's clock."""
+    """End of the part in nanoseconds on the writer's clock."""
     segment: int | None = None
-    """Its number; None: a whole session."""
+    """Segment number; None for an entire session."""
 
 
 class Retention:
-    """Removes what is too much or too old, the oldest first."""
+    """Deletion of the oldest parts when a recording exceeds its size or age limit."""
 
     def __init__(self, keep_bytes: int | None, keep_s: float | None, room_bytes: int) -> None:
-        """room_bytes: what the segment that is being written may still come to; it has to fit, too."""
+        """Create a retention policy.
+
+        Args:
+            keep_bytes: size limit; None for no limit.
+            keep_s: age limit in seconds; None for no limit.
+            room_bytes: largest size of the segment being written; counts towards the limit.
+        """
         self._keep_bytes, self._keep_s, self._room_bytes = keep_bytes, keep_s, room_bytes
         self._parts: deque[KeptPart] = deque()
 
     @property
     def bytes(self) -> int:
-        """Of all parts."""
+        """Total size of all parts."""
         return sum(part.bytes for part in self._parts)
 
     @property
     def segment_bytes(self) -> int:
-        """Of the segments among them."""
+        """Total size of the parts that are segments."""
         return sum(part.bytes for part in self._parts if part.segment is not None)
 
     def add(self, part: KeptPart) -> None:
@@ -79,8 +85,14 @@ class Retention:
         self._parts.append(part)
 
     def give_up(self, now_ns: int) -> Iterator[tuple[KeptPart, str | None]]:
-        """Remove parts until the bounds hold; each one, and why it could not be removed where that is so: a session of an earlier run that
-        somebody has locked away ends no recording."""
+        """Delete parts until the limits hold.
+
+        Failure to delete an earlier session does not end the recording; failure to delete a segment
+        raises.
+
+        Yields:
+            Each part, and the error text if it could not be deleted, otherwise None.
+        """
         while self._parts and self._is_too_much(now_ns):
             part = self._parts.popleft()
             try:
@@ -116,9 +128,9 @@ def finish_removals(recordings: Path) -> Iterator[tuple[Path, str]]:
 
 
 def earlier_sessions(recordings: Path, present: Path, now_ns: int) -> list[KeptPart]:
-    """The sessions in a folder of recordings but the present one, those that ended first in front.
+    """Return the other sessions in a folder of recordings, ordered by their end.
 
-    A session that was renamed is not among them: its name says no more that it was recorded here, and somebody wants to keep it.
+    Renamed sessions are excluded, because renaming signals that the user wants to keep them.
     """
     now_s = time.time()
     found = []
@@ -139,10 +151,13 @@ _PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "
 
 @dataclass(frozen=True)
 class WriterOptions:
-    """How a session is recorded."""
+    """Options of session recording."""
 
     shown: Literal["vp9", "lossless", "digest"] = "vp9"
-    """What is kept of shown pictures beside their SHA-256: a video for people, the pictures themselves, or nothing."""
+    """Content kept of displayed pictures in addition to the SHA-256.
+
+    "vp9" keeps a lossy video, "lossless" the exact pictures, "digest" nothing.
+    """
     segment_bytes: int = 256 * 2**20
     segment_s: float = 60.0
     """A segment ends when it has so many bytes, or is so old."""
@@ -151,9 +166,11 @@ class WriterOptions:
     keep_s: float | None = None
     """Remove segments that ended longer ago; None: keep them."""
     with_earlier: bool = False
-    """Both bounds are those of all sessions in the folder in which this one lies: earlier ones go before its segments."""
+    """Apply both limits to all sessions in the parent folder; earlier sessions are
+    deleted first.
+    """
     sync_s: float = 1.0
-    """Force what was written to the disk so often: a power failure loses no more than that."""
+    """Interval in seconds of forced disk writes; bounds the loss at a power failure."""
     clock: Callable[[], int] = time.monotonic_ns
 
     def __post_init__(self) -> None:
@@ -168,33 +185,43 @@ class WriterOptions:
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture that was shown, and what is written about it."""
+    """Displayed picture with its metadata."""
 
     frame: Frame
-    """The frame whose picture it is."""
+    """Frame whose content the picture shows."""
     rendered: NDArray[np.uint8]
     """RGB uint8 [H, W, 3], as rendered."""
     model_version: int
     on_screen: NDArray[np.uint8] | None = None
-    """As shown, with state and age drawn into it; None: as rendered."""
+    """Picture with its status overlay; None if displayed as rendered."""
     new: bool = True
     """False: the picture was there before, and only its state or age has changed."""
     shown_ns: int | None = None
-    """By `time.monotonic_ns`."""
+    """Display time in nanoseconds of `time.monotonic_ns`."""
     age_ns: int | None = None
     state: str | None = None
     """`live`, `stale`, …"""
 
 
 class SessionWriter:
-    """Writes a session into a folder, in the caller's thread: `operators.sinks.recorder` gives it a thread of its own.
+    """Synchronous writer of a session folder; `operators.sinks.recorder` runs it in a thread.
 
-    What is written can be read at any moment, however the program ends, up to the last picture or two. Raises OSError and av.FFmpegError where the
-    disk does not take it; then `abandon`.
+    The files are readable at any moment, even after a crash, except for the last one or two
+    pictures. If the disk rejects a write, methods raise OSError or av.FFmpegError; call `abandon`
+    then.
     """
 
     def __init__(self, folder: Path, info: SessionInfo, options: WriterOptions | None = None) -> None:
-        """folder: made where it is not there. Raises FileExistsError where a session is in it."""
+        """Create the session folder and its first segment.
+
+        Args:
+            folder: folder of the session; created if missing.
+            info: content of the session file.
+            options: recording options.
+
+        Raises:
+            FileExistsError: if the folder already contains a session.
+        """
         self.folder, self.info = folder, info
         self.options = options or WriterOptions()
         self.deleted_segments = self.deleted_sessions = 0
@@ -210,7 +237,7 @@ class SessionWriter:
 
     @property
     def bytes(self) -> int:
-        """What the recording takes on the disk now."""
+        """Current size of the recording on disk in bytes."""
         return self._kept.segment_bytes + self._segment.bytes
 
     def frame(self, frame: Frame) -> None:
@@ -220,7 +247,12 @@ class SessionWriter:
         self._segment.line(FrameLine(**_said(frame), tracks=tracks))
 
     def prepared(self, frame: Frame, arrived: Frame) -> None:
-        """What training was given of a frame, as far as it differs from `arrived`, the frame as it was recorded by `frame`."""
+        """Record the frame as passed to training; stores only planes that differ from `arrived`.
+
+        Args:
+            frame: frame passed to training.
+            arrived: received frame, already recorded by `frame`.
+        """
         self._go_on()
         same: list[TrackName] = []
         planes: dict[TrackName, NDArray[Any]] = {}
@@ -270,16 +302,16 @@ class SessionWriter:
         )
 
     def line(self, line: Record) -> None:
-        """A line of the log as it is: what was trained, what was lost."""
+        """Append a record, such as a training step or a loss, to the log."""
         self._go_on()
         self._segment.line(line)
 
     def note(self, text: str) -> None:
-        """A sentence for whoever reads the recording."""
+        """Append a human-readable remark to the log."""
         self.line(NoteLine(text=text))
 
     def close(self, why: str) -> None:
-        """Finish the recording; `why` says what ended it."""
+        """Finish the recording; `why` is stored as the reason."""
         self._segment.close(why)
 
     def abandon(self, why: str) -> None:
@@ -328,7 +360,7 @@ class SessionWriter:
         self._give_up(now_ns)
 
     def _give_up(self, now_ns: int) -> None:
-        """Remove what is too much or too old, and say so in the log."""
+        """Delete parts that exceed the limits and log each deletion."""
         for part, failure in self._kept.give_up(now_ns):
             if part.segment is not None:
                 self.deleted_segments += 1
@@ -348,7 +380,7 @@ def _planes(frame: Frame, names: tuple[TrackName, ...]) -> dict[TrackName, NDArr
 
 
 def _said(frame: Frame) -> dict[str, Any]:
-    """What a line says of a frame beside its pictures."""
+    """Return the fields of a frame's log line except its tracks."""
     return {
         "seq": frame.seq,
         "pts_ns": frame.pts_ns,

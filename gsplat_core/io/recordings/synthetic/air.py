@@ -1,4 +1,4 @@
-"""What is between a scope and the tissue, and what its camera makes of the light: smoke that drifts, and an exposure that changes."""
+"""Drifting smoke between scope and tissue, and a varying camera exposure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMOKE_MM = 74.0
 SMOKE_COLOUR = (0.42, 0.41, 0.44)
 EXPOSURE_PERIODS_S = (1.9, 3.1)
 EXPOSURE_STOPS = (0.45, 0.25)
-"""How far the exposure goes up and down with each period, in factors of two."""
+"""Amplitudes of the exposure's oscillations in stops (factors of two), one per period."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Air:
         return cls(smoke, exposure_changes, np.clip(1 + 0.55 * soft / soft.std(), 0, None).astype(np.float32))
 
     def exposure_at(self, time_s: float) -> float:
-        """By how much a picture is brighter than usual, 1 at time 0."""
+        """Return the exposure factor at a time; 1 at time 0."""
         if not self.exposure_changes:
             return 1.0
         stops = zip(EXPOSURE_STOPS, EXPOSURE_PERIODS_S, strict=True)
@@ -55,10 +55,24 @@ class Air:
     def through(
         self, radiance: Array, camera: Camera, ray_x: Array, ray_y: Array, depth: Array, lamp: Lamp, time_s: float
     ) -> Array:
-        """What a camera gets of the radiance [H, W, 3] of what is `depth` away, and of the smoke before it."""
+        """Attenuate the radiance by smoke, add light scattered by it, and apply the exposure.
+
+        Args:
+            radiance: linear radiance [H, W, 3] leaving the surfaces.
+            camera: camera of the picture.
+            ray_x: x / z of each pixel's ray [H, W].
+            ray_y: y / z of each pixel's ray [H, W].
+            depth: depth of the surface in mm [H, W].
+            lamp: light source in camera coordinates.
+            time_s: time in seconds.
+
+        Returns:
+            Radiance at the sensor, float32 [H, W, 3].
+        """
         if self.smoke:
             clear = self._transmitted(camera, ray_x, ray_y, depth, time_s)[..., None]
-            # Smoke half-way to the tissue is lit as a white surface there is, but weakly: it is thin.
+            # Light smoke like a white surface half-way to the tissue, scaled down because it is
+            # thin.
             half = np.stack([ray_x, ray_y, np.ones_like(ray_x)], axis=-1) * (0.5 * depth)[..., None]
             arriving = sum(power for _, power in lamp.rays_to(half, nearest_mm2=400))
             lit = np.minimum(np.float32(0.25) * arriving, np.float32(0.8))[..., None]

@@ -1,7 +1,8 @@
-"""A colon-like scene: a tube with folds, seen along its axis, that closes in the distance; the near wall is bright and the far end dark.
+"""Colon-like scene: a folded tube viewed along its axis, bright nearby, dark at the closed end.
 
-At rest the wall is an ellipsoid of revolution around the origin, z along its long axis, with rings of folds. The material point (u, v) lies
-on the ray (u, v, TEXTURE_MM) from the origin, so that the wall has no seam and no pole.
+At rest the wall is an ellipsoid of revolution around the origin with rings of folds; z is its long
+axis. The material point (u, v) is on the ray (u, v, TEXTURE_MM) from the origin, so the wall has no
+seam and no pole.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ Array = NDArray[np.floating]
 
 RADIUS_MM = 23.0
 LENGTH_MM = 150.0
-"""From the origin to where the tube closes."""
+"""Distance in mm from the origin to the closed end of the tube."""
 TEXTURE_MM = 72.0
 """Texture has its own size at this distance, and is drawn out along the nearer wall."""
 FOLD_SHARE = 0.045
-"""How far folds reach into the tube, as a share of its radius."""
+"""Height of the folds as a share of the tube's radius."""
 FOLDS = 13.0
 """Folds between two distances: so many radians for each unit of the logarithm of the distance."""
 FOLD_TILT = (1.1, -0.7)

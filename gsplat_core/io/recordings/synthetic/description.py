@@ -1,4 +1,6 @@
-"""`recording.json` and `views.json` of a synthetic recording: what its files mean."""
+"""Writer of `recording.json` and `views.json`, which document the files of a synthetic
+recording.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ _BEHIND = {
 
 
 def describe(files: FrameFiles, frames: int) -> None:
-    """Write `recording.json`, and `views.json` where there is a third camera."""
+    """Write `recording.json`, and `views.json` if the recording has a third camera."""
     extras, scene = files.extras, files.scene
     meaning = dict(_ALWAYS)
     for wanted, more in (

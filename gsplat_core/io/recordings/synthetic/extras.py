@@ -1,4 +1,4 @@
-"""What a synthetic recording can have beyond pictures, masks, depth and poses of the usual scene."""
+"""Optional content of synthetic recordings: other scenes, more ground truth, disturbances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ MOST_WANDER = 0.5
 
 @dataclass(frozen=True)
 class Extras:
-    """Another scene, more ground truth, and what makes a recording harder. Raises InvalidSetting for a value out of its range."""
+    """Optional scene, ground truth and disturbances of a synthetic recording.
+
+    Raises:
+        InvalidSetting: if a value is out of range.
+    """
 
     scene: str = "open"
     """`open`: a sheet of tissue with a tool; `colon`: a tube along its axis."""
@@ -23,13 +27,16 @@ class Extras:
     flow: bool = False
     """Optical flow and scene flow from each frame to the next."""
     tracks: bool = False
-    """Which of the points in `tracks.npy` each frame sees."""
+    """Write the visibility of each point of `tracks.npy` in each frame."""
     behind: bool = False
     """Pictures and depth of the tissue as they are behind the tool, in its shadow, in `behind/`, for evaluation alone."""
     smoke: float = 0.0
     """Strength; 1 is dense."""
     depth_noise_mm: float = 0.0
-    """Standard deviation of the depth's noise at 74 mm; it grows with the square of the distance. The true depth is kept beside it."""
+    """Standard deviation in mm of the depth noise at a distance of 74 mm.
+
+    It grows with the squared distance. The noise-free depth is written as well.
+    """
     exposure_changes: bool = False
     """Let the exposure go up and down."""
 
@@ -64,9 +71,9 @@ class Extras:
 
     @property
     def changes_pictures(self) -> bool:
-        """Whether pictures differ from those of the scene in clear air and usual exposure."""
+        """True if smoke or exposure changes alter the pictures."""
         return self.smoke > 0 or self.exposure_changes
 
 
 CLEAR = Extras()
-"""None of it."""
+"""No optional content."""

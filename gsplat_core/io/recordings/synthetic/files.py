@@ -21,7 +21,7 @@ DEPTH_UNIT_MM = 0.01
 
 @dataclass(frozen=True)
 class FrameRow:
-    """What of a frame goes into files of the whole recording."""
+    """Values of one frame that are collected into files of the whole recording."""
 
     pose_bounds: NDArray[np.float64]
     track: NDArray[np.float32]

@@ -1,10 +1,10 @@
-"""Rendered recordings that are kept, so that the same one is there at once the next time.
+"""On-disk cache of rendered recordings.
 
-    CACHE/                       0700, of this user alone
-      DIGEST.safetensors         image [N, H, W, 3], depth, mask, pose, and right_image of a stereo pair
+    CACHE/                       mode 0700
+      DIGEST.safetensors         image [N, H, W, 3], depth, mask, pose, right_image of stereo pairs
 
-The digest is that of the arguments and of the renderer's own source: another renderer makes other files. What was not used for longest is removed
-when the folder grows beyond its bound; it holds nothing that could not be rendered again.
+The digest covers the arguments and the renderer's source, so a changed renderer invalidates the
+cache. The least recently used files are evicted when the cache exceeds its size limit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PLANES = ("image", "right_image", "depth", "mask", "pose")
 
 
 def default_folder() -> Path:
-    """Where the system keeps such files for this user."""
+    """Return this user's cache folder (`XDG_CACHE_HOME`, default `~/.cache`)."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path("~/.cache").expanduser()) / "intrasplat" / "synthetic"
 
@@ -47,9 +47,18 @@ def kept_recording(
     most_bytes: int = MOST_BYTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> RenderedRecording:
-    """`render_recording`, from the file of an earlier call where there is one. A folder that cannot be used is no error: it is rendered then.
+    """Return `render_recording(asked)`, read from the cache if an earlier call has stored it.
 
-    Raises InvalidSetting as `render_recording`.
+    An unusable cache folder is not an error; the recording is rendered instead.
+
+    Args:
+        asked: parameters of the recording.
+        folder: cache folder; None selects `default_folder()`.
+        most_bytes: size limit of the cache in bytes.
+        progress: callback that receives the numbers of rendered and of all frames.
+
+    Raises:
+        InvalidSetting: as raised by `render_recording`.
     """
     folder = folder or default_folder()
     path = folder / f"{_digest(asked)}{SUFFIX}"
@@ -66,7 +75,7 @@ def kept_recording(
 
 
 def _is_own(folder: Path) -> bool:
-    """Whether nobody else can have put anything there."""
+    """Return True if `folder` belongs to this user and no other user can write to it."""
     try:
         found = folder.lstat()
     except OSError:
@@ -75,7 +84,7 @@ def _is_own(folder: Path) -> bool:
 
 
 def _read(path: Path, asked: Asked) -> RenderedRecording | None:
-    """The recording of a file; None where there is none, or it is damaged, which is removed."""
+    """Read a cached recording; None if it is missing or damaged. Damaged files are removed."""
     try:
         planes = load_file(path)
         frames = [_frame(planes, index, asked.fps) for index in range(asked.frames)]
@@ -98,7 +107,11 @@ def _frame(planes: dict[str, NDArray], index: int, fps: float) -> Frame:
 
 
 def _keep(recording: RenderedRecording, path: Path, most_bytes: int) -> None:
-    """Write a recording's file, unless it is too large by itself; then remove what was not used for longest. Raises OSError."""
+    """Write a recording to the cache unless it exceeds the limit by itself, evicting old files.
+
+    Raises:
+        OSError: if the folder is not writable, or other users can write to it.
+    """
     frames = list(recording)
     named = {name: [getattr(frame, name) for frame in frames] for name in PLANES}
     planes = {name: np.stack(arrays) for name, arrays in named.items() if arrays[0] is not None}

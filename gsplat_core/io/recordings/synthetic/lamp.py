@@ -1,7 +1,8 @@
-"""The scope's own light: two fibres at its tip, in the coordinates of the eye that looks.
+"""Light source of the scope: two fibres at its tip, in the coordinates of the rendering camera.
 
-What arrives falls with the square of the distance to a fibre, with the cosine between surface and light, and away from the middle of the
-beam. Nothing else shines, so near tissue is bright and far tissue dark.
+Irradiance falls with the squared distance to a fibre, with the cosine between surface normal and
+light direction, and with the angle from the beam axis. No other light exists, so near tissue is
+bright and far tissue dark.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
 REFERENCE_MM = 66.0
 """A white surface facing the scope at this distance is exposed as 1."""
 SHADOW_MM = (0.0, -7.0, 0.0)
-"""From where shadows are cast: a little above the fibres, so that a shadow does not hide behind the tool."""
+"""Origin of the shadow rays, above the fibres so that shadows are not hidden behind the tool."""
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """Where the light comes from; lengths in millimetres, in the coordinates of the eye that looks."""
+    """Geometry of the light source in mm, in the coordinates of the rendering camera."""
 
     fibres: Array
     """[2, 3]."""
@@ -32,7 +33,7 @@ class Lamp:
     shadow_from: Array
     """[3]."""
     reference_mm: float = REFERENCE_MM
-    """As REFERENCE_MM: how the picture is exposed."""
+    """Reference distance in mm that sets the exposure."""
 
     @classmethod
     def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM) -> Lamp:
@@ -42,16 +43,27 @@ class Lamp:
         return cls(fibres, np.array([0, 0, 1], np.float32), above, reference_mm)
 
     def seen_from(self, eye_to_view: NDArray[np.float64]) -> Lamp:
-        """The same light in the coordinates of another camera."""
+        """Return the light source in the coordinates of another camera.
+
+        Args:
+            eye_to_view: rigid transform [4, 4] from the current camera to the other one.
+        """
         rotation, translation = eye_to_view[:3, :3], eye_to_view[:3, 3]
         moved = lambda points: (points @ rotation.T + translation).astype(np.float32)
         axis = (rotation @ self.axis).astype(np.float32)
         return replace(self, fibres=moved(self.fibres), axis=axis, shadow_from=moved(self.shadow_from))
 
     def rays_to(self, points: Array, nearest_mm2: float = 0.0) -> list[tuple[Array, Array]]:
-        """For each fibre: unit vectors from points [..., 3] to it, and how much of its light arrives there, before the surface's cosine.
+        """Return, for each fibre, the light direction and irradiance at points [..., 3].
 
-        nearest_mm2: the square of a distance below which nothing becomes brighter.
+        The irradiance excludes the cosine at the surface.
+
+        Args:
+            points: positions in mm.
+            nearest_mm2: squared distance in mm² below which the irradiance is constant.
+
+        Returns:
+            For each fibre, unit vectors to the fibre [..., 3] and irradiance [...].
         """
         found = []
         for fibre in self.fibres:

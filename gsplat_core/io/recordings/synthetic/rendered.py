@@ -21,7 +21,7 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 
 @dataclass(frozen=True)
 class Asked:
-    """What a synthetic recording is asked to be: as the arguments of `synthesize`."""
+    """Parameters of a synthetic recording; the fields match the arguments of `synthesize`."""
 
     frames: int = 48
     width_px: int = 320

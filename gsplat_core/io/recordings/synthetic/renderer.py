@@ -25,7 +25,7 @@ NEWTON_STEPS = 6
 
 @dataclass(frozen=True)
 class Eye:
-    """What one camera sees, and the material point behind each pixel."""
+    """Picture, depth and material coordinates of the pixels of one camera."""
 
     image: NDArray[np.uint8]
     """sRGB [H, W, 3]."""
@@ -52,8 +52,15 @@ def render_eye(
 ) -> Eye:
     """Render one camera's view of the scene at a time.
 
-    lamp: in the camera's coordinates; all cameras see by the same light. air: what is between the scope and the tissue, and how the picture
-    is exposed; None: clear, and exposed as usual. transparent: tools are looked through; they shade the tissue all the same.
+    Args:
+        tissue: deforming tissue.
+        tug: pull of the tool on the tissue.
+        parts: capsules that make up the tool.
+        camera: camera with its pose.
+        time_s: time in seconds.
+        lamp: light source in the camera's coordinates; the same light serves all cameras.
+        air: smoke and exposure; None for clear air and constant exposure.
+        transparent: omit the tools from the picture but keep their shadow on the tissue.
     """
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     ray_x, ray_y = pixel_rays(camera)
@@ -109,7 +116,7 @@ def cast_tissue(
     u, v = tissue.first_guess(camera.position.astype(np.float32), directions)
     for _ in range(NEWTON_STEPS):
         points = tissue.points(u, v, time_s, tug)
-        # Rows of the camera's rotation minus the ray: what a displacement does to the two residuals.
+        # Camera rotation rows minus the ray: Jacobian of the two residuals by displacement.
         residual_x, residual_y, xu, xv, yu, yv = (
             _dot(r[axis], vector) - ray * _dot(r[2], vector)
             for vector_axis in (

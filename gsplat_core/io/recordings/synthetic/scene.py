@@ -19,7 +19,7 @@ from gsplat_core.scene.cameras import Camera
 
 BASELINE_MM = 4.4
 THIRD_MM = (-7.0, -5.0, 3.0)
-"""Where the third camera is, in the left one's coordinates."""
+"""Position of the third camera in the left camera's coordinates, in mm."""
 View = Literal["left", "right", "third"]
 SCENES: dict[str, type[Tissue]] = {"open": Tissue, "colon": Colon}
 
@@ -68,7 +68,7 @@ class SyntheticScene:
     moving: bool
     air: Air | None = None
     sway: Sway = field(default_factory=lambda: USUAL_SWAY)
-    """How a moving scope sways."""
+    """Amplitudes and periods of a moving scope's sway."""
 
     @classmethod
     def from_seed(
@@ -95,7 +95,7 @@ class SyntheticScene:
         return left if view == "left" else left.with_pose(self.left_to(view) @ left.world_to_camera)
 
     def _left_at(self, time_s: float) -> Camera:
-        """At rest, or swaying around a point on the tissue."""
+        """Return the left camera: at rest, or swaying around a fixed point on the tissue."""
         if not self.moving:
             return self.camera
         centre, roll = self.sway.at(time_s, self.tissue.sway_mm)
@@ -103,7 +103,9 @@ class SyntheticScene:
         return self.camera.with_pose(_pose(rotation, centre))
 
     def left_to(self, view: View) -> NDArray[np.float64]:
-        """From the left camera's coordinates to those of another one, which is fixed to the same scope [4, 4]."""
+        """Return the rigid transform [4, 4] from the left camera to another camera of the same
+        scope.
+        """
         if view == "left":
             return np.eye(4)
         if view == "right":
@@ -112,7 +114,13 @@ class SyntheticScene:
         return _pose(_looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.0), centre)
 
     def render(self, time_s: float, view: View = "left", transparent: bool = False) -> Eye:
-        """Render what a camera sees at a time; with `transparent` tools, the tissue behind them in the light that falls on it."""
+        """Render one camera's view at a time.
+
+        Args:
+            time_s: time in seconds.
+            view: camera to render.
+            transparent: omit the tools but keep their shadow on the tissue.
+        """
         reference_mm = self.tissue.exposed_mm
         if view == "third":
             lamp = Lamp.of_eye(BASELINE_MM / 2, reference_mm).seen_from(self.left_to(view))
@@ -123,7 +131,7 @@ class SyntheticScene:
         return render_eye(self.tissue, tug, parts, camera, time_s, lamp, self.air, transparent=transparent)
 
     def tug(self, time_s: float) -> Tug:
-        """How a tool pulls at a time."""
+        """Return the tool's pull on the tissue at a time."""
         return self.motion.tug(time_s) if self.tissue.tools else NO_TUG
 
     def parts(self, time_s: float) -> list[Part]:

@@ -1,4 +1,4 @@
-"""What colour tissue and tool have in the scope's light, in linear radiance, and how a picture is developed from that."""
+"""Shading of tissue and tool in linear radiance, and conversion of radiance to a picture."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def shade_tissue(
     turn = camera.world_to_camera[:3, :3].T.astype(np.float32)
     along_u = np.stack(points.along_u, axis=-1) @ turn
     along_v = np.stack(points.along_v, axis=-1) @ turn
-    # The sheet lies across the view, u to the right and v down: u x v points away from the scope.
+    # The sheet spans the view, u to the right and v down, so u x v points away from the scope.
     smooth = _unit(np.cross(along_v, along_u))
     bumpy = _unit(np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32))
     light_diffuse = np.zeros(u.shape, np.float32)
@@ -49,7 +49,10 @@ def shade_tissue(
 
 
 def _tool_shade(parts: list[Part], camera: Camera, local: Array, lamp: Lamp) -> Array:
-    """How much light reaches the tissue past the tool: sampled on a coarse grid, along the way to the scope."""
+    """Return the share of light [H, W] that passes the tool on its way to the tissue.
+
+    The distance to the tool is sampled along the shadow rays on a coarse pixel grid.
+    """
     step = 3
     rotation = camera.world_to_camera[:3, :3].astype(np.float32)
     coarse = local[::step, ::step].reshape(-1, 3)

@@ -1,20 +1,20 @@
-"""Writing a synthetic recording: the EndoNeRF layout, `recording.json`, and exact ground truth.
+"""Writer of synthetic recordings in the EndoNeRF layout, with `recording.json` and ground truth.
 
 images/frame-000000.color.png        left eye
 images_right/frame-000000.color.png  right eye of the rectified pair, rendered, not warped
 masks/frame-000000.mask.png          255 = tool
-depth/frame-000000.depth.png         16 bit, units of 0.01 mm: the first surface on the ray, tool or tissue
-poses_bounds.npy                     camera-to-world, size, focal length, nearest and farthest depth
-tracks.npy                           float32 [frames, points, 3]: material points of the tissue in the world, in mm
-recording.json                       frame rate, camera, units, seed, and what the files mean
+depth/frame-000000.depth.png         16 bit, units of 0.01 mm: first surface hit, tool or tissue
+poses_bounds.npy                     camera-to-world, size, focal length, near and far depth
+tracks.npy                           float32 [frames, points, 3]: tissue points in the world, mm
+recording.json                       frame rate, camera, units, seed, description of the files
 
-and with `Extras`:
+Additional files, by field of `Extras`:
 
-views.json, views/third/             a camera that training never gets: images, masks and depth
-flow/000000.npy, scene_flow/         float32 [H, W, 2] in pixels and [H, W, 3] in mm, to the next frame
-tracks_seen.npy                      uint8 [frames, points]: whether the left eye sees the point
-behind/images, behind/depth          the left eye's picture and depth through the tool
-true_depth/                          where depth/ has noise
+views.json, views/third/             held-out camera: images, masks and depth
+flow/000000.npy, scene_flow/         float32 [H, W, 2] in px and [H, W, 3] in mm, to the next frame
+tracks_seen.npy                      uint8 [frames, points]: visibility in the left eye
+behind/images, behind/depth          left picture and depth with transparent tools
+true_depth/                          noise-free depth if depth/ has noise
 """
 
 from __future__ import annotations
@@ -92,7 +92,11 @@ def check_arguments(frames: int, width_px: int, height_px: int, fps: float, seed
 
 
 def threads_that_fit(width_px: int, height_px: int) -> int:
-    """How many frames are rendered at once. Raises InvalidSetting where the memory is too small for the scene and one frame."""
+    """Return the number of frames to render concurrently within the available memory.
+
+    Raises:
+        InvalidSetting: if the memory does not suffice for the scene and one frame.
+    """
     texture, frame = SCENE_BYTES * max(width_px, height_px) ** 2, FRAME_BYTES * width_px * height_px
     threads = min(8, os.cpu_count() or 1)
     available = available_bytes()

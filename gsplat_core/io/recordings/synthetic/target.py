@@ -1,4 +1,8 @@
-"""Which folder a synthetic recording may take the place of: a new one, an empty one, or what an earlier call wrote, and nothing more."""
+"""Protection of existing folders from being overwritten by a synthetic recording.
+
+Accepted targets are new folders, empty folders, and folders that contain only files of an earlier
+`synthesize` call.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +54,10 @@ def check_target(target: Path) -> None:
 
 
 def _foreign(target: Path) -> Iterator[str]:
-    """What is in the folder and not of an earlier `synthesize`: everything, unless its description lies there."""
+    """Yield the names of entries that no earlier `synthesize` call wrote.
+
+    Every entry is foreign unless the folder contains a synthetic recording's description.
+    """
     description = target / "recording.json"
     ours = description.is_file() and _made_here(description)
     folders = [target]

@@ -70,7 +70,7 @@ class TissueTexture:
         for cell_mm in cells_mm:
             count = int(np.ceil(2 * HALF_EXTENT_MM / cell_mm)) + 3
             grid = rng.standard_normal((count, count), dtype=np.float32)
-            # The grid's node (1, 1) lies on the sheet's corner whatever the texel is.
+            # The grid's node (1, 1) coincides with the sheet's corner for every texel size.
             scale, shift = self.texel_mm / cell_mm, 1 + 0.5 * self.texel_mm / cell_mm
             affine = np.array([[scale, 0, shift], [0, scale, shift]])
             total += np.float32(weight) * cv2.warpAffine(

@@ -1,7 +1,8 @@
-"""Deforming tissue: a smooth sheet of material points (u, v), where they are at time t, and what colour they have.
+"""Deforming tissue: a smooth sheet of material points (u, v) with motion and colour.
 
-Texture is looked up by (u, v), the point's place on the undeformed sheet, so it moves with the tissue.
-Lengths in millimetres, time in seconds, world axes as the camera's at rest (x right, y down, z away).
+Texture is looked up by (u, v), the point's position on the undeformed sheet, so it moves with the
+tissue. Lengths are in millimetres and times in seconds. World axes are those of the camera at rest
+(x right, y down, z away).
 """
 
 from __future__ import annotations
@@ -44,19 +45,22 @@ class SurfacePoints:
 
 
 class Tissue:
-    """One patient's sheet of tissue at the bottom of an open cavity: shape, breathing and pulse, colour. Deterministic by the generator it
-    is given. Another scene overrides its shape at rest."""
+    """One patient's sheet of tissue at the bottom of an open cavity: shape, breathing, pulse,
+    colour.
+
+    Deterministic for a given random generator. Subclasses override the shape at rest.
+    """
 
     focal_factor = DEFAULT_FOCAL_FACTOR
     """Focal length of the scene's camera over the longer side of its pictures."""
     exposed_mm = REFERENCE_MM
-    """As `lamp.REFERENCE_MM`: how pictures of the scene are exposed."""
+    """Reference distance in mm that sets the exposure; see `lamp.REFERENCE_MM`."""
     looked_at_mm = TISSUE_DISTANCE_MM
-    """How far ahead a moving scope keeps its eye on one point."""
+    """Distance in mm of the point that a moving scope keeps at the centre of its view."""
     sway_mm = (7.0, 4.5, 6.0)
-    """How far a moving scope sways along x, y and z."""
+    """Amplitudes in mm of a moving scope's sway along x, y and z."""
     tools = True
-    """Whether a tool works there."""
+    """True if the scene contains a tool."""
 
     def __init__(self, rng: np.random.Generator, texel_mm: float) -> None:
         wavelengths = np.array([74.0, 58.0, 43.0, 33.0, 26.0, 21.0])
@@ -80,7 +84,9 @@ class Tissue:
         return origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
 
     def _at_rest(self, u: Array, v: Array) -> SurfacePoints:
-        """Where the material points (u, v) are when nothing moves, and the derivatives by u and v."""
+        """Return undeformed positions of the material points (u, v) and their derivatives by u and
+        v.
+        """
         one, zero = np.ones_like(u), np.zeros_like(u)
         bowl = np.float32(-0.0022)
         tilt_u, tilt_v = (np.float32(tilt) for tilt in self._tilt)
@@ -94,7 +100,9 @@ class Tissue:
         return SurfacePoints((u, v, z), (one, zero, z_u), (zero, one, z_v))
 
     def points(self, u: Array, v: Array, time_s: float, tug: Tug) -> SurfacePoints:
-        """Where the material points (u, v) are at a time, and the derivatives by u and v."""
+        """Return positions of the material points (u, v) at a time and their derivatives by u and
+        v.
+        """
         rest = self._at_rest(u, v)
         (x, y, z), (x_u, y_u, z_u), (x_v, y_v, z_v) = rest.position, rest.along_u, rest.along_v
 
@@ -128,7 +136,7 @@ class Tissue:
         )
 
     def position(self, point: tuple[float, float], time_s: float, tug: Tug) -> NDArray[np.float64]:
-        """Where one material point (u, v) is [3]."""
+        """Return the position [3] in mm of one material point (u, v) at a time."""
         u, v = point
         points = self.points(np.array([u], np.float32), np.array([v], np.float32), time_s, tug)
         return np.array([float(component[0]) for component in points.position])

@@ -15,19 +15,22 @@ from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 Array = NDArray[np.floating]
 
 PORT_MM = np.array([58.0, 44.0, 8.0])
-"""Where the shaft enters: to the lower right, beside the scope."""
+"""Entry point of the shaft in mm: to the lower right of the scope."""
 CYCLE_S = 2.4
 HOVER_MM = 13.0
 TRACE_STEPS = 56
 HIT_MM = 2e-3
 NEAREST_MM = 4.0
 HULL_RADIUS_MM = 7.0
-"""Around the shaft's axis: the open jaws, and a margin so that what only grazes a pixel is measured too."""
+"""Radius in mm of the bounding hull around the shaft's axis.
+
+Includes the open jaws and a margin for rays that graze the tool within a pixel.
+"""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A capsule from a to b whose radius changes linearly."""
+    """Capsule from a to b with a linearly varying radius."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]
@@ -38,7 +41,7 @@ class Part:
 
 @dataclass(frozen=True)
 class ToolHits:
-    """What the rays meet."""
+    """Intersections of rays with the tool."""
 
     distance_mm: Array
     """Along the ray; infinity where it meets nothing before the limit."""
@@ -53,7 +56,7 @@ SHAFT, STEEL, RING = 0, 1, 2
 
 
 class ToolMotion:
-    """Where the tool is at a time, and how it pulls: cycles of approach, tug and retreat with a new grasp each."""
+    """Tool motion in cycles of approach, tug and retreat, each with a new grasp point."""
 
     def __init__(self, rng: np.random.Generator, cycles: int) -> None:
         angle = rng.uniform(0, 2 * np.pi, cycles + 1)

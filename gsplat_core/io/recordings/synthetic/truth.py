@@ -1,4 +1,4 @@
-"""Exact motion: where what a pixel shows is in the next frame, and which material points a frame sees."""
+"""Exact optical flow, scene flow and point visibility of a synthetic scene."""
 
 from __future__ import annotations
 
@@ -17,16 +17,23 @@ HIDDEN_MM = 0.5
 
 @dataclass(frozen=True)
 class Motion:
-    """From one frame to the next, NaN where the tool is."""
+    """Motion from one frame to the next; NaN at tool pixels."""
 
     flow: NDArray[np.float32]
-    """Optical flow of the left picture [H, W, 2], pixels: what is at pixel p is at p + flow then."""
+    """Optical flow of the left picture [H, W, 2] in pixels: pixel p moves to p + flow."""
     scene_flow: NDArray[np.float32]
-    """How far the tissue moves in the world [H, W, 3], mm."""
+    """Displacement of the tissue in the world [H, W, 3] in mm."""
 
 
 def motion_to(scene: SyntheticScene, eye: Eye, time_s: float, next_s: float) -> Motion:
-    """What moves how far from a frame that the left camera saw as `eye` to another time."""
+    """Compute the motion of each pixel's tissue point from one time to another.
+
+    Args:
+        scene: synthetic scene.
+        eye: left camera's view at `time_s`.
+        time_s: start time in seconds.
+        next_s: end time in seconds.
+    """
     now, then = (
         np.stack(scene.tissue.points(eye.u, eye.v, at, scene.tug(at)).position, axis=-1) for at in (time_s, next_s)
     )
@@ -40,7 +47,10 @@ def motion_to(scene: SyntheticScene, eye: Eye, time_s: float, next_s: float) -> 
 
 
 def seen_points(scene: SyntheticScene, eye: Eye, time_s: float) -> NDArray[np.bool_]:
-    """Which of the points of `SyntheticScene.track` the left camera sees [points]: inside of its picture, and behind nothing."""
+    """Return the visibility, bool [points], of the tracked points in the left camera.
+
+    A point is visible if it is inside the picture, on the front surface and not behind the tool.
+    """
     pixels, z = projected(scene.camera_at(time_s), scene.track(time_s))
     height, width = eye.u.shape
     column, row = (np.floor(pixels[:, k]).astype(int) for k in (0, 1))
