@@ -61,12 +61,17 @@ class BasisSlot:
 
     @property
     def parameter_count(self) -> int:
-        """Of the rows and bumps in use."""
+        """Number of parameters in the rows and bumps in use."""
         count, bumps = self._used
         return count * bumps * (2 + int(self.field.weights.shape[2]))
 
     def overwrite(self, source: DeformationField) -> bool:
-        """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
+        """Copy another field's bumps and column layout into the slot, and reset unused places to
+        inert.
+
+        Returns:
+            False, with nothing copied, if the field does not fit into the slot.
+        """
         if not isinstance(source, type(self.field)):
             return False
         if source.continuation is not None and self.field.continuation is None:
@@ -78,7 +83,7 @@ class BasisSlot:
         if self._used != (count, columns.count):
             self._use(count, columns.count)
         theirs = (source.centers.data, source.log_widths.data, source.weights.data)
-        # Bumps lie at the first places, or in a ring at all of them.
+        # Bumps occupy the first places, or all places of a ring.
         copy_each(self._in_use, [values[:count, : columns.count] for values in theirs])
         self.field._time_window_s = source.time_window_s
         self.field._columns = replace(columns, places=places)
@@ -97,7 +102,9 @@ class BasisSlot:
         mine.set_clock(self.field.tau, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
-        """Choose the part of every tensor that is written, and make inert what an earlier state had used beyond it."""
+        """Select the region of each tensor to write, and reset the previously used rest
+        to inert.
+        """
         mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
         rows, columns = self._used
         for to, inert in zip(mine, INERT, strict=True):
@@ -142,7 +149,9 @@ class BasisField(BumpTensors):
         return cls(gaussians.count, time_window_s, **architecture)
 
     def deltas(self, time_s: float) -> Tensor:
-        """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
+        """Return the deltas [N, 13] at `time_s`: position, rotation, log-scale, colour;
+        differentiable.
+        """
         past = self.continuation
         bumps_s = time_s if past is None else min(time_s, past.from_s)
         deltas = cast(Tensor, self._ops.basis_field(*self._parameters_of(self.count), self.tau(bumps_s)))
@@ -179,10 +188,17 @@ class BasisField(BumpTensors):
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-8,
     ) -> None:
-        """As `adam_step`, at a `tau` of `self.tau` and with the six `rates` of `BasisRates` in order.
+        """Take the step of `adam_step` at a normalised time.
 
-        Both may be float32 tensors on the field's device ([1] and [6]), which a CUDA graph reads anew at every replay; `gradient`
-        may be [N, 16], the frame path's v_raw.
+        `tau` and `rates` may be float32 tensors on the field's device, which a CUDA graph reads at
+        every replay.
+
+        Args:
+            tau: time as returned by `self.tau`, float or float32 [1].
+            gradient: dL/d(deltas) [N, 13], or the frame path's [N, 16].
+            rates: the six rates of `BasisLearningRates` in order, floats or float32 [6].
+            betas: Adam's decay rates.
+            epsilon: Adam's epsilon.
         """
         count = gradient.shape[0]
         moments = self._moments_in_use().of_first(count)
@@ -214,15 +230,15 @@ class BasisField(BumpTensors):
         return True
 
     def frame_time(self, time_s: float) -> float:
-        """What `frame_deltas` takes for a time: its `tau`."""
+        """Return the argument of `frame_deltas` for a time in seconds: its `tau`."""
         return self.tau(time_s)
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
-        """From the float32 tau [1] on the field's device to what the field adds then, in the frame path's layout [N, 16].
+        """Return a function from tau, float32 [1], to deltas [N, 16], without autograd.
 
-        No autograd graph. The function reads the field's parameters of the moment; they do not depend on `gaussians`, nor is anything
-        computed in another `dtype`. Where rows are reserved, `gaussians` may have all of them: a captured graph then holds while
-        Gaussians join and leave.
+        The function reads the current values of the field's parameters. `gaussians` determines only
+        the row count, and `dtype` is ignored. With reserved rows, `gaussians` may have all of them;
+        a captured graph then stays valid while Gaussians are added and removed.
         """
         count = gaussians.count
         if count not in (self.count, self.weights.shape[0]):
@@ -263,7 +279,12 @@ class BasisField(BumpTensors):
         return True
 
     def move_to_at(self, tau: float | Tensor, deltas: Tensor) -> None:
-        """As `move_to`, at a `tau` of `self.tau`, which may be a float32 tensor [1] on the field's device; `deltas` [N, 13] may be those of all rows."""
+        """Apply `move_to` at a normalised time.
+
+        Args:
+            tau: time as returned by `self.tau`, float or float32 [1] on the field's device.
+            deltas: [N, 13], also for all rows including reserved ones.
+        """
         bumps = (p.data for p in self._parameters_of(deltas.shape[0]))
         self._ops.basis_field_move_to_(*bumps, tau, deltas)
 
@@ -284,15 +305,18 @@ class BasisField(BumpTensors):
         self.add_colours_at(self.tau(time_s), change)
 
     def add_colours_at(self, tau: float | Tensor, change: Tensor) -> None:
-        """As `add_colours`, at a `tau` of `self.tau`, which may be a float32 tensor [1] on the field's device."""
+        """Apply `add_colours` at a normalised time `tau`, float or float32 [1] on the field's
+        device.
+        """
         with torch.no_grad():
             bumps = (p.data for p in self._parameters_of(change.shape[0]))
             self._ops.basis_field_add_colours_(*bumps, tau, change)
 
     def training_tensors(self) -> tuple[Tensor, ...]:
-        """Everything that `adam_step_at` changes: parameters, both moments of each, updates per bump. Made where they are not yet.
+        """Return every tensor that `adam_step_at` changes, allocating missing optimiser state.
 
-        A captured CUDA graph is valid as long as these are the same tensors.
+        These are the parameters, both moments of each, and the update counts per bump. A captured
+        CUDA graph is valid as long as the returned tensors stay the same.
         """
         moments = self._moments_in_use()
         return *(p.data for p in self._whole_parameters()), *moments.first, *moments.second, moments.steps
@@ -308,13 +332,19 @@ class BasisField(BumpTensors):
 
 
 FADING_S = 1.0
-"""Time constant with which the deformation of Gaussians that are in view fades beside what training asks for, where a stream has no end.
-Without it deformations that cancel each other add up: Gaussians become needles, and quality falls as the stream goes on."""
+"""Time constant in seconds with which unneeded deformation of visible Gaussians decays.
+
+Applies to streams without a known end. Without decay, deformations that cancel each other add up:
+Gaussians become needles and image quality falls over time.
+"""
 
 
 @dataclass(frozen=True)
 class BasisLearningRates(FieldRates):
-    """Rates of the bumps' weights by what they move, and of the bumps' centres and widths (`timing`, in bump spacings)."""
+    """Learning rates of the bumps' weights by parameter, and of their timing in bump spacings.
+
+    Timing comprises the bumps' centres and widths.
+    """
 
     means_px: float = 0.1
     quats: float = 5e-3
@@ -336,10 +366,10 @@ def basis_rates(rates: Mapping[str, float]) -> BasisRates:
 
 
 class BasisTraining:
-    """Lazy Adam over the bumps that are active at a step's time.
+    """Lazy Adam (Kingma & Ba 2015) over the bumps that are active at a step's time.
 
-    What the field adds to a raw parameter has that parameter's gradient, so the picture's gradient serves both, and no autograd graph is
-    built.
+    A delta has the same gradient as the raw parameter it is added to. The image gradient thus
+    serves both, and no autograd graph is built.
     """
 
     def __init__(self, field: BasisField) -> None:
@@ -361,7 +391,7 @@ class BasisTraining:
 
 
 class CapturedBasisTraining:
-    """The same in a CUDA graph."""
+    """Trainer of a basis field for captured CUDA graphs."""
 
     rates = 6
     reads_positions = False
@@ -384,7 +414,8 @@ class CapturedBasisTraining:
         return self._field.frame_deltas(gaussians)(time)
 
     def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
-        # A frame whose splats did not fit has a gradient of zero, and bumps of Gaussians without gradient are left alone.
+        # An overflowed frame has a gradient of zero, and Gaussians without gradient keep their
+        # bumps.
         self._field.adam_step_at(time, gradient, rates)
 
     def add_colours(self, change: Tensor, time: Tensor) -> None:
@@ -392,7 +423,11 @@ class CapturedBasisTraining:
 
 
 def new_basis_field(wanted: NewField) -> BasisField:
-    """Columns `spacing_s` apart over the window; online over what `BasisField.cover` keeps ahead, as a ring where only so much is kept."""
+    """Create a basis field with bump columns every `spacing_s` seconds over the window.
+
+    Live, the columns cover the span that `BasisField.cover` keeps ahead. With a limited history
+    they form a ring.
+    """
     spacing_s = wanted.spacing_s
     span_s = COLUMNS_AHEAD * spacing_s if wanted.end_s is None else max(wanted.end_s - wanted.start_s, spacing_s)
     bumps = max(4, round(span_s / spacing_s) + 3)

@@ -46,11 +46,11 @@ class Moments:
         return Moments(first, second, torch.zeros_like(parameters[0], dtype=torch.int32))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Moments:
-        """The same change of rows or columns applied to every tensor."""
+        """Return the moments with `change` applied to every tensor."""
         return Moments([change(t) for t in self.first], [change(t) for t in self.second], change(self.steps))
 
     def of_first(self, count: int) -> Moments:
-        """Those of the first `count` Gaussians, in the same memory."""
+        """Return views of the moments of the first `count` Gaussians."""
         return self if count == self.steps.shape[0] else self.map(lambda tensor: tensor[:count])
 
 
@@ -67,13 +67,13 @@ COLUMNS_AHEAD = 1
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of a field, numbered from the oldest, and where they lie: number n at place (oldest + n) % places.
+    """Columns of a field, numbered from the oldest; number n is stored at (oldest + n) % places.
 
-    Only a ring whose places are all in use starts elsewhere than at place 0.
+    Only a full ring has an oldest column at a place other than 0.
     """
 
     origin_s: float
-    """Where the oldest column was laid out: time is counted in spacings from there."""
+    """Time at which the oldest column was created; times are counted in spacings from it."""
     spacing_s: float
     count: int
     """Columns in use."""
@@ -82,7 +82,7 @@ class Columns:
     oldest: int = 0
     """The place of column 0."""
     is_ring: bool = False
-    """Whether new columns take the places of the oldest ones once all are in use."""
+    """True if new columns replace the oldest ones once all places are in use."""
 
     @property
     def spare(self) -> int:
@@ -90,7 +90,9 @@ class Columns:
         return self.places - self.count
 
     def moved_on(self, added: int) -> tuple[Columns, int]:
-        """With `added` more columns at the head, and how many of the oldest gave up their places for them."""
+        """Return the columns after adding `added` at the head, and the number of
+        replaced columns.
+        """
         passed = max(0, self.count + added - self.places)
         origin_s = self.origin_s + passed * self.spacing_s
         oldest = (self.oldest + passed) % self.places
@@ -130,7 +132,11 @@ def bump_capacity(bumps: int) -> int:
 
 
 def ring_places(history_s: float, spacing_s: float) -> int:
-    """The places of a ring that keeps `history_s` seconds: the bumps that reach into them, and what `BasisField.cover` keeps ahead."""
+    """Return the ring size for a history of `history_s` seconds.
+
+    It includes the bumps that reach into the history and the columns that `BasisField.cover` keeps
+    ahead.
+    """
     return math.ceil(history_s / spacing_s - 1e-6) + int(BUMP_REACH) + COLUMNS_AHEAD + 4
 
 
@@ -140,7 +146,7 @@ def with_columns(tensor: Tensor, added: int, value: float = 0.0) -> Tensor:
 
 
 def columns_to_change(window_s: tuple[float, float], columns: Columns) -> tuple[int, int]:
-    """How many bumps to add at the head and to drop at the tail, so that `columns` cover the window."""
+    """Return the numbers of columns to add at the head and drop at the tail to cover the window."""
     start, end = window_s
     spacing = columns.spacing_s
     last_s = columns.origin_s + (columns.count - 1) * spacing
@@ -150,7 +156,7 @@ def columns_to_change(window_s: tuple[float, float], columns: Columns) -> tuple[
 
 
 BUMPS_PER_SPACING = math.sqrt(math.pi)
-"""What a row of equal bumps of width 1, one per spacing, adds up to at any time (within 0.02 %)."""
+"""Sum at any time of equal bumps of width 1 at unit spacing (within 0.02 %)."""
 
 
 class BumpTensors(DeformationField):
@@ -199,7 +205,7 @@ class BumpTensors(DeformationField):
 
     @property
     def columns(self) -> Columns:
-        """Where the bumps lie in the tensors."""
+        """Layout of the columns in the tensors."""
         return self._columns
 
     def tau(self, time_s: float) -> float:
@@ -207,14 +213,24 @@ class BumpTensors(DeformationField):
         return (self.clamp_time(time_s) - self._columns.origin_s) / self._columns.spacing_s
 
     def deltas(self, time_s: float) -> Tensor:
-        """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
+        """Return the deltas [N, 13] at `time_s`: position, rotation, log-scale, colour;
+        differentiable.
+        """
         raise NotImplementedError
 
     def keep_last(self, history_s: float, fading_s: float = math.inf) -> None:
-        """From now on keep only the last `history_s` seconds before the newest frame deformable.
+        """Keep only the last `history_s` seconds before the newest frame deformable.
 
-        All memory is taken here: new bumps take the places of the oldest ones, and no tensor moves while the stream goes on. Times
-        before the window show its first state. What new bumps hold fades with the time constant `fading_s` where training goes on.
+        All memory is allocated here. New bumps replace the oldest ones, and no tensor moves while
+        the stream continues. Times before the window show its first state. During training, deltas
+        carried into new bumps decay with time constant `fading_s`.
+
+        Args:
+            history_s: deformable past in seconds.
+            fading_s: decay time constant in seconds; infinity for no decay.
+
+        Raises:
+            InvalidInput: if `history_s` is not positive.
         """
         if not (math.isfinite(history_s) and history_s > 0):
             raise InvalidInput(f"history_s must be a positive number of seconds, got {history_s}")
@@ -345,7 +361,7 @@ class BumpTensors(DeformationField):
         return (self._moments,)
 
     def _held(self, time_s: float) -> Tensor:
-        """The deformation [N, 13] that new bumps continue. What training does not need of it must not add up without an end."""
+        """Return the deltas [N, 13] that new bumps continue, decayed where training is active."""
         deltas = self.deltas(time_s).detach()
         if self._fading_s == math.inf or self._moments is None:
             return deltas
@@ -354,7 +370,7 @@ class BumpTensors(DeformationField):
         return torch.where(trained[:, None], deltas * math.exp(-self.spacing_s / self._fading_s), deltas)
 
     def _append_columns(self, added: int, held: Tensor | None) -> int:
-        """Lay out columns at the head; returns how many at the tail they were written over."""
+        """Append columns at the head and return the number of tail columns that they replaced."""
         before = self._columns
         if added > before.spare and not before.is_ring:
             end = before.count + added
@@ -369,7 +385,7 @@ class BumpTensors(DeformationField):
         return passed
 
     def _lay_out(self, places: slice, numbers: range, held: Tensor | None) -> None:
-        """Write new bumps over whatever these places held."""
+        """Initialise new bumps in these places, overwriting previous content."""
         used = self.count
         for tensor, inert in self._tensors_and_fill():
             tensor[:used, places] = inert
@@ -404,7 +420,7 @@ class BumpTensors(DeformationField):
         return self.centers, self.log_widths, self.weights
 
     def _tensors_and_fill(self) -> Iterator[tuple[Tensor, float]]:
-        """Every tensor with rows and columns, and what it holds where there is no bump."""
+        """Yield every tensor with rows and columns, and its value at places without a bump."""
         yield from zip((p.data for p in self._whole_parameters()), INERT, strict=True)
         if self._moments is not None:
             yield from ((moment, 0.0) for moment in (*self._moments.first, *self._moments.second, self._moments.steps))

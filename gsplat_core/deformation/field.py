@@ -1,8 +1,10 @@
-"""Deformation fields: modules that move canonical Gaussians to their state at one time, and the entry of one in the registry.
+"""Deformation fields: modules that deform canonical Gaussians to one time, and their registry
+entry.
 
-`DeformationField` is the module. `FieldKind` tells the program how to make, check, train and rebuild one without naming its class. A field continues with
-a velocity for a short while after the newest frame (`Continuation`). `FieldSlot` holds a copy at fixed addresses, so captured frames stay valid while
-newer states are written into it.
+`DeformationField` is the module. `FieldKind` lets the program create, validate, train and rebuild a
+field without naming its class. `Continuation` extrapolates a field with a velocity shortly after
+the newest frame. `FieldSlot` holds a copy at fixed addresses, so that captured CUDA graphs stay
+valid while newer states are written to it.
 """
 
 from __future__ import annotations
@@ -27,35 +29,44 @@ from gsplat_core.scene.rows import RowMoves
 from gsplat_core.value_ranges import ListOf, NumberIn, ValueRange
 
 DeltasAt = Callable[[Tensor], Tensor]
-"""From a field's own time, [1] on the device, to what the field adds then, [N, 16]."""
+"""Function from a field's normalised time, [1] on the device, to its deltas [N, 16]."""
 
 
 class Continuation(torch.nn.Module):
-    """deltas(t) = deltas(min(t, from)) + velocity * min(max(t - from, 0), horizon).
+    """Extrapolation after the newest frame: deltas(min(t, from)) + velocity * min(max(t - from, 0),
+    horizon).
 
-    `velocity` [N, 16] is what is added per second, in the columns of `gsplat_core.scene.layout`. Its tensors keep their addresses when it
-    is written over, so that a captured graph reads the new values. They are in no `state_dict`.
+    `velocity` [N, 16] is the change of the deltas per second, in the columns of
+    `gsplat_core.scene.layout`. Writing keeps the tensors' addresses, so captured graphs read the
+    new values. The tensors are not part of a `state_dict`.
     """
 
     velocity: Tensor
     clock: Tensor
-    """The same moments for a captured graph, in the field's own time: [start, horizon, seconds per unit]."""
+    """Start, horizon and seconds per unit in the field's normalised time, for captured graphs."""
 
     def __init__(self, rows: int, device: torch.device | str = "cpu") -> None:
         super().__init__()
         self.register_buffer("velocity", torch.zeros(rows, RAW_COLUMNS, device=device), persistent=False)
         self.register_buffer("clock", torch.zeros(3, device=device), persistent=False)
         self.from_s = math.inf
-        """When it starts: the time of the newest frame. Never, at first."""
+        """Start of the extrapolation: time of the newest frame in seconds. Initially never."""
         self.horizon_s = 0.0
-        """How long it goes on; afterwards the field holds what it reached."""
+        """Duration of the extrapolation in seconds; afterwards the deltas stay constant."""
         self._written = 0
         """Rows that may differ from zero."""
 
     def write(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
-        """Continue with `velocity` [n, 16] per second from `from_s` on; n may be less than there are rows, which then stay as they are.
+        """Extrapolate with `velocity` from `from_s` on.
 
-        Raises InvalidInput for more rows than there are, a time that is not finite, or a horizon that is negative.
+        Args:
+            velocity: change per second [n, 16] of the first n rows; n may be below the row count.
+                Other rows stay constant.
+            from_s: start in seconds.
+            horizon_s: duration in seconds.
+
+        Raises:
+            InvalidInput: for too many rows, a non-finite time or a negative horizon.
         """
         count = velocity.shape[0]
         if count > self.velocity.shape[0] or velocity.shape[1:] != (RAW_COLUMNS,):
@@ -81,16 +92,20 @@ class Continuation(torch.nn.Module):
         store_scalars_(self.clock, [torch.finfo(torch.float32).max, 0.0, 0.0])
 
     def past_s(self, time_s: float) -> float:
-        """For how long it has gone on at `time_s`."""
+        """Return the elapsed extrapolation at `time_s`, in seconds."""
         return min(max(time_s - self.from_s, 0.0), self.horizon_s)
 
     def added(self, time_s: float, count: int) -> Tensor | None:
-        """What is added at `time_s` to the first `count` Gaussians, [count, 16]; None for nothing."""
+        """Return the extrapolated part [count, 16] of the deltas at `time_s`; None before the
+        start.
+        """
         past_s = self.past_s(time_s)
         return self.velocity[:count] * past_s if past_s > 0 else None
 
     def captured(self, deltas: DeltasAt) -> DeltasAt:
-        """The field's `deltas` and what is added to them, all queued on the device."""
+        """Return the field's `deltas` plus the extrapolated part, computed on the device without
+        sync.
+        """
 
         def at(tau: Tensor) -> Tensor:
             start, horizon, seconds = self.clock.split(1)
@@ -110,8 +125,15 @@ class Continuation(torch.nn.Module):
 
 
 def displaced(gaussians: Gaussians, deltas: Tensor) -> Gaussians:
-    """The Gaussians with `deltas` added, whole raw rows [N, 16], or [N, 13] without opacity; differentiable in both. What nothing is added to
-    shares memory with what it was."""
+    """Add deltas to the raw parameters of Gaussians; differentiable in both.
+
+    Args:
+        gaussians: canonical Gaussians.
+        deltas: [N, 16] raw rows, or [N, 13] without opacity.
+
+    Returns:
+        Deformed Gaussians. Unchanged tensors share memory with the canonical ones.
+    """
     sh = gaussians.sh
     base = sh[:, :1] + deltas[:, None, COLOUR]
     opacities = gaussians.logit_opacities
@@ -130,14 +152,15 @@ WINDOW_S = ListOf(NumberIn(-1e10, 1e10), 2, 2)
 
 
 class DeformationField(torch.nn.Module):
-    """Base of the deformation fields.
+    """Base class of deformation fields.
 
-    A field knows the window of time that it covers. Times outside the window are clamped to it: the field holds the state of
-    the nearest end. An untrained field is the identity.
+    A field covers a time window. Times outside are clamped, so the field holds the state at the
+    nearest end. An untrained field is the identity.
 
-    A field has to have `kind` and a differentiable `forward`. What it learns are its parameters, float32. One that is made otherwise than by
-    `cls(time_window_s)` overrides `for_gaussians` and `config`; one with state for each Gaussian `count`, `select` and `append`; one whose
-    parameters mean times relative to the window `extend`.
+    Subclasses define `kind` and a differentiable `forward`. Learned values are float32 parameters.
+    Subclasses with constructor arguments beyond `time_window_s` override `for_gaussians` and
+    `config`. Those with per-Gaussian state override `count`, `select` and `append`. Those with
+    parameters tied to times relative to the window override `extend`.
     """
 
     kind: ClassVar[str] = ""
@@ -146,28 +169,35 @@ class DeformationField(torch.nn.Module):
     """The `FieldSlot` for `slot`, made from a field and a number of rows. None: every snapshot of such a field gets memory of its own."""
 
     continues: ClassVar[bool] = False
-    """Whether `continuation` is looked at."""
+    """True if the field applies its `continuation`."""
     takes_colours: ClassVar[bool] = False
-    """Whether `add_colours` is there."""
+    """True if `add_colours` is implemented."""
     takes_positions: ClassVar[bool] = False
-    """Whether `deltas` is there without the Gaussians, and positions can be set by `move_to` and `scale_positions`."""
+    """True if `deltas` does not need the Gaussians, and `move_to` and `scale_positions` exist."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
         self.continuation: Continuation | None = None
-        """What the field does after the newest frame; None: nothing of its own."""
+        """Extrapolation after the newest frame; None for none."""
         self._time_window_s = checked_window(time_window_s)
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> Self:
-        """An untrained field for these Gaussians; `architecture` is what `config` has besides kind and window."""
+        """Create an untrained field for these Gaussians.
+
+        Args:
+            gaussians: canonical Gaussians.
+            time_window_s: first and last time in seconds.
+            architecture: values of `config` other than kind and window.
+        """
         return cls(time_window_s, **architecture)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> Self:
-        """An untrained field of the checked values of `config`, whose tensors are then loaded.
+        """Create an untrained field from validated `config` values; the caller then loads its
+        tensors.
 
-        Called for the "meta" device when a bundle is read: it may look at shapes, not at values.
+        Called on the "meta" device while a bundle is read, so it may use shapes but no values.
         """
         start, end = config["time_window_s"]
         architecture = {name: value for name, value in config.items() if name not in ("kind", "time_window_s")}
@@ -175,7 +205,7 @@ class DeformationField(torch.nn.Module):
 
     @property
     def count(self) -> int | None:
-        """How many Gaussians the field has state for; None when it moves any number of them."""
+        """Number of Gaussians with per-Gaussian state; None for fields without such state."""
         return None
 
     @property
@@ -189,7 +219,11 @@ class DeformationField(torch.nn.Module):
         return self._time_window_s
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the window, or into what its continuation adds to it; InvalidInput when it is not a finite number."""
+        """Clamp `time_s` to the window, extended by the continuation.
+
+        Raises:
+            InvalidInput: if `time_s` is not finite.
+        """
         if not math.isfinite(time_s):
             raise InvalidInput(f"time_s must be finite, got {time_s}")
         start, end = continued_window(self._time_window_s, self)
@@ -200,14 +234,18 @@ class DeformationField(torch.nn.Module):
         raise NotImplementedError
 
     def deltas(self, time_s: float) -> Tensor:
-        """What the field adds at `time_s`, [N, C], the first columns of a raw row. Raises InvalidInput for a kind that needs the Gaussians
-        for that."""
+        """Return the deltas [N, C] at `time_s`: the first C columns of the raw row.
+
+        Raises:
+            InvalidInput: for kinds whose deltas depend on the Gaussians.
+        """
         raise InvalidInput(f"a {self.kind} field says what it adds only for given Gaussians; use forward")
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
-        """A function time_s -> Gaussians for inference: no autograd graph, and what does not depend on time is computed once.
+        """Return a function time_s -> Gaussians for inference, without autograd.
 
-        The field and the Gaussians must not change while it is in use.
+        Parts that do not depend on time are computed once. The field and the Gaussians must not
+        change while the function is in use.
         """
         gaussians = gaussians.detach()
 
@@ -219,7 +257,9 @@ class DeformationField(torch.nn.Module):
 
     @property
     def has_frame_deltas(self) -> bool:
-        """Whether `frame_time` and `frame_deltas` are there for this architecture, so that a CUDA graph can hold the field."""
+        """True if `frame_time` and `frame_deltas` are implemented, so that a CUDA graph can hold
+        the field.
+        """
         return False
 
     def frame_time(self, time_s: float) -> float:
@@ -227,15 +267,25 @@ class DeformationField(torch.nn.Module):
         raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph; use cached")
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
-        """From a time ([1] on the field's device, see `frame_time`) to what the field adds then: [N, 16], the columns of
-        `gsplat_core.ops.frame`. No autograd graph and no wait, so a CUDA graph can hold it. With `dtype` torch.float16 a field may
-        compute in half precision where that is faster; the result is float32.
+        """Return a function from a normalised time to the deltas, for capture in a CUDA graph.
 
-        Raises InvalidInput unless a kind of field overrides it."""
+        The function builds no autograd graph and does not synchronise.
+
+        Args:
+            gaussians: canonical Gaussians.
+            dtype: torch.float16 permits half precision where it is faster; the result is float32.
+
+        Returns:
+            Function from `frame_time` [1] on the field's device to deltas [N, 16] in the columns of
+                `gsplat_core.ops.frame`.
+
+        Raises:
+            InvalidInput: unless the kind of field overrides this method.
+        """
         raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph; use cached")
 
     def config(self) -> dict[str, Any]:
-        """All that `field_from_config` needs to rebuild the field without its tensors, as values of JSON."""
+        """Return the JSON-serialisable values from which `field_from_config` rebuilds the field."""
         return {"kind": self.kind, "time_window_s": list(self._time_window_s)}
 
     def detached_copy(self) -> Self:
@@ -256,7 +306,7 @@ class DeformationField(torch.nn.Module):
         return ()
 
     def extend(self, time_window_s: tuple[float, float]) -> None:
-        """Cover a window that reaches further ahead; what was learned keeps its place in time."""
+        """Extend the window to later times while preserving the learned motion at each time."""
         self._time_window_s = checked_window(time_window_s)
 
     def cover(self, time_s: float, newest_s: float) -> None:
@@ -274,40 +324,76 @@ class DeformationField(torch.nn.Module):
         return False
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
-        """Let what the field adds to the positions of the Gaussians in `rows` be `offsets` [n, T, 3] at the times [T], as nearly as it can, and smooth
-        between them. False, with nothing changed, for a field that cannot do that: here."""
+        """Fit the position deltas of some Gaussians to given trajectories, smooth between the
+        times.
+
+        Args:
+            rows: rows of the Gaussians.
+            times_s: times [T] in seconds.
+            offsets: wanted position deltas [n, T, 3].
+
+        Returns:
+            False, with nothing changed, if the kind of field does not support this, as in this base
+                class.
+        """
         return False
 
     def add_colours(self, time_s: float, change: Tensor) -> None:
-        """Change what the field adds to the colours of degree 0 at `time_s` by `change` [N, 3], and at other times as little as it can. Raises
-        InvalidInput for a kind that cannot: here."""
+        """Change the degree-0 colour deltas at `time_s` by `change` [N, 3], and little at other
+        times.
+
+        Raises:
+            InvalidInput: unless the kind of field overrides this method.
+        """
         raise InvalidInput(f"the colours of a {self.kind} field cannot be set at one time")
 
     def scale_positions(self, factor: Tensor) -> None:
-        """Multiply what the field adds to each position by `factor` [N], at all times. Raises InvalidInput for a kind that cannot: here."""
+        """Multiply each Gaussian's position deltas by `factor` [N] at all times.
+
+        Raises:
+            InvalidInput: unless the kind of field overrides this method.
+        """
         raise InvalidInput(f"a {self.kind} field cannot be scaled")
 
     def scale_rotations(self, factor: Tensor) -> bool:
-        """Multiply what the field adds to each quaternion by `factor` [N], at all times. False, with nothing changed, for a field that
-        cannot do that: here."""
+        """Multiply each Gaussian's quaternion deltas by `factor` [N] at all times.
+
+        Returns:
+            False, with nothing changed, if the kind of field does not support this, as in this base
+                class.
+        """
         return False
 
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
-        """Go on with `velocity` [N, 16] per second after `from_s`, for `horizon_s`; see `Continuation`.
+        """Extrapolate with `velocity` [N, 16] per second for `horizon_s` after `from_s`.
 
-        Raises InvalidInput for a kind of field that does not look at its continuation."""
+        See `Continuation`.
+
+        Raises:
+            InvalidInput: if the kind of field does not support a continuation.
+        """
         raise InvalidInput(f"a {self.kind} field has no continuation")
 
     def select(self, index: Tensor) -> None:
-        """Keep the state of the Gaussians in `index` (int64 positions or a bool mask), in that order. Here there is none."""
+        """Keep the per-Gaussian state selected by `index` (int64 rows or bool mask), in that order.
+
+        A no-op without per-Gaussian state.
+        """
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
-        """Add state for new Gaussians at the end: still, or copied from `parents` (int64 [count]). Here there is none."""
+        """Append per-Gaussian state, static or copied from `parents` (int64 [count]).
+
+        A no-op without per-Gaussian state.
+        """
 
     def smooth_in_time(self, amount: float) -> None:
-        """Move what is learned for each time `amount` (0..1) of the way to the mean of what is learned for the times before and after.
+        """Smooth the time-dependent parameters with those of the neighbouring times.
 
-        In place, outside of any optimiser; for a field of which all frames are known. Here nothing is learned for times.
+        Runs in place and outside of any optimiser, for fields of complete recordings. A no-op for
+        fields without time-dependent parameters.
+
+        Args:
+            amount: weight 0..1 of the neighbours' mean.
         """
 
     def share_motion(self, neighbours: Tensor, amount: float) -> None:
@@ -317,9 +403,10 @@ class DeformationField(torch.nn.Module):
         """
 
     def reserve(self, rows: int) -> bool:
-        """Take the memory for `rows` Gaussians now, so that `append` and `close_gaps` move no tensor until there are more.
+        """Allocate capacity for `rows` Gaussians, so that `append` and `close_gaps` move no tensor.
 
-        False where the field cannot do that. Here it can when there is no state for each Gaussian.
+        Returns:
+            False if the field does not support this. Fields without per-Gaussian state return True.
         """
         return self.count is None
 
@@ -341,7 +428,7 @@ def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:
 
 
 def continued_window(window_s: tuple[float, float], field: DeformationField | None) -> tuple[float, float]:
-    """The window with the time for which the field goes on by its continuation."""
+    """Return the time window extended by the field's continuation."""
     continuation = None if field is None else field.continuation
     if continuation is None or not math.isfinite(continuation.from_s):
         return window_s
@@ -349,14 +436,14 @@ def continued_window(window_s: tuple[float, float], field: DeformationField | No
 
 
 def ops_for(tensor: Tensor, compiled: ModuleType, plain: ModuleType) -> ModuleType:
-    """The compiled ops where there are kernels for such a tensor, their plain-torch versions for other dtypes and devices."""
+    """Select compiled ops for float32 tensors on supported devices, otherwise plain-torch ops."""
     device = tensor.device.type
     has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
     return compiled if has_kernels and tensor.dtype == torch.float32 else plain
 
 
 def count_of(added: int | Gaussians) -> int:
-    """How many Gaussians `append` was asked for."""
+    """Return the number of Gaussians denoted by an `append` argument."""
     count = added if isinstance(added, int) else added.count
     if count < 0:
         raise InvalidInput(f"cannot append {count} Gaussians")
@@ -364,7 +451,7 @@ def count_of(added: int | Gaussians) -> int:
 
 
 class FieldSlot(Protocol):
-    """One copy of a field that is written over."""
+    """Reusable storage for a copy of a field."""
 
     @property
     def field(self) -> DeformationField:
@@ -387,7 +474,7 @@ def copy_each(to: list[Tensor], values: list[Tensor]) -> None:
 
 
 class WholeFieldSlot:
-    """For a field without tensors per Gaussian: its tensors never change their shapes."""
+    """Slot for fields without per-Gaussian tensors, whose shapes never change."""
 
     def __init__(self, source: DeformationField, rows: int) -> None:
         self.field = source.detached_copy()
@@ -408,7 +495,10 @@ class WholeFieldSlot:
 
 
 class NewestState(DeformationField):
-    """For Gaussians as they are at the newest time: earlier times show that one, later ones its continuation. It is not trained or saved."""
+    """Field that always returns the newest state, plus its continuation.
+
+    It is neither trained nor saved.
+    """
 
     kind = "newest state"
     continues = True
@@ -428,10 +518,13 @@ class NewestState(DeformationField):
 
 @dataclass(frozen=True)
 class FieldRates:
-    """Adam's learning rates of one kind of field: a frozen dataclass of numbers that derives from this one.
+    """Base of frozen dataclasses with the Adam learning rates of one kind of field.
 
-    A rate whose name ends in `_px` moves positions and is in pixels of the training image; the others are in the units of what they train.
-    Raises InvalidSetting when a rate is not in 0..10.
+    A rate with a name ending in `_px` applies to positions and is in pixels of the training image.
+    Other rates are in the units of their parameters.
+
+    Raises:
+        InvalidSetting: if a rate is not in 0..10.
     """
 
     def __post_init__(self) -> None:
@@ -448,7 +541,7 @@ class FieldRates:
 
 @dataclass(frozen=True)
 class OneRate(FieldRates):
-    """The same rate for every parameter of a field."""
+    """Common learning rate of all parameters of a field."""
 
     parameters: float = 5e-3
 
@@ -468,7 +561,7 @@ Field = TypeVar("Field", bound=DeformationField)
 
 @dataclass(frozen=True)
 class NewField:
-    """What a reconstruction asks of a new field."""
+    """Request of the reconstruction for a new field."""
 
     gaussians: Gaussians
     """The canonical Gaussians, on the device that will train."""
@@ -479,53 +572,75 @@ class NewField:
     spacing_s: float
     """The shortest time, in seconds, within which motion has to change its course."""
     history_s: float | None = None
-    """How much of the past, in seconds, has to stay deformable online; None: all of it."""
+    """Length of the past, in seconds, that stays deformable in a live session; None for
+    all of it.
+    """
 
     @property
     def time_window_s(self) -> tuple[float, float]:
-        """From the first frame to the last, or online to one spacing after the first."""
+        """Time window: from the first frame to the last, or live to one spacing after the first."""
         return self.start_s, self.start_s + self.spacing_s if self.end_s is None else self.end_s
 
 
 class FieldTraining(Protocol):
-    """How a field takes part in a training step on any device: `deform`, then `update` with the gradient at the deformed Gaussians."""
+    """Training of a field: `deform`, then `update` with the gradient at the deformed Gaussians."""
 
     def deform(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, outside of any autograd graph."""
 
     def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
-        """One optimiser step of the field.
+        """Take one optimiser step of the field.
 
         Args:
-            gradients: of the loss, for each raw tensor of the Gaussians that the last `deform` returned.
-            rates: `FieldRates.scaled` of the field's kind.
+            gradients: loss gradients of the raw tensors of the Gaussians returned by the last
+                `deform`.
+            rates: learning rates from `FieldRates.scaled`.
 
         Returns:
-            The gradients of the canonical Gaussians; None or a missing name for a tensor that has none.
+            Gradients of the canonical Gaussians; None or a missing name for a tensor without
+                gradient.
         """
 
 
 class CapturedTraining(Protocol):
-    """How a field takes part in a training step on a GPU that is captured as a CUDA graph; nothing of it waits for the device."""
+    """Training of a field inside a captured CUDA graph; no method synchronises with the device."""
 
     rates: int
-    """How many learning rates `update` takes."""
+    """Number of learning rates taken by `update`."""
     reads_positions: bool
-    """Whether the deltas depend on the canonical positions, which then get a gradient through the field too."""
+    """True if the deltas depend on the canonical positions, whose gradient then
+    includes the field.
+    """
 
     def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
-        """From `FieldRates.scaled` to the values that `update` takes, in its order."""
+        """Arrange the learning rates of `FieldRates.scaled` in the order that `update` expects."""
 
     def tensors(self) -> Sequence[Tensor]:
-        """Every device tensor that a step reads or changes. The same sequence object again says that none was replaced."""
+        """Return every device tensor that a step reads or changes.
+
+        Returning an identical sequence object signals that no tensor was replaced.
+        """
 
     def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor | None:
-        """What the field adds at the time in the device scalar `time`: [N, 16], raw parameters; None for nothing."""
+        """Return the deltas [N, 16] of the raw parameters at a time; None for no deformation.
+
+        Args:
+            gaussians: canonical Gaussians.
+            time: normalised time, scalar on the device.
+        """
 
     def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
-        """One optimiser step for dL/d(deltas) `gradient` [N, 16]; none where the frame's `status` says that splats were left out.
+        """Take one optimiser step, skipped if `status` reports that splats were left out.
 
-        A field that reads positions adds their part of the gradient to the first three columns of `gradient`.
+        A field that depends on positions adds its part of the gradient to columns 0 to 2 of
+        `gradient`.
+
+        Args:
+            gradient: dL/d(deltas) [N, 16].
+            time: normalised time, scalar on the device.
+            rates: learning rates in the order of `rate_values`.
+            step: step number.
+            status: frame status.
         """
 
     def add_colours(self, change: Tensor, time: Tensor) -> None:
@@ -534,24 +649,24 @@ class CapturedTraining(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class FieldKind(Generic[Field]):
-    """One kind of deformation field.
+    """Registry entry of a kind of deformation field.
 
-    The smallest one is a class with a differentiable `forward`; it is trained by autograd on every device.
+    The minimum is a class with a differentiable `forward`, trained by autograd on every device.
     """
 
     field: type[Field]
-    """Its class. `field.kind` is its name in the registry, in reports and in a bundle's manifest."""
+    """Class of the field. `field.kind` is the name in the registry, in reports and in manifests."""
     new: Callable[[NewField], Field] | None = None
     """Makes an untrained field, which is the identity, for a reconstruction; None: `field.for_gaussians` without an architecture.
     torch's random numbers are seeded when it is called."""
     config: Mapping[str, ValueRange] = dataclasses.field(default_factory=dict)
-    """The range of every value that `DeformationField.config` has besides kind and time window."""
+    """Permitted range of each `DeformationField.config` value other than kind and time window."""
     rates: FieldRates = dataclasses.field(default_factory=OneRate)
     """The default learning rates; others must be of the same type."""
     training: Callable[[Field], FieldTraining] | None = None
-    """What trains such a field; None: autograd through its `forward`."""
+    """Factory of the trainer; None trains by autograd through `forward`."""
     captured_training: Callable[[Field], CapturedTraining | None] | None = None
-    """What trains such a field in a CUDA graph. None, or an answer of None: as on the CPU."""
+    """Factory of the trainer for CUDA graphs. Without a trainer, training runs as on the CPU."""
 
     @property
     def name(self) -> str:

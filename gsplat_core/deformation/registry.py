@@ -18,11 +18,15 @@ FIELDS: Registry[FieldKind[Any]] = Registry(
         "hexplane": "gsplat_core.deformation.hexplane:KIND",
     },
 )
-"""Kinds by the names that a user can choose; `auto` stands for one of the others."""
+"""Kinds of deformation fields by the names that a user can choose; `auto` is an alias."""
 
 
 def kind_of(name: object) -> FieldKind[Any]:
-    """The kind whose own name is `name`: what a field or a manifest calls itself, so not `auto`. Raises InvalidSetting."""
+    """Return the kind with this canonical name, as stated by a field or manifest; not `auto`.
+
+    Raises:
+        InvalidSetting: if the name is unknown.
+    """
     if not isinstance(name, str) or name not in FIELDS or FIELDS[name].name != name:
         known = [each for each in FIELDS if FIELDS[each].name == each]
         raise InvalidSetting(f"unknown deformation field {name!r:.80}; known are {', '.join(known)}")

@@ -13,7 +13,10 @@ from gsplat_core.threads import one_thread
 ROWS_AT_ONCE = 1 << 14
 """Bounds the memory for differences."""
 BEND = 0.05
-"""How much a course that bends from bump to bump costs, beside being off by as much at one time: what is measured at each frame is noisy."""
+"""Weight of the penalty on bending between bumps, relative to the squared error at one time.
+
+Suppresses the noise of per-frame measurements.
+"""
 
 
 def towards_neighbours_(values: Tensor, amount: float) -> None:

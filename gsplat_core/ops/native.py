@@ -1,4 +1,7 @@
-"""Loads the compiled core once, the CUDA kernels where they were built, and says what to do when it is not there."""
+"""Loader of the compiled core and, if built, of the CUDA kernels.
+
+Reports the remedy if a library is missing.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +37,12 @@ def load_native() -> None:
 
 
 def load_cuda() -> str | None:
-    """Register the CUDA kernels too, where they were built; otherwise returns why not, in a sentence. Touches no GPU.
+    """Register the CUDA kernels if they were built. Does not access a GPU.
 
-    They are an addition: whatever keeps them from loading leaves the CPU's as they are.
+    A failure does not affect the CPU kernels.
+
+    Returns:
+        None on success, otherwise the reason as a sentence.
     """
     if not CUDA_LIBRARY_PATH.exists():
         return "not built (on a machine with an NVIDIA GPU `make cuda` in the repository builds them)"
@@ -74,4 +80,4 @@ def cuda_refusal(device: int = 0) -> str | None:
 
 load_native()
 CUDA_MISSING = load_cuda()
-"""Why the CUDA kernels are not there; None when they are."""
+"""Reason why the CUDA kernels are unavailable; None if they are loaded."""

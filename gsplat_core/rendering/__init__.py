@@ -1,1 +1,1 @@
-"""From Gaussians to pictures."""
+"""Rendering of Gaussians to pictures."""

@@ -30,12 +30,13 @@ from gsplat_core.scene.snapshots import Snapshot
 
 
 class AlphaRenderer:
-    """Deforms, projects, sorts and blends.
+    """Renderer that deforms, projects, sorts and alpha-blends Gaussians (Kerbl et al. 2023).
 
-    On a GPU a frame is one CUDA graph. A snapshot is rendered where it lies, by a graph that is captured once for its slot; a `Model` has a
-    graph of its own, which is captured when it is prepared. On the CPU, and for a field that has no fused frame path, the model is deformed
-    by the field's own function and rendered by `gsplat_core.render`. Outputs of `Surface` beyond the standard ones (`ray_depth`, `normals`,
-    `median_depth`, `spread`, `confidence`) take much longer than a picture, on either.
+    On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once
+    for the slot. A `Model` has a graph of its own, captured by `prepare`. On the CPU, and for
+    fields without a fused frame path, the field's own function deforms the model and
+    `gsplat_core.render` renders it. `Surface` outputs (`ray_depth`, `normals`, `median_depth`,
+    `spread`, `confidence`) take much longer than a picture on any device.
     """
 
     capabilities = Capabilities(
@@ -53,9 +54,9 @@ class AlphaRenderer:
         self._background = background
         self._model: Model | Snapshot | None = None
         self._frames: FrameRenderer | None = None
-        """What renders the prepared model as a CUDA graph; None: the model is rendered by single launches."""
+        """CUDA-graph renderer of the prepared model; None renders it by single launches."""
         self._by_slot: dict[int, tuple[tuple[int, int], FrameRenderer]] = {}
-        """For each slot's number: which slot and layout the graph was captured for, and the graph's owner."""
+        """Graph renderer by slot number, with the slot and layout for which it was captured."""
 
     def prepare(self, model: Model | Snapshot) -> None:
         """See `Renderer.prepare`. Raises InvalidInput for a model on another device."""
@@ -142,7 +143,9 @@ class _FrameInFlight:
 def _with_surface(
     model: Model, camera: Camera, time_s: float, background: Tensor | None, asked: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """By single launches on a GPU, too: these outputs are for looking closely, not for every frame of a stream."""
+    """Render surface outputs by single launches, also on a GPU; they are not meant for
+    live frames.
+    """
     outputs = {**model.surface(time_s, camera)._asdict(), **model.render(time_s, camera, background)._asdict()}
     return {name: outputs[name] for name in asked}
 

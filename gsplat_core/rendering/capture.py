@@ -32,12 +32,14 @@ class GraphMemory:
 
 
 class CapturedSequence(Generic[Result]):
-    """The launches of `sequence()` as one CUDA graph.
+    """CUDA graph of the launches of `sequence()`.
 
-    What the sequence allocates stays at the same addresses, so `results` are the same tensors every time, overwritten by every replay.
-    Whatever changes between replays must be read from device memory that the sequence refers to.
+    Allocations of the sequence keep their addresses. `results` are the same tensors at every
+    replay, which overwrites them. Inputs that change between replays must be in device memory
+    referenced by the sequence.
 
-    Kernels cannot be loaded during a capture: the sequence must have run before, or `warm_up` runs it once, with all its effects.
+    Kernels cannot be loaded during a capture. The sequence must have run before, or `warm_up` runs
+    it once with all its side effects.
     """
 
     def __init__(
@@ -65,7 +67,8 @@ def _capture(
         current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
         side.wait_stream(current)
         with torch.cuda.stream(side):
-            graph.capture_begin(pool=pool, capture_error_mode="thread_local")  # other threads may go on allocating
+            # thread_local lets other threads allocate
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
                 results = sequence()
             finally:

@@ -1,7 +1,7 @@
-"""From Gaussians to images in four steps, written once: project, colour, list by tile, blend.
+"""Rendering pipeline in four steps: project, colour, bin into tiles, blend.
 
-`rasterization()` and training go this way with the compiled operations, the tests' oracle with those in plain torch. On CUDA
-`single_call.py` does the same in one native call.
+`rasterization()` and training run it with the compiled operations, tests with those in plain torch.
+On CUDA, `single_call.py` does the same in one native call.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from gsplat_core.rendering.settings import CONSTANTS, RenderSettings
 
 @dataclass(frozen=True)
 class StepOperations:
-    """One implementation of the steps, under gsplat's names and signatures."""
+    """One implementation of the pipeline's operations, with gsplat's names and signatures."""
 
     fully_fused_projection: Callable[..., Any]
     spherical_harmonics: Callable[..., Tensor]
     bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
     rasterize_to_pixels: Callable[..., tuple[Tensor, ...]]
-    """Colours, alphas, and whatever else the caller of `render_splats` wants to have of it."""
+    """Returns colours, alphas, and further values that `render_splats` passes on to its caller."""
     zero_gradients_stay_zero: bool = False
-    """On CUDA a gradient of zero stays zero in the backward operations, whatever it would be multiplied with."""
+    """True if a zero gradient stays zero in backward operations, even times NaN, as on CUDA."""
 
 
 class Geometry(NamedTuple):
@@ -46,21 +46,24 @@ class Geometry(NamedTuple):
 
 
 class RenderedSplats(NamedTuple):
-    """The images and what was computed on the way. A row is a Gaussian in a camera, or a visible one where packed."""
+    """Rendered images and intermediate results.
+
+    A row is a pair of Gaussian and camera, or a visible pair if packed.
+    """
 
     image: Tensor
     """[..., C, H, W, channels]: colours, then the sum of weight and z where depth is rendered."""
     alphas: Tensor
     rows: DenseProjection | PackedProjection
     channels: Tensor
-    """What was blended, [rows, channels]."""
+    """Blended values, [rows, channels]."""
     opacities: Tensor
     """[rows], with the compensation for antialiasing."""
     tiles_per_gauss: Tensor
     flatten_ids: Tensor
     isect_offsets: Tensor
     rest: tuple[Tensor, ...]
-    """What `rasterize_to_pixels` returned beyond image and alphas."""
+    """Values returned by `rasterize_to_pixels` after image and alphas."""
 
 
 Coloring = Callable[[DenseProjection], tuple[Tensor, DenseProjection]]

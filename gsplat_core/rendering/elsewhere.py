@@ -1,8 +1,10 @@
-"""A model as it looks from where the scope never was: highlights lie elsewhere than the scope's eye saw them.
+"""Relocation of highlights for cameras away from the scope.
 
-The light rides with the scope. A model shows from everywhere what the scope's left eye saw, highlights included; but those move with the eye. How each Gaussian's colour
-changes with the direction between light and eye is learned from what the model itself shows over time (`sheen`), because tissue that breathes and a scope that moves turn the
-surface to and fro. Worked out on the host, the same for every device.
+The light moves with the scope. A model reproduces the colours seen by the scope's left eye,
+including highlights, from any viewpoint; true highlights depend on the viewpoint. The dependence of
+each Gaussian's colour on the half-way direction is learned from the model's own colours over time
+(`sheen`), because breathing tissue and a moving scope vary that direction. The computation runs on
+the host and is identical for all devices.
 """
 
 from __future__ import annotations
@@ -28,16 +30,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.floating]
 
 SAME_PLACE = 1e-3
-"""A camera so near to the scope's eye, as a share of the distance to the tissue, sees what that eye sees."""
+"""Distance from the scope's eye, as a share of the tissue distance, below which views are equal."""
 BEHIND = 1.1
-"""What is farther away than what a picture shows by this factor is not seen in it."""
+"""Ratio of a point's depth to the rendered depth above which the point counts as occluded."""
 LEAST_TIMES = 4
-"""With fewer looks nothing is learned."""
+"""Minimum number of observation times for learning."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What the scope's eye saw of each Gaussian at one time."""
+    """Observation of each Gaussian by the scope's eye at one time."""
 
     halves: Array
     """[N, 2]."""
@@ -65,7 +67,11 @@ class SeenFromElsewhere:
 
     @classmethod
     def of(cls, model: Model) -> SeenFromElsewhere | None:
-        """None where nobody knows where the scope was, where nothing moves, and for cameras that are no pinholes."""
+        """Create the predictor for a model.
+
+        Returns:
+            None without scope trajectory, without deformation, or for cameras other than pinhole.
+        """
         path = model.scope_path
         if path is None or len(path.times_s) < LEAST_TIMES or model.field is None:
             return None
@@ -77,7 +83,10 @@ class SeenFromElsewhere:
         return self._sheen.skill
 
     def at(self, camera: Camera, time_s: float) -> Gaussians:
-        """The Gaussians at a time, with the colours that `camera` sees; those of the left eye where it is there."""
+        """Return the Gaussians at a time with the colours that `camera` sees.
+
+        For a camera at the position of the scope's left eye, these are the colours of that eye.
+        """
         now = self._model.at(time_s)
         points, light, eye = _host(now.means), self._path.centre_at(time_s), camera.position
         if np.linalg.norm(eye - light) <= SAME_PLACE * np.median(np.linalg.norm(points - light, axis=1)):
@@ -89,7 +98,9 @@ class SeenFromElsewhere:
         return replace(now, sh=sh, right_sh=None)
 
     def _look(self, number: int) -> Look:
-        """At one of the path's times; in the picture of the model from where the scope was then."""
+        """Render the model from the scope's pose at one time of its path and sample
+        each Gaussian.
+        """
         camera = self._model.camera.with_pose(self._path.pose(number))
         now = self._model.at(self._path.times_s[number])
         with torch.no_grad():

@@ -54,14 +54,16 @@ class LaunchedFrame:
 
 
 class FrameRenderer:
-    """Renders one set of Gaussians again and again: new camera, new time, changed parameters, same number of Gaussians.
+    """Repeated renderer of one set of Gaussians with changing camera, time and parameters.
 
-    `render` queues a frame and returns at once; the host never waits for the device. The tile lists have a fixed capacity. A frame that
-    exceeds it says so in its status, and `LaunchedFrame.result` renders it again with more, so that no finished picture lacks a splat.
+    The number of Gaussians is fixed. `render` enqueues a frame and returns without waiting for the
+    device. Tile lists have a fixed capacity. A frame that exceeds it reports the overflow in its
+    status, and `LaunchedFrame.result` renders it again with a larger capacity. No finished picture
+    lacks a splat.
 
-    The tensors of the Gaussians and of the field are read where they are: changed in place, they change the next frame. Exceptions are the
-    values that are computed once, when the renderer is made: harmonics in half precision and what a HexPlane field computes ahead.
-    With `recompute` they are computed in every frame.
+    Tensors of the Gaussians and the field are read in place, so in-place changes affect the next
+    frame. Exceptions are values computed at construction: half-precision spherical harmonics and
+    the features precomputed by a HexPlane field. With `recompute` they are computed in every frame.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class FrameRenderer:
         self.gaussians = gaussians.detach()
         self.field = field
         self.capacity = TileListCapacity.initial(gaussians.count, camera.width_px, camera.height_px)
-        """Of the tile lists; may be replaced between frames."""
+        """Capacity of the tile lists; may be replaced between frames."""
         self._camera = camera
         self._background = background
         self._dtype = torch.float32 if precision == "fp32" else torch.float16

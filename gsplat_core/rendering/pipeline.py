@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.rasterization.rasterization import Rasterized
 
 Meta = dict[str, Any]
-"""What was computed on the way, under gsplat's names."""
+"""Intermediate results under gsplat's names."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Operations(StepOperations):
         return image, splats.alphas, meta
 
     def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
-        """The colours and alphas of `rasterization`, without what it computes for `meta` alone."""
+        """Return colours and alphas as `rasterization`, without values that only `meta` needs."""
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
         if rendered is not None:
             return rendered.image, rendered.alphas
@@ -172,7 +172,7 @@ def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderS
 
 
 def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, RenderedSplats]:
-    """Colours and depth [..., C, H, W, X], and what was computed on the way."""
+    """Return colours and depth [..., C, H, W, X], and the intermediate results."""
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
     batch_dims, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
     if covars is not None:
@@ -233,7 +233,10 @@ def _check_shapes(
     backgrounds: Tensor | None,
     settings: RenderSettings,
 ) -> tuple[tuple[int, ...], int]:
-    """Batch dimensions and number of Gaussians; what the projection checks is left to it."""
+    """Check shapes and return the batch dimensions and number of Gaussians.
+
+    The projection checks the remaining arguments.
+    """
     if means.dim() < 2 or means.shape[-1] != 3:
         raise InvalidInput(f"means must be [..., N, 3], got {list(means.shape)}")
     if viewmats.dim() < 3:

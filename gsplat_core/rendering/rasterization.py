@@ -43,7 +43,8 @@ _REQUIRED = [name for name in _POSITIONAL if _PARAMETERS[name].default is inspec
 
 @functools.wraps(_operations.rasterization)
 def rasterization(*arguments: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    # Its documentation and signature are those of `Operations.rasterization`, whose name Python would put into errors about arguments.
+    # Signature and docstring are copied from `Operations.rasterization`. Calling that method
+    # directly would put its name into argument errors.
     unknown = options.keys() - _PARAMETERS.keys()
     if (
         unknown
@@ -79,7 +80,7 @@ SMALLEST_SCENE = 1 << 14
 
 
 class RenderOutput(NamedTuple):
-    """What one camera sees; differentiable with respect to the Gaussians."""
+    """Rendered outputs of one camera; differentiable with respect to the Gaussians."""
 
     image: Tensor
     """Colours [H, W, 3], 0 to 1 for an ordinary scene (not clamped above)."""

@@ -14,7 +14,11 @@ RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.
 
 
 def check_renderer(name: str, device: torch.device | str = "cpu", precision: str = "fp32") -> None:
-    """Raises InvalidSetting where there is no renderer of the name, or where it does not run on the device or in the precision."""
+    """Check that a renderer exists and supports the device and precision.
+
+    Raises:
+        InvalidSetting: otherwise.
+    """
     check_choice(name, RENDERERS[name].capabilities, torch.device(device), precision)
 
 

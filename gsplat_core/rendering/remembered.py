@@ -1,4 +1,4 @@
-"""How much of a picture is remembered: tissue that was there when the camera saw it last, and that it does not see now."""
+"""Share of a picture that is remembered: tissue seen earlier but not visible to the camera now."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from gsplat_core.scene.model import Model
 
 
 def share_of(gaussians: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
-    """How much of what each pixel shows, [H, W] from 0 to 1, is of the chosen Gaussians, bool [N]; 0 where nothing is shown."""
+    """Return each pixel's share of chosen Gaussians in the blended weight.
+
+    Args:
+        gaussians: all Gaussians.
+        chosen: bool [N].
+        camera: camera of the picture.
+
+    Returns:
+        [H, W] in 0..1; 0 where nothing is rendered.
+    """
     require_shape("chosen", chosen, (gaussians.count,), "[N]")
     colours = (chosen.to(gaussians.dtype) - 0.5) / SH_C0
     with torch.no_grad():
@@ -24,9 +33,16 @@ def share_of(gaussians: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
 
 
 def remembered_share(model: Model, camera: Camera, time_s: float) -> Tensor:
-    """How much of what each pixel shows from any camera, [H, W] from 0 to 1, nobody saw when that was looked at last.
+    """Return each pixel's share of Gaussians that the scope did not see at the last visibility
+    update.
 
-    0 everywhere for a model of which that is not known.
+    Args:
+        model: model with `unseen_s`.
+        camera: any camera.
+        time_s: time in seconds.
+
+    Returns:
+        [H, W] in 0..1; 0 everywhere if the model has no visibility data.
     """
     gaussians = model.at(time_s)
     if model.unseen_s is None:

@@ -1,4 +1,4 @@
-"""What every renderer of published models is, whichever way it turns Gaussians into pictures."""
+"""Interface of all renderers of published models."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from gsplat_core.scene.snapshots import Snapshot
 
 Precision = Literal["fp32", "fp16"]
 STANDARD_OUTPUTS = RenderOutput._fields
-"""What a frame has unless other outputs are asked for: `image`, `alpha`, `depth`."""
+"""Default outputs of a frame: `image`, `alpha`, `depth`."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a renderer can do; a program reads it before it makes one."""
+    """Features of a renderer, available before it is created."""
 
     outputs: tuple[str, ...]
     """Names of the outputs, `image` among them. Those of `RenderOutput` have its shapes and units; a renderer documents its others."""
     precisions: Mapping[str, tuple[Precision, ...]]
     """The devices (`cpu`, `cuda`) on which it runs, each with its precisions, the exact one first."""
     differentiable: bool
-    """Whether a frame's outputs have gradients with respect to the model's tensors."""
+    """True if the outputs have gradients with respect to the model's tensors."""
     deterministic: bool
-    """Whether the same model, camera and time give the same bits on the same device."""
+    """True if equal model, camera and time give bit-identical results on one device."""
     reads_snapshots: bool = False
-    """Whether `prepare` takes a `Snapshot`; where not, it is given an immutable `Model` copied from it."""
+    """True if `prepare` accepts a `Snapshot`; otherwise it receives an immutable `Model` copy."""
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -43,12 +43,15 @@ class Capabilities:
 
 
 class PendingFrame(Protocol):
-    """A frame that was asked for; on a GPU it may still be under way. It holds what it is rendered from until it is forgotten."""
+    """Requested frame, on a GPU possibly still in flight; holds its source data while
+    referenced.
+    """
 
     def outputs(self) -> Mapping[str, Tensor]:
-        """Every output that `render` was asked for, by name, whole; waits for it on a GPU.
+        """Return the requested outputs by name; waits for the frame on a GPU.
 
-        The memory is the renderer's and may be used again for the next frame of the renderer: copy what is to last.
+        The renderer owns the memory and may reuse it for its next frame. Copy outputs that must
+        persist.
         """
 
     def result(self) -> RenderOutput:
@@ -66,10 +69,20 @@ class Renderer(Protocol):
     def __init__(
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
     ) -> None:
-        """`camera` gives size and projection of every frame; `background` [3] is what shows where nothing is, black when None."""
+        """Create a renderer.
+
+        Args:
+            camera: size and projection of every frame.
+            device: device of the model's tensors.
+            precision: arithmetic precision.
+            background: colour [3] behind the Gaussians; None for black.
+        """
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """Make `model` what the next frames show. What does not depend on camera and time is done here; the host does not wait."""
+        """Set the model of the following frames.
+
+        Work that does not depend on camera and time is done here, without host synchronisation.
+        """
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
         """Queue the picture of the prepared model at `time_s`, clamped to the model's time window, on the current stream.
@@ -80,7 +93,7 @@ class Renderer(Protocol):
 
 
 class RendererKind(Protocol):
-    """What a name in the registry stands for: usually the renderer's class."""
+    """Registry entry of a renderer, usually its class."""
 
     @property
     def capabilities(self) -> Capabilities:
@@ -99,7 +112,7 @@ class FinishedFrame:
     _outputs: Mapping[str, Tensor]
 
     def outputs(self) -> Mapping[str, Tensor]:
-        """What the frame was made of."""
+        """Outputs of the frame."""
         return self._outputs
 
     def result(self) -> RenderOutput:
@@ -108,7 +121,7 @@ class FinishedFrame:
 
 
 def standard_outputs(outputs: Mapping[str, Tensor]) -> RenderOutput:
-    """The three standard outputs of those by name; zeros for what is not there. Needs `image`."""
+    """Return the three standard outputs, with zeros for missing ones; `image` is required."""
     image = outputs["image"]
     unknown = image.new_zeros(image.shape[:2])
     return RenderOutput(image, outputs.get("alpha", unknown), outputs.get("depth", unknown))

@@ -26,7 +26,7 @@ TILE_SIZE = 16
 
 
 class Constants(NamedTuple):
-    """What differs between gsplat's versions."""
+    """Constants that differ between gsplat versions."""
 
     max_alpha: float
     """The most opaque that a splat can be at a pixel."""
@@ -63,12 +63,12 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "backgrounds": ("[..., C, D]", ()),
     "covars": ("[..., N, 3, 3]", (3, 3)),
 }
-"""How each tensor is shaped, for messages, and how its shape ends."""
+"""Expected shape of each tensor, for error messages, and its trailing dimensions."""
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What `rasterization` was asked for, beyond tensors; the checks that need no tensor are made here."""
+    """Non-tensor options of `rasterization`, validated on construction."""
 
     width: int
     height: int
@@ -113,7 +113,7 @@ class RenderSettings:
 
     @property
     def has_colors(self) -> bool:
-        """Whether colours are among the channels."""
+        """True if colours are among the output channels."""
         return self.render_mode.startswith("RGB")
 
     @property
@@ -123,7 +123,7 @@ class RenderSettings:
 
     @property
     def has_depth(self) -> bool:
-        """Whether depth is the last channel."""
+        """True if depth is the last output channel."""
         return self.render_mode.endswith("D")
 
 

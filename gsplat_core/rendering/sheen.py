@@ -1,8 +1,10 @@
-"""How colours of wet tissue depend on the direction half-way between light and eye.
+"""Dependence of wet tissue's colour on the half-way direction between light and eye.
 
-A highlight is where that direction is the normal of the (finely rough) surface. It is given here in the surface's own tangents, so that what a place showed
-while tissue was turned, or the scope was elsewhere, tells what it shows to another eye. Each point's colours over time are learned by Gaussian process regression
-(Rasmussen and Williams 2006, chapters 2 and 5): a function of that direction, something that changes slowly with time, and noise.
+A highlight appears where the half-way direction equals the normal of the microscopically rough
+surface. Directions are expressed in the surface's tangent frame. Colours observed while the tissue
+or the scope moved therefore predict the colours seen from elsewhere. Each point's colour over time
+is modelled by Gaussian process regression (Rasmussen and Williams 2006, chapters 2 and 5) as the
+sum of a function of direction, a slow function of time, and noise.
 """
 
 from __future__ import annotations
@@ -15,12 +17,12 @@ Array = NDArray[np.floating]
 LOBES = ((1.0, 0.06), (1.5, 0.15))
 """Variances, and over how much of the direction (a sine) colours stay alike: of glints, and of the broad sheen."""
 SLOW, SLOW_S = 0.5, 0.6
-"""Variance of what changes with time alone, and over how many seconds it stays alike: shadows, and points that slip."""
+"""Variance and correlation time in seconds of the slow component: shadows and drifting points."""
 NOISE = 0.3
 UNKNOWN = 1e4
 """The variance of noise where a point was not seen."""
 CONSTANT = 10.0
-"""Variance of a point's mean colour about the mean of what was seen."""
+"""Prior variance of a point's mean colour around the mean of the observations."""
 ROWS_AT_ONCE = 4096
 """Bounds the memory for covariances."""
 
@@ -42,16 +44,19 @@ class Sheen:
             rows = slice(start, start + ROWS_AT_ONCE)
             inverse = np.linalg.inv(self._covariance(halves[rows], seen[rows]))
             strengths = inverse @ off[rows]
-            # What each look would be missed by, had it not been learned from.
+            # Leave-one-out residual of each observation.
             missed = strengths / np.diagonal(inverse, axis1=1, axis2=2)[..., None] * seen[rows, :, None]
             left += float((weights[rows] * np.square(missed).sum(axis=(1, 2))).sum())
             total += float((weights[rows] * np.square(off[rows]).sum(axis=(1, 2))).sum())
             self._strengths[rows] = strengths * seen[rows, :, None]
         self.skill = max(0.0, 1 - left / total) if total > 0 else 0.0
-        """How much of the colours' change over time is foretold where it was not learned from, 0 to 1."""
+        """Share of the colour variance over time that leave-one-out prediction explains, 0 to 1."""
 
     def difference(self, halves: Array, instead_of: Array) -> NDArray[np.float32]:
-        """By how much each point's colour changes [N, 3] when the direction is `halves` [N, 2] in place of another one; as much of it as the skill."""
+        """Return the predicted colour change [N, 3] between two half-way directions [N, 2].
+
+        The change is scaled by `skill`.
+        """
         return np.asarray(self.skill * (self._at(halves) - self._at(instead_of)), np.float32)
 
     def _at(self, halves: Array) -> Array:
@@ -65,7 +70,7 @@ class Sheen:
 
 
 def _alike(apart: Array) -> Array:
-    """The covariance [...] of colours whose directions are so far apart [..., 2]."""
+    """Return the covariance [...] of colours whose directions differ by `apart` [..., 2]."""
     squared = np.square(apart).sum(axis=-1)
     return np.asarray(sum(variance * np.exp(squared * (-0.5 / reach**2)) for variance, reach in LOBES))
 

@@ -27,14 +27,18 @@ from gsplat_core.rendering.view_colors import camera_centers
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 NATIVE_CONSTANTS = "1.6"
-"""The version of gsplat whose constants the native call is compiled with."""
+"""gsplat version whose constants are compiled into the native call."""
 _PLAIN_TENSORS = (Tensor, Parameter)
 _DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": DEPTH_SUM, "RGB+ED": EXPECTED_DEPTH}
 
 
 def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Rasterized | None:
-    """What the chain of operations renders; the host waits once, for the lists' length. None for what the native call does not take,
-    wrong arguments among it: the chain renders it, or says what is wrong."""
+    """Render with the native call; one host synchronisation, for the length of the tile lists.
+
+    Returns:
+        The same result as the chain of operations, or None for unsupported or invalid arguments.
+            The chain then renders them or raises the error.
+    """
     return _rasterize(arguments, settings) if _takes(arguments, settings) else None
 
 
@@ -67,7 +71,7 @@ def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
 
 
 def _are_plain_cuda_floats(arguments: Arguments) -> bool:
-    """Whether all are float32 on one CUDA device, and neither a subclass of Tensor nor under a transform or mode of torch's."""
+    """Return True if all tensors are plain float32 on one CUDA device, outside torch transforms."""
     device = arguments.means.device
     if device.type != "cuda":
         return False

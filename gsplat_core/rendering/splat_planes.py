@@ -26,7 +26,7 @@ blur of the picture (`EPS2D`) is no part of the surface: with it, tilted ones ca
 
 
 class SplatPlanes(NamedTuple):
-    """Splats in one camera; what a culled one holds is finite and means nothing."""
+    """Splats projected to one camera; values of culled splats are finite and meaningless."""
 
     rows: DenseProjection
     """[N, ...]."""
@@ -35,7 +35,7 @@ class SplatPlanes(NamedTuple):
     slopes: Tensor
     """[N, 2]: by how much z changes along a splat for each pixel to the right and down."""
     variances: Tensor
-    """[N]: of z along the ray, what the Gaussian's thickness leaves open."""
+    """Variance [N] of z along the ray, due to the thickness of the Gaussian."""
     normals: Tensor
     """[N, 3] in the camera's axes, of unit length, towards the camera: the Gaussian's shortest axis."""
 
@@ -118,7 +118,7 @@ def _facing(quats: Tensor, scales: Tensor, rotation: Tensor, local: Tensor, came
 
 
 def tile_lists(planes: SplatPlanes, camera: Camera) -> TileLists:
-    """Which splats each tile of the picture has, nearest centre first."""
+    """Return the splats that touch each tile, sorted by depth of their centres."""
     grid = TileGrid(TILE_SIZE, -(-camera.width_px // TILE_SIZE), -(-camera.height_px // TILE_SIZE))
     rows = planes.rows
     _, ids, starts = bin_splats(

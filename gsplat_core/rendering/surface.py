@@ -18,11 +18,15 @@ from gsplat_core.scene.gaussians import Gaussians
 COVERED = 0.1
 """Opacity from which on a pixel shows something; below it nothing was observed."""
 HALVED_AFTER_S = 5.0
-"""Confidence in tissue that nobody sees is halved after so long, a third after twice that, and so on."""
+"""Time in seconds after which the confidence in unseen tissue is 1/2; it is 1/3 after
+twice that.
+"""
 
 
 class Surface(NamedTuple):
-    """What one camera sees of the scene's surface; all of the scene's unit, in the camera's axes (x right, y down, z forward)."""
+    """Surface seen by one camera, in the scene's unit and camera axes (x right, y down,
+    z forward).
+    """
 
     alpha: Tensor
     """Opacity [H, W]."""
@@ -35,7 +39,7 @@ class Surface(NamedTuple):
     spread: Tensor
     """Standard deviation of z along the ray [H, W]: the error that the model itself shows. It does not know by how much all of it is off."""
     confidence: Tensor
-    """[H, W], 0 to 1: opacity, less where what is seen was not seen for long (`certainty`)."""
+    """Confidence [H, W], 0 to 1: opacity, reduced where tissue has not been seen (`certainty`)."""
 
     @property
     def observed(self) -> Tensor:
@@ -44,19 +48,26 @@ class Surface(NamedTuple):
 
 
 def certainty(unseen_s: Tensor) -> Tensor:
-    """How sure Gaussians are, 0 to 1, by the time [N] in seconds for which nobody has seen them; 1 for those that are seen."""
+    """Return the confidence [N] in Gaussians, 0 to 1, by the time [N] in seconds since
+    last seen.
+    """
     return 1 / (1 + unseen_s / HALVED_AFTER_S)
 
 
 SURFACE_OUTPUTS = tuple(name for name in Surface._fields if name != "alpha")
-"""What a renderer may be asked for beyond a picture, its opacity and the depth of the splats' centres."""
+"""Outputs that a renderer offers in addition to picture, opacity and centre depth."""
 
 
 @torch.no_grad()
 def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None = None) -> Surface:
-    """The surface as `camera` sees it, on the Gaussians' device, float32.
+    """Render the surface seen by `camera`, float32 on the Gaussians' device.
 
-    certain: [N], 0 to 1, how sure each Gaussian is; None: all are. Beside a picture this takes long: see `tile_blending`.
+    Much slower than a picture; see `tile_blending`.
+
+    Args:
+        gaussians: Gaussians at one time.
+        camera: camera of the outputs.
+        certain: confidence [N], 0 to 1, of each Gaussian; None for 1.
     """
     if certain is not None:
         require_shape("certain", certain, (gaussians.count,), "[N]")

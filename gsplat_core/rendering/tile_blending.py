@@ -1,6 +1,7 @@
-"""What lies along the rays through the pixels, splat by splat: the same blending as of the picture, in plain torch, tile by tile.
+"""Per-ray blending statistics in plain torch, tile by tile, with the same blending as the picture.
 
-A picture takes it about a hundred times as long as the compiled blending, which keeps sums alone. A median needs the order.
+About a hundred times slower than the compiled blending, which keeps only sums. A median needs the
+sorted order.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ TRANSMITTANCE_STOP = 1e-4
 
 
 class AlongRays(NamedTuple):
-    """What each pixel's ray meets [H, W]; 0 where there is nothing."""
+    """Depth statistics of each pixel's ray [H, W]; 0 where no splat is hit."""
 
     median: Tensor
     """z of the splat with which half of the light is blocked; 0 where never half of it is."""
@@ -39,7 +40,7 @@ class TileOfRays(NamedTuple):
     weights: Tensor
     """[P, L]: the share that each splat has of each pixel."""
     through: Tensor
-    """[P, L]: what is left of the light behind each splat."""
+    """Transmittance [P, L] behind each splat."""
     depths: Tensor
     """[P, L]: z of each splat where the ray meets it."""
 

@@ -1,6 +1,7 @@
-"""How long the tile lists of a frame may be, and how the host learns that a frame needed longer ones.
+"""Capacity of a frame's tile lists, and detection of frames that exceed it.
 
-An instance is a pair of a splat and a tile that it touches; a tile's list holds the instances that it blends.
+An instance is a pair of a splat and a tile that it touches. A tile's list holds the instances that
+it blends.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ CAPACITY_STEP = 1 << 16
 TILE_STEP = 32
 """The capacity of each tile's own buffer is a multiple of this many instances."""
 HEADROOM = 1.25
-"""Capacity relative to what a frame needed, so that a scene that moves seldom outgrows it."""
+"""Capacity relative to a frame's need, so that a moving scene seldom exceeds it."""
 
 
 def capacity_for(needed: int) -> int:
@@ -43,14 +44,19 @@ class TileListCapacity:
 
     @property
     def mode(self) -> FrameMode:
-        """In which `render_frame` takes this capacity."""
+        """Mode of `render_frame` for this capacity."""
         return FrameMode.SEGMENTS if self.per_tile else FrameMode.SHARED
 
     @staticmethod
     def for_frame(needed: int, most_in_tile: int) -> TileListCapacity:
-        """For a frame with `needed` instances, at most `most_in_tile` of them in one tile.
+        """Return the capacity for a frame's measured need.
 
-        Separate buffers are faster and take up to 32 bytes a pixel. Where a tile has more instances than that allows, one buffer serves all.
+        Separate buffers per tile are faster and take up to 32 bytes per pixel. If a tile has more
+        instances than fit, one shared buffer is used.
+
+        Args:
+            needed: number of instances in the frame.
+            most_in_tile: largest number of instances in one tile.
         """
         of_tile = max(1, math.ceil(most_in_tile * HEADROOM / TILE_STEP)) * TILE_STEP
         if of_tile <= MAX_SEGMENT:
@@ -65,13 +71,13 @@ class TileListCapacity:
 
 
 class FrameNeeds(NamedTuple):
-    """What rendered frames needed, in instances, and whether their lists overflowed."""
+    """Instances needed by rendered frames, and the number of overflows."""
 
     instances: int
-    """Of all tiles of a frame."""
+    """Largest number of instances in all tiles of a frame."""
     most_in_tile: int
     overflowed: int
-    """How many frames left instances out because their lists were full."""
+    """Number of frames that dropped instances because their lists were full."""
 
 
 class FrameStatusCopy:

@@ -22,10 +22,12 @@ def view_colors(
     dense: DenseProjection,
     settings: RenderSettings,
 ) -> tuple[Tensor, DenseProjection]:
-    """Colours [..., C, N, D] seen by each camera; Gaussians whose colour is not finite are culled.
+    """Return the colours [..., C, N, D] seen by each camera; cull Gaussians with non-finite colour.
 
-    On CUDA the host does not wait here, so the colours of culled Gaussians are not replaced. They have no effect: culled Gaussians
-    are in no tile's list, compositing skips what is not finite, and a colour with a zero gradient adds nothing to its coefficients'.
+    On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They
+    have no
+    effect: culled Gaussians are in no tile list, compositing skips non-finite values, and a zero
+    colour gradient adds nothing to the coefficients' gradient.
     """
     shape = dense.depths.shape
     visible = dense.radii[..., 0] > 0
@@ -59,10 +61,12 @@ def view_colors(
 
 
 def camera_centers(viewmats: Tensor) -> Tensor:
-    """The first three numbers of the last column of the inverse of [..., 4, 4] matrices, any that have one: [..., 3].
+    """Return the camera centres [..., 3] of world-to-camera matrices [..., 4, 4].
 
-    On CUDA by Cramer's rule, for `torch.linalg.inv` makes the host wait there to see whether there is an inverse: the vector
-    that the first three rows are orthogonal to, scaled so that its product with the fourth is 1.
+    This is the translation column of the inverse of any invertible matrix. On CUDA it is computed
+    by Cramer's rule, because `torch.linalg.inv` synchronises with the host to check invertibility.
+    The centre is the vector orthogonal to the first three rows, scaled so that its product with the
+    fourth row is 1.
     """
     if not viewmats.is_cuda:
         return torch.linalg.inv(viewmats)[..., :3, 3]

@@ -1,4 +1,4 @@
-"""The fast global smoother (Min et al. 2014): planes smoothed within what looks like one surface in a guide picture."""
+"""Fast global smoother (Min et al. 2014): edge-aware smoothing of planes with a guide image."""
 
 from __future__ import annotations
 
@@ -13,16 +13,25 @@ MOST_LENGTH, MOST_CHANNELS = 4096, 4
 
 
 def smooth_within_edges(planes: Tensor, guide: Tensor, strength: float, grey_step: float) -> Tensor:
-    """Planes [C, H, W] float32, smoothed along rows and columns by weighted least squares, three times with less and less strength.
+    """Smooth planes by separable weighted least squares, in three passes of decreasing strength.
 
-    The mean of a plane stays what it is where the guide has no edges. On CUDA nothing waits for the device.
+    The mean of a plane is preserved where the guide has no edges. On CUDA the host does not
+    synchronise. Method: Min et al., "Fast Global Image Smoothing Based on Weighted Least Squares"
+    (2014).
 
     Args:
-        guide: [H, W] or [H, W, channels] uint8, at most 4 channels.
-        strength: how much a change between neighbours of the same look counts against one from what was given.
-        grey_step: by how many grey values neighbours differ whose link is weaker by e.
+        planes: float32 [C, H, W].
+        guide: uint8 [H, W] or [H, W, channels] with at most 4 channels.
+        strength: weight of the smoothness term between similar neighbours, relative to the data
+            term.
+        grey_step: difference in grey values between neighbours that reduces the weight by a factor
+            e.
 
-    Raises InvalidInput for other shapes and types, for sides of more than 4096 pixels, and for numbers below 0.
+    Returns:
+        Smoothed planes, float32 [C, H, W].
+
+    Raises:
+        InvalidInput: for other shapes or dtypes, sides over 4096 pixels, or negative parameters.
     """
     require_float32("smooth_within_edges", planes=planes)
     if (

@@ -1,7 +1,8 @@
-"""One frame on CUDA from raw Gaussians: deform, activate, project, sort and blend, without the host ever waiting.
+"""Rendering of one frame on CUDA from raw Gaussians without host synchronisation.
 
-Splatting after Kerbl et al. 2023 and Zwicker et al. 2001, the same picture as `gsplat_core.rasterization`. An instance is a pair of a
-splat and a tile that it touches.
+The steps are deform, activate, project, sort and blend. Splatting follows Kerbl et al. 2023 and
+Zwicker et al. 2001, with the same picture as `gsplat_core.rasterization`. An instance is a pair of
+a splat and a tile that it touches.
 """
 
 from __future__ import annotations
@@ -43,26 +44,32 @@ STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)
 
 
 class FrameMode(IntEnum):
-    """What a frame is rendered for, which decides the layout of its tile lists."""
+    """Purpose of a frame, which determines the layout of its tile lists."""
 
     SHARED = 0
-    """A picture. The tile lists, of any length, lie one after the other in one buffer of `capacity` instances."""
+    """Picture. Tile lists of any length are stored consecutively in a buffer of `capacity`
+    instances.
+    """
     TRAINING = 1
-    """As SHARED, and what the gradient needs is returned; depth is the sum of weight and z."""
+    """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of
+    weight times z.
+    """
     SEGMENTS = 2
     """A picture. Every tile has a segment of its own for `capacity` instances, at most MAX_SEGMENT: two launches fewer, for 8 bytes per
     instance."""
 
 
 class Frame(NamedTuple):
-    """A frame, and what its gradient needs."""
+    """Rendered frame and the values needed by its backward pass."""
 
     image: Tensor
     """[H, W, 4]: red, green, blue in front of the background, and depth: the weighted mean of z, or its weighted sum when training."""
     alphas: Tensor
     """[H, W]."""
     last: Tensor
-    """int32 [H, W]: the position in `sorted` of the last instance blended, -1 where there is none. Empty unless training."""
+    """Index in `sorted` of the last blended instance, int32 [H, W]; -1 for none. Empty unless
+    training.
+    """
     records: Tensor
     """[N, 12]: the projected splats as the kernels keep them; rows of culled Gaussians are not written. A colour of exactly 0
     was clamped. Columns: x, y, and log2 of alpha's polynomial (xx, xy, yy, 1), infinity, red, green, blue, z, 0."""
@@ -87,22 +94,31 @@ def render_frame(
 ) -> Frame:
     """Render N Gaussians, given by their raw parameters, for one camera.
 
+    With float16 `sh` (not when training), blending runs in half precision on the tensor cores. This
+    is faster and nearly the same picture. Colours saturate at 65,504, and splats thinner than 0.01
+    pixel (with `eps2d` 0) are culled. All other arithmetic is float32.
+
+    The picture is that of `gsplat_core.reference.render_frame`. Gaussians with a non-finite value
+    or a zero-length rotation are culled. The host does not synchronise, and torch allocates all
+    memory, so a CUDA graph can capture the call. The view's tensors and the deltas are read on the
+    device at each replay. Equal inputs give bit-identical results.
+
     Args:
-        gaussians: means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3], logit_opacities [N], sh [N, B, 3] with
-            B = (degree + 1)², up to degree 4.
-        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.layout`. Or None.
-        capacity: for how many instances there is memory, in all tiles together or, with segments, in each. If a frame needs more,
-            `status` says so and how many; its picture is then not to be used. Render again with at least as many.
+        gaussians: float32 on CUDA: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3],
+            logit_opacities [N], and sh [N, B, 3] with B = (degree + 1)², degree at most 4.
+        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.layout`, or
+            None.
+        view: camera with its tensors on the device.
+        capacity: allocated instances, in all tiles together or, with segments, in each tile. If a
+            frame needs more, `status` reports how many, and the picture is invalid. Render again
+            with at least as many.
+        mode: purpose of the frame.
 
-    Where `sh` is float16 (not when training), the picture is also blended in half precision, on the tensor cores: faster, and
-    nearly the same. Colours saturate at 65,504 there, and splats thinner than a hundredth of a pixel (with `eps2d` 0) are left out.
-    Everything else is float32 all the same.
+    Returns:
+        Frame with image, alphas and status.
 
-    The picture is that of `gsplat_core.reference.render_frame`. A Gaussian with a value that is not finite, or a rotation of
-    length zero, is left out. Nothing waits for the device and all memory is torch's, so a call can be captured in a CUDA graph;
-    the view's tensors and deltas are read on the device each time. The same inputs give the same bits.
-
-    float32 on CUDA only (but for `sh`): raises InvalidInput for anything else and for wrong shapes.
+    Raises:
+        InvalidInput: for other devices, dtypes or shapes.
     """
     if capacity < 1:
         raise InvalidInput(f"capacity must be at least 1 instance, got {capacity}")

@@ -1,4 +1,4 @@
-"""What the frame path's ops have in common: the camera's view with its tensors on the device, and checks of the inputs."""
+"""Shared parts of the frame ops: the camera view with device tensors, and input checks."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""All of `rasterization()` on CUDA in one native call per pass: project, colour, sort and blend (Kerbl et al. 2023).
+"""`rasterization()` on CUDA in one native call per pass: project, colour, sort and blend.
 
-Two autograd nodes, so that programs can look between them: `_Project` (Gaussians to splats) and `_Blend` (splats to the picture),
-with `means2d` on the way from one to the other. The forward pass of both is the one call that `_Project` makes.
+Follows Kerbl et al. 2023. Two autograd nodes expose the intermediate `means2d`: `_Project`
+(Gaussians to splats) and `_Blend` (splats to the picture). `_Project` makes the single forward call
+of both.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 
 PLAIN_COLORS = -1
-"""In place of a degree: colours are taken as they are, at most `MOST_PLAIN_COLORS` of them."""
+"""Value of the degree for plain colours, at most `MOST_PLAIN_COLORS` channels."""
 MOST_PLAIN_COLORS = 3
 NO_DEPTH, DEPTH_SUM, EXPECTED_DEPTH = range(3)
 TILE_SIZE = 16
@@ -56,7 +57,7 @@ class Ranges(NamedTuple):
 
 
 class View(NamedTuple):
-    """What is to be rendered, but for the tensors."""
+    """Non-tensor arguments of a rendering."""
 
     image_dims: tuple[int, ...]
     """Batch dimensions and number of cameras."""
@@ -84,7 +85,7 @@ class Inputs(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What the forward pass leaves for the gradient of the picture."""
+    """Values of the forward pass saved for the backward pass."""
 
     records: Tensor
     """[images * N, 12]: the splats as the kernels keep them."""
@@ -107,7 +108,10 @@ class Saved(NamedTuple):
 
 
 class Rasterized(NamedTuple):
-    """What the forward pass returns; `opacities` is empty unless antialiased or packed, the ids are None unless packed."""
+    """Results of the forward pass.
+
+    `opacities` is empty unless antialiased or packed. The ids are None unless packed.
+    """
 
     image: Tensor
     alphas: Tensor
@@ -126,7 +130,7 @@ class Rasterized(NamedTuple):
 
 
 class _Call:
-    """One forward pass on its way through the two nodes."""
+    """State of one forward pass shared by both autograd nodes."""
 
     __slots__ = ("outputs", "view")
 
