@@ -1,11 +1,11 @@
-"""Run one `intrasplat` command on one recording, as a user does, and print its figures as one JSON line.
+"""Run one `intrasplat` command on one recording and print its figures as one JSON line.
 
     python benchmarks/plain.py live RECORDING --device cuda --fps 30
     python benchmarks/plain.py replay RECORDING
     python benchmarks/plain.py reconstruct RECORDING --steps 16000
 
-Further options are the command's own. The line holds what the command's report says of quality, baselines, latency, frames and memory. A recording of
-a single frame is played as eight equal frames.
+Further options are passed to the command. The line contains quality, baselines, latency, frames and
+memory from the command's report. A recording of a single frame is played as eight equal frames.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ def main() -> int:
 
 
 def figures(report: dict[str, Any]) -> dict[str, Any]:
-    """The report without its per-frame series, its quantiles and what it says of the machine, which a log states itself."""
+    """Return the report without per-frame series, quantiles and the machine, which the
+    log states.
+    """
     kept = {name: report[name] for name in KEPT if report.get(name) is not None}
     kept["run"] = {name: value for name, value in kept["run"].items() if name not in ("machine", "started_at")}
     return kept

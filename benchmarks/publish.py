@@ -1,11 +1,11 @@
-"""Make RESULTS.md, and the figures in README.md, out of the logs in `benchmarks/logs`.
+"""Generate RESULTS.md, and the figures in README.md, from the logs in `benchmarks/logs`.
 
     python benchmarks/publish.py            # writes
     python benchmarks/publish.py --check    # exit code 1 where a written figure and its log differ
 
-Each table below names the logs that its rows are read from and the values of a result that its columns show. A figure is the median over the
-runs in the log; where there are several, the worst run and their number follow. A row without a log is not printed. Logs are written by
-`suite.py`; each line has the command, commit, machine and date.
+Each table below names the logs of its rows and the values of its columns. A figure is the median
+over the runs in the log. With several runs, the worst run and their number follow. A row without a
+log is not printed. `suite.py` writes the logs; each line has command, commit, machine and date.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RESULTS = ROOT / "benchmarks" / "RESULTS.md"
 README = ROOT / "README.md"
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 ENVELOPE = ("benchmark", "run", "commit", "date", "machine", "command", "seconds")
-"""Fields that every log line has besides its result."""
+"""Fields of every log line in addition to its result."""
 
 
 @dataclass(frozen=True)
@@ -268,10 +268,10 @@ TABLES = (
 
 
 def log_lines(log: str, logs: Path = LOGS) -> list[dict[str, Any]]:
-    """The lines of a log; none where there is no such file.
+    """Return the lines of a log; empty if the file does not exist.
 
     Raises:
-        ValueError: a line lacks a part of its envelope.
+        ValueError: if a line lacks a part of its envelope.
     """
     path = logs / f"{log}.jsonl"
     if not path.exists():

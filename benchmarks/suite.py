@@ -1,13 +1,14 @@
 """Run the published benchmarks and write a log line for every result.
 
-    python benchmarks/suite.py --device cpu                       # what `make bench` runs
-    python benchmarks/suite.py --device cuda --minutes 9 --only live_cutting live_heart
-    python benchmarks/suite.py --device cuda --list
+    python benchmarks/suite.py --device cpu                       # as in `make bench`
+    python benchmarks/suite.py --device cuda --minutes 9 --only live_cutting live_heart python
+        benchmarks/suite.py --device cuda --list
 
-`BENCHMARKS` is the only list of what is published: name, command and number of runs. Every line that a command prints as JSON becomes a line
-of `benchmarks/logs/DEVICE/NAME.jsonl` together with the command, commit, machine, date and number of the run. `publish.py` makes RESULTS.md
-out of these logs and of nothing else. A benchmark replaces its own earlier log. All benchmarks run once before any of them runs again, so that
-a time limit leaves at least one run of each.
+`BENCHMARKS` defines all published benchmarks: name, command and number of runs. Each JSON line
+printed by a command becomes a line of `benchmarks/logs/DEVICE/NAME.jsonl`, with command, commit,
+machine, date and run number. `publish.py` generates RESULTS.md from these logs alone. A benchmark
+replaces its own earlier log. All benchmarks run once before any runs again, so a time limit leaves
+at least one run of each.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class Benchmark:
 
 
 def plain(name: str, device: str, command: str, recording: str, *options: str, runs: int = 3) -> Benchmark:
-    """One run of an `intrasplat` command on a real recording, with no other options than the stated ones."""
+    """Define a run of an `intrasplat` command on a real recording with exactly the
+    given options.
+    """
     words = ["benchmarks/plain.py", command, f"{{recordings}}/{recording}", "--device", device, *options]
     return Benchmark(name, shlex.join(words).replace("'", ""), device, runs)
 
@@ -175,7 +178,9 @@ def commit() -> str:
 
 
 def measured(benchmark: Benchmark, run: int, about: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Run the command once; a log line for each of its results, or one that says how it failed."""
+    """Run the command once and yield a log line for each result, or one that reports
+    the failure.
+    """
     env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))}
     start = time.perf_counter()
     done = subprocess.run(

@@ -34,8 +34,10 @@ def recordings_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def gpu() -> torch.device:
-    """The GPU to test on, where torch sees one and the CUDA kernels are built. Else the test is skipped, saying why, unless
-    FAIL_WITHOUT_CUDA=1 says that there must be one."""
+    """Return the GPU to test on, if torch sees one and the CUDA kernels are built.
+
+    Otherwise the test is skipped with the reason, or fails if FAIL_WITHOUT_CUDA=1.
+    """
     from gsplat_core.ops import native
 
     why = None if torch.cuda.is_available() else f"torch {torch.__version__} sees no GPU"
@@ -50,7 +52,7 @@ def gpu() -> torch.device:
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> torch.device:
-    """The CPU, and again the GPU where there is one."""
+    """Parametrise a test over the CPU and, if available, the GPU."""
     return request.getfixturevalue("gpu") if request.param == "cuda" else torch.device("cpu")
 
 
@@ -68,7 +70,10 @@ def generator() -> torch.Generator:
 
 @pytest.fixture
 def sdk() -> None:
-    """The Holoscan SDK, an extra: without it the test is skipped, unless INTRASPLAT_REQUIRE_HOLOSCAN says that it must be there."""
+    """Require the optional Holoscan SDK.
+
+    Without it the test is skipped, or fails if INTRASPLAT_REQUIRE_HOLOSCAN=1.
+    """
     from operators.errors import EngineMissing
     from operators.graph.sdk import load_sdk
 

@@ -37,7 +37,9 @@ PACKAGES = ("gsplat_core", "operators", "services")
 MOST_TEST_FILES = 24
 """Test files beyond those that import the module itself."""
 LIMIT_S = 300.0
-"""Time limit for one run of pytest. A mutant whose tests take longer counts as killed: it hangs."""
+"""Time limit in seconds for one run of pytest. A mutant that exceeds it hangs and
+counts as killed.
+"""
 NO_TESTS = 5
 """Exit code of pytest when every collected test is deselected."""
 PRECHECK_FILES = 3
@@ -52,7 +54,7 @@ OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
 }  # fmt: skip
 EXCHANGED = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "maximum", "maximum": "minimum"}
 UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_progress"}
-"""Calls whose only effect is a log line; they are not left out."""
+"""Calls with no effect except a log line, which are not mutated."""
 
 HOOK = """
 import importlib.abc, importlib.util, os, sys

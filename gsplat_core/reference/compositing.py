@@ -128,7 +128,15 @@ class _Instances:
     def _blend_part(
         self, ids: Tensor, values: Tensor, pixels: Tensor, product: Tensor, through: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """One part of the list. `product` is the transmittance had no pixel stopped, `through` the one that is left."""
+        """Blend one part of the list.
+
+        Args:
+            ids: splat ids of the part [L].
+            values: splat parameters [L, 6 + channels]: mean, conic, opacity, colours.
+            pixels: pixel centres [P, 2].
+            product: transmittance [P] ignoring early termination.
+            through: transmittance [P] after the splats blended so far.
+        """
         means2d, conics, opacities, colors = values[:, :2], values[:, 2:5], values[:, 5], values[:, 6:]
         means = means2d[None].expand(len(pixels), -1, -1)
         if self.absolute is not None and means.requires_grad:
@@ -145,10 +153,10 @@ class _Instances:
         falloff = torch.exp(-torch.where(sigma >= 0, sigma, 0))
         alpha = (opacities * falloff).clamp(max=self.max_alpha)
         alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0)
-        # The product of (1 - alpha) by its logarithm, whose gradient is cheaper.
+        # Cumulative product of (1 - alpha) through logarithms, which has a cheaper gradient.
         after = product[:, None] * torch.exp(torch.cumsum(torch.log1p(-alpha), 1))
         before = torch.cat([product[:, None], after[:, :-1]], 1)
-        # The product only falls, so a pixel that has stopped stays stopped: what is blended is the start of the list.
+        # The product decreases monotonically, so the blended splats are the start of the list.
         blended = after > TRANSMITTANCE_STOP
         weights = torch.where(blended, alpha * before, 0)
         length = blended.sum(1, keepdim=True)

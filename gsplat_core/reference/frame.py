@@ -1,4 +1,6 @@
-"""One frame from raw Gaussians and their deformation, in plain torch: the oracle of the fused frame path."""
+"""One frame from raw Gaussians and deltas in plain torch: test reference of the fused
+frame path.
+"""
 
 from __future__ import annotations
 

@@ -17,7 +17,9 @@ STEEP_AS_L1 = 0.01
 
 
 def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
-    """Mean of the kept values; 0 when none is kept. What is not kept may be NaN: neither value nor gradient sees it."""
+    """Return the mean of the kept values, or 0 if none is kept. NaN in other values has
+    no effect.
+    """
     return torch.where(keep, values, torch.zeros_like(values)).sum() / keep.sum().clamp(min=1)
 
 
@@ -68,7 +70,7 @@ def masked_ssim_loss(image: Tensor, target: Tensor, mask: Tensor | None = None) 
 
 
 def valid_depth(depth: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """Where both depths are known (> 0) and the mask is tissue: booleans [H, W]."""
+    """Return the mask [H, W] of tissue pixels where both depths are known (> 0)."""
     _same_shape(depth, target, "depth and target depth")
     valid = (depth > 0) & (target > 0)
     if mask is not None:
@@ -78,14 +80,17 @@ def valid_depth(depth: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def inverse_depth_l1(depth: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean |1/depth - 1/target| over pixels where both are known (> 0) and the mask is tissue.
+    """Return the mean of |1/depth - 1/target| over tissue pixels where both are known (> 0).
 
-    Inverse depth weighs by what a stereo pair can see: its error is disparity's.
+    An error in inverse depth is proportional to an error in stereo disparity.
 
     Args:
         depth: [H, W] in mm, 0 = unknown.
         target: [H, W] in mm, 0 = unknown.
         mask: [H, W], non-zero = tissue; None = all.
+
+    Returns:
+        Scalar loss.
     """
     valid = valid_depth(depth, target, mask)
     one = torch.ones_like(depth)
@@ -102,7 +107,7 @@ def image_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> ImageLoss:
-    """As `gsplat_core.ops.image_loss.image_loss`, which documents it; here image and depth may be of any floating type."""
+    """Compute the loss of `gsplat_core.ops.image_loss.image_loss` for any floating dtype."""
     if target.dtype == torch.uint8:
         target = target.to(image.dtype) / 255
     with torch.enable_grad():
@@ -132,7 +137,11 @@ def frame_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `gsplat_core.ops.image_loss.frame_loss`, which documents it: loss, terms, dL/dimage and dL/dalphas, of any floating type."""
+    """Compute `gsplat_core.ops.image_loss.frame_loss` for any floating dtype.
+
+    Returns:
+        Loss, its terms, dL/dimage and dL/dalphas.
+    """
     with torch.enable_grad():
         x, alpha = image.detach().requires_grad_(), alphas.detach().requires_grad_()
         depth = None if target_depth is None else x[..., 3] / alpha.clamp(min=1e-10)

@@ -22,7 +22,7 @@ from gsplat_core.ops.projection.arguments import (
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci, triu_to_matrix
 
 FISHEYE_SERIES_BELOW = 0.01
-"""For tan θ below this the fisheye's quotients by r are taken from their Taylor series."""
+"""Bound of tan θ below which the fisheye's quotients by r use their Taylor series."""
 
 
 def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
@@ -142,7 +142,7 @@ def fully_fused_projection(
 def _usable(
     means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, opacities: Tensor | None
 ) -> Tensor:
-    """Whether a Gaussian has finite values and a rotation, bool [..., N]."""
+    """Return a mask [..., N] of Gaussians with finite values and a non-zero quaternion."""
     usable = means.isfinite().all(-1)
     if covars is not None:
         usable = usable & covars.isfinite().all(-1)

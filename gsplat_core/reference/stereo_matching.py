@@ -34,7 +34,11 @@ def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> t
 
 
 def window_costs(left: Tensor, right: Tensor, lowest: int, count: int) -> Tensor:
-    """What each disparity costs at each pixel, [H, W, count]."""
+    """Return the matching cost [H, W, count] of each disparity at each pixel.
+
+    The pixel cost is the sampling-insensitive difference (Birchfield and Tomasi 1998) of slope and
+    clamped brightness, summed over a square window.
+    """
     height, width = left.shape
     columns = torch.arange(width, device=left.device)[:, None] - lowest - torch.arange(count, device=left.device)
     columns = columns.clamp(0, width - 1)  # [W, count]
@@ -56,7 +60,7 @@ def window_costs(left: Tensor, right: Tensor, lowest: int, count: int) -> Tensor
 
 
 def _moved(plane: Tensor, down: int, right: int) -> Tensor:
-    """What lies so much further down and to the right, the outermost pixels repeated."""
+    """Return the plane sampled at an offset of (down, right) pixels, with replicated borders."""
     height, width = plane.shape
     rows = (torch.arange(height, device=plane.device) + down).clamp(0, height - 1)
     columns = (torch.arange(width, device=plane.device) + right).clamp(0, width - 1)
@@ -69,14 +73,16 @@ def _slope(grey: Tensor) -> Tensor:
 
 
 def _range(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and most of each value and those half a pixel beside it."""
+    """Return minimum and maximum of each value and its interpolated half-pixel neighbours in the
+    row.
+    """
     before, after = (values + _moved(values, 0, -1)) // 2, (values + _moved(values, 0, 1)) // 2
     least, most = torch.minimum(before, after), torch.maximum(before, after)
     return torch.minimum(values, least), torch.maximum(values, most)
 
 
 def _messages_down(costs: Tensor) -> Tensor:
-    """What paths down the first dimension of [H, W, count] add to each cost."""
+    """Return the path costs aggregated down the first dimension of costs [H, W, count]."""
     kept = torch.zeros_like(costs[0])
     messages = torch.zeros_like(costs)
     beyond = torch.full_like(kept[:, :1], LARGE_STEP)
@@ -124,7 +130,9 @@ def checked_winners(totals: Tensor, lowest: int) -> Tensor:
 
 
 def without_patches(found: Tensor) -> Tensor:
-    """Without the patches of few pixels that differ much from what is around them."""
+    """Invalidate small connected patches (at most `PATCH_PIXELS`) that differ from their
+    surroundings.
+    """
     known = found != UNKNOWN
     labels = torch.arange(found.numel(), device=found.device).reshape(found.shape)
     while True:
@@ -146,7 +154,7 @@ def without_patches(found: Tensor) -> Tensor:
 
 
 def one_surface(found: Tensor) -> Tensor:
-    """Where neither a jump of disparity nor a hole is near."""
+    """Return the mask [H, W] of pixels without a disparity jump or hole nearby."""
     known = found != UNKNOWN
     far = 1 << 40
     most, least = torch.where(known, found, -far), torch.where(known, found, far)

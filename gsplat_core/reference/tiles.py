@@ -1,4 +1,4 @@
-"""Which tiles each splat touches, in plain torch: the oracle of the compiled ops."""
+"""Binning of splats into tiles in plain torch: test reference of the compiled ops."""
 
 from __future__ import annotations
 
@@ -68,7 +68,10 @@ def isect_tiles(
 def _ellipse_touches(
     means: Tensor, conics: Tensor, opacities: Tensor, column: Tensor, row: Tensor, size: int
 ) -> Tensor:
-    """Whether alpha reaches 1/255 somewhere in the rectangle of each tile's pixel centres (sigma is convex there)."""
+    """Return True for tiles in which alpha reaches 1/255 within the rectangle of pixel centres.
+
+    Sigma is convex there, so its minimum is at the mean or on an edge.
+    """
     low = torch.stack([column, row], -1) * size + 0.5 - means
     high = low + (size - 1)
     a, b, c = conics.unbind(-1)
@@ -89,7 +92,11 @@ def _ellipse_touches(
 
 
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """Where each tile's entries start in the sorted `isect_ids`: int32 [n_images, tile_height, tile_width]."""
+    """Return the start of each tile's entries in the sorted `isect_ids`.
+
+    Returns:
+        int32 [n_images, tile_height, tile_width].
+    """
     tiles = tile_width * tile_height
     tile_bits = tiles.bit_length()
     key = isect_ids >> 32

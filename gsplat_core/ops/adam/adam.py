@@ -80,12 +80,24 @@ def adam_step_at_(
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> None:
-    """As `adam_step_queued`, with what changes from step to step on the device, so that a CUDA graph can repeat it.
+    """Take the step of `adam_step_queued` with rate and step number in device memory.
+
+    A captured CUDA graph can replay the call with new values.
 
     Args:
+        parameter: float32 tensor, updated in place.
+        gradient: gradient of the same shape.
+        first_moment: first moment, updated in place.
+        second_moment: second moment, updated in place.
         rate: learning rate, float32 [1].
-        step: counts from 1, int64 [1].
-        skipped: the number of rows left alone is added to it, int64 [1].
+        step: step number from 1, int64 [1].
+        skipped: int64 [1]; incremented by the number of rows left unchanged.
+        betas: decay rates of the moments.
+        epsilon: term added to the denominator.
+        row_size: number of consecutive values that are skipped together.
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices.
     """
     _check(parameter, gradient, first_moment, second_moment, row_size)
     for name, tensor, dtype in (

@@ -1,6 +1,7 @@
-"""The basis-function field's ops in plain torch: any floating dtype and device, differentiable by ordinary autograd.
+"""Basis-function field ops in plain torch: any floating dtype and device, differentiable by
+autograd.
 
-`BasisField` falls back to them where there are no kernels, and they are the oracle that the kernels are tested against.
+`BasisField` uses them where no kernels exist. They are also the reference for tests of the kernels.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def basis_field(
     u = (tau - centers) * torch.exp(-log_widths)
     inactive = u.abs() > BUMP_REACH
     bumps = torch.exp(-(u.masked_fill(inactive, 0.0) ** 2)).masked_fill(inactive, 0.0)
-    # Inactive rows are not read, so that what they hold (even NaN) cannot matter.
+    # Masked, so that values in inactive rows, even NaN, have no effect.
     deltas = (bumps[..., None] * weights.masked_fill(inactive[..., None], 0.0)).sum(dim=1)
     return torch.nn.functional.pad(deltas, (0, RAW_COLUMNS - deltas.shape[1])) if padded else deltas
 
@@ -64,14 +65,24 @@ def basis_field_backward_adam_(
     betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
 ) -> None:
-    """One lazy Adam step of every bump active at `tau`, in place; the other bumps and their moments are left alone.
+    """Take one lazy Adam step of every bump active at `tau`, in place.
 
-    So is a Gaussian whose gradient is zero in every channel: the frame does not show it, and momentum must not move what nobody sees.
-    And one whose gradient, squared, is not finite: it would poison the moments for good.
+    Inactive bumps and their moments are not changed. A Gaussian with a zero gradient in all
+    channels is skipped, because it is not visible in the frame and momentum must not move it. A
+    Gaussian whose squared gradient is not finite is skipped, because it would corrupt the moments
+    permanently. The per-bump step counts give each bump Adam's bias correction (Kingma and Ba 2015,
+    algorithm 1) from its own first update.
 
-    `field` holds (centers, log_widths, weights), `first_moments` and `second_moments` tensors of their shapes; `steps` int32 [N, B] counts the
-    updates of each bump, so that each one sees Adam's bias correction (Kingma and Ba 2015, algorithm 1) from its own first
-    update, however late in a stream it was added. `learning_rates`: position, rotation, log-scale, colour, centres, widths.
+    Args:
+        gradient: dL/d(deltas) [N, 13] or [N, 16].
+        tau: normalised time.
+        field: centers [N, B], log_widths [N, B], weights [N, B, 13].
+        first_moments: tensors with the shapes of `field`.
+        second_moments: tensors with the shapes of `field`.
+        steps: int32 [N, B], number of updates of each bump.
+        learning_rates: six rates: position, rotation, log-scale, colour, centres, widths.
+        betas: decay rates of the moments.
+        epsilon: term added to the denominator.
     """
     centers, log_widths, weights = field
     beta1, beta2 = betas
@@ -121,9 +132,9 @@ def basis_field_add_colours_(
 ) -> None:
     """Change `weights` in place so that the colours at `tau` change by `change` [N, 3].
 
-    With heights h_b = exp(-u_b^2) (see `basis_field`) the weights that add up to `change` and have the smallest norm are
-    h_b / sum(h^2) times it. Other times change by exp(-d^2 / 2) of it, d bump spacings away. A Gaussian whose change is not finite, or whose
-    bumps are nearly all over, is left alone.
+    Let h_b = exp(-u_b^2) be the bump heights (see `basis_field`). The minimum-norm weight change is
+    h_b / sum(h^2) times `change`. The colours at d bump spacings from `tau` change by exp(-d^2 / 2)
+    of it. Gaussians with a non-finite change, or without a significant bump height, are skipped.
     """
     u = (tau - centers) * torch.exp(-log_widths)
     heights = torch.where(u.abs() > BUMP_REACH, torch.zeros_like(u), torch.exp(-u * u))

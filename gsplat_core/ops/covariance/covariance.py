@@ -14,15 +14,24 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 def quat_scale_to_covar_preci(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ, as gsplat 1.5.3 does.
+    """Compute covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ (Kerbl et al. 2023), as gsplat
+    1.5.3.
+
+    R is the rotation of the quaternion and S = diag(scales). Differentiable in both inputs.
 
     Args:
-        quats: [..., 4] wxyz, of any length but zero.
-        scales: [..., 3].
-        compute_covar, compute_preci: what to compute; the other is None.
-        triu: return upper triangles (xx, xy, xz, yy, yz, zz) [..., 6] in place of matrices [..., 3, 3].
+        quats: float32 [..., 4] wxyz, of any non-zero length.
+        scales: float32 [..., 3], standard deviations.
+        compute_covar: compute the covariances; otherwise None is returned for them.
+        compute_preci: compute the precisions; otherwise None is returned for them.
+        triu: return upper triangles (xx, xy, xz, yy, yz, zz) [..., 6] instead of matrices [..., 3,
+            3].
 
-    Differentiable in both. Raises InvalidInput for wrong shapes, dtypes or devices.
+    Returns:
+        Covariances and precisions.
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices.
     """
     check_covariance_arguments(quats, scales)
     require_float32("quat_scale_to_covar_preci", quats=quats, scales=scales)

@@ -1,4 +1,4 @@
-"""Matched disparities moved a little to where two pictures agree best (Lucas and Kanade 1981, along the row alone), as one fused op."""
+"""Sub-pixel refinement of matched disparities along the row (Lucas and Kanade 1981), as one op."""
 
 from __future__ import annotations
 
@@ -21,11 +21,21 @@ class Fitted(NamedTuple):
 
 
 def fit_disparities(left: Tensor, right: Tensor, sixteenths: Tensor) -> Fitted:
-    """Move each known disparity by at most 0.7 px to where the pictures [H, W] uint8 agree best around it, whatever offset of brightness is between them.
+    """Refine each known disparity by at most 0.7 px to the best photometric agreement around it.
 
-    Matching gathers around whole pixels, the fit does not. sixteenths: as in `Matches`. On CUDA nothing waits for the device.
+    A constant brightness offset between the pictures has no effect. The refinement removes the bias
+    of matching towards whole pixels. On CUDA the host does not synchronise.
 
-    Raises InvalidInput for other shapes and types.
+    Args:
+        left: uint8 [H, W].
+        right: uint8 [H, W].
+        sixteenths: int32 [H, W], disparities in 1/16 px as in `Matches`.
+
+    Returns:
+        Refined disparities and their standard deviations.
+
+    Raises:
+        InvalidInput: for other shapes or dtypes.
     """
     if left.ndim != 2 or left.shape != right.shape or left.dtype != torch.uint8 or right.dtype != torch.uint8:
         raise InvalidInput(

@@ -29,9 +29,9 @@ class RawGradients(NamedTuple):
     """Gradients of one frame's raw Gaussians, all zero if the frame's lists overflowed."""
 
     raw: Tensor
-    """[N, 16] in the layout of `scene.layout`, which is that of the deltas, whose gradient it is too."""
+    """Gradient [N, 16] in the layout of `scene.layout`; equals the gradient of the deltas."""
     sh: Tensor
-    """[N, B, 3]; empty for B = 1, where `raw[:, COLOUR]` is all there is."""
+    """Gradient of `sh` [N, B, 3]; empty for B = 1, where `raw[:, COLOUR]` contains it."""
 
 
 class GaussianAdam(NamedTuple):
@@ -51,7 +51,10 @@ class GaussianAdam(NamedTuple):
 
 
 class ColourCorrection(NamedTuple):
-    """Colours corrected by what the picture is off by, in place of a gradient; see `gsplat_core.training.colour_correction`."""
+    """Colour update from image residuals in place of a gradient.
+
+    See `gsplat_core.training.colour_correction`.
+    """
 
     residuals: Tensor
     """[H, W, 4]: red, green, blue of tissue (1, else 0) times (picture wanted - picture shown), and tissue."""
@@ -69,16 +72,25 @@ def render_frame_backward(
     *,
     deterministic: bool = True,
 ) -> RawGradients:
-    """Gradients of the raw parameters for dL/dimage and dL/dalphas.
+    """Compute gradients of the raw parameters from dL/dimage and dL/dalphas.
+
+    Camera and background receive no gradient.
 
     Args:
-        gaussians, deltas, view: as `render_frame` had them.
-        forward: what it returned in FrameMode.TRAINING.
-        v_image: [H, W, 4], dL/d(red, green, blue, sum of w z). v_alphas: [H, W], zero where None.
-        deterministic: the same bits every time. False: sums are taken as the tiles finish, with atomics, in 48 B of scratch memory per
-            Gaussian and not per instance.
+        gaussians: argument of the `render_frame` call.
+        deltas: argument of the `render_frame` call.
+        view: argument of the `render_frame` call.
+        forward: result of `render_frame` in FrameMode.TRAINING.
+        v_image: [H, W, 4], dL/d(red, green, blue, sum of weight times z).
+        v_alphas: [H, W], dL/dalphas; None for zero.
+        deterministic: bit-identical results. False sums by atomics in the order in which tiles
+            finish, and uses 48 B of scratch memory per Gaussian instead of per instance.
 
-    Neither the camera nor the background gets a gradient. Raises InvalidInput for wrong shapes, types or devices.
+    Returns:
+        Gradients of the raw parameters.
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices.
     """
     _check("render_frame_backward", gaussians, deltas, view, v_image, v_alphas)
     raw, sh = torch.ops.gsplat_core.render_frame_backward(
@@ -101,19 +113,31 @@ def render_frame_backward_adam_(
     needs_raw: bool = True,
     deterministic: bool = True,
 ) -> Tensor | None:
-    """As `render_frame_backward`, and one step of Adam over every Gaussian, in place.
+    """Run `render_frame_backward` and take one Adam step over every Gaussian, in place.
 
-    A Gaussian's row of a tensor stays as it is, moments and all, where its gradient (or the square of it) is not finite. If
-    the frame's lists overflowed, nothing changes.
+    A Gaussian's row of a tensor and its moments stay unchanged if its gradient, or the square of
+    it, is not finite. If the frame's lists overflowed, nothing changes.
 
     Args:
-        gaussians: five contiguous tensors, of memory of their own.
-        correction: the raw gradients' `COLOUR` is then what to add to the colours, and `sh` stays as it is. For harmonics of degree 0, and
-            a `v_image` that is 0 for the sum of w z.
-        needs_raw: whether the raw gradients are wanted.
+        gaussians: five contiguous tensors with separate memory.
+        adam: optimiser state.
+        deltas: argument of the `render_frame` call.
+        view: argument of the `render_frame` call.
+        forward: result of `render_frame` in FrameMode.TRAINING.
+        v_image: [H, W, 4], dL/d(red, green, blue, sum of weight times z).
+        v_alphas: [H, W], dL/dalphas; None for zero.
+        correction: residuals that replace the colour gradient. Column `COLOUR` of the result is
+            then the colour update, and `sh` is not changed. Requires SH degree 0 and a `v_image`
+            with zeros in the last channel.
+        needs_raw: return the raw gradients.
+        deterministic: as in `render_frame_backward`.
 
-    Returns the raw gradients [N, 16] for a deformation field, with zeros for a Gaussian that has one that is not finite; None
-    unless `needs_raw`.
+    Returns:
+        Raw gradients [N, 16] for a deformation field, with zeros for Gaussians that have a
+            non-finite gradient; None unless `needs_raw`.
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices.
     """
     _check("render_frame_backward_adam_", gaussians, deltas, view, v_image, v_alphas)
     _check_adam(gaussians, adam)

@@ -1,7 +1,7 @@
-"""The HexPlane field's ops in plain torch: any floating dtype and device, differentiable by ordinary autograd.
+"""HexPlane field ops in plain torch: any floating dtype and device, differentiable by autograd.
 
-`HexPlaneField` trains through them on the CPU and falls back to them where there are no kernels, and they are the oracle that the
-kernels are tested against.
+`HexPlaneField` (Cao & Johnson 2023) trains with them on the CPU and uses them where no kernels
+exist. They are also the reference for tests of the kernels.
 """
 
 from __future__ import annotations
@@ -90,10 +90,23 @@ def hexplane_deltas(
     order: Tensor | None = None,
     decode: Callable[..., Tensor] | None = None,
 ) -> Tensor:
-    """What the field adds to the raw parameters at `time` (a number in [-1, 1]) in the layout of `scene.layout`: [N, 16].
+    """Return the field's deltas of the raw parameters at `time`.
 
-    The time planes [V, U, C], three per level, are interpolated into lines, then `hexplane_decode` (or another `decode`). With `order`,
-    row i of the inputs is Gaussian order[i].
+    The time planes are interpolated to lines at `time`, which `hexplane_decode` (or `decode`)
+    combines with the space features.
+
+    Args:
+        spaces: per level the product of the space planes, [N, C].
+        coordinates: positions in [-1, 1], [N, 4].
+        time: normalised time in [-1, 1], one element.
+        time_planes: xt, yt, zt of every level, [V, U, C].
+        weights: weight matrices of the trunk's layers and the head.
+        biases: biases of the same layers.
+        order: row i of the inputs belongs to Gaussian order[i]; None for the identity.
+        decode: replacement for `hexplane_decode`.
+
+    Returns:
+        Deltas [N, 16] in the layout of `scene.layout`.
     """
     # Nothing here makes the host wait or copies from it, so that a CUDA graph can hold the call.
     lines = []

@@ -25,20 +25,30 @@ def hexplane_deltas(
     biases: Sequence[Tensor],
     order: Tensor | None = None,
 ) -> Tensor:
-    """What the field adds to every Gaussian's raw parameters at `time`: [N, 16], for inference (not differentiable).
+    """Return the HexPlane deltas of the raw parameters of all Gaussians at `time`, for inference.
+
+    Not differentiable. The field is that of Cao & Johnson 2023.
 
     Args:
-        spaces: per level the product of the space planes [N, C] (`hexplane_space`), all float32, or all float16: half the memory traffic,
-            and features and network rounded to half precision (sums stay float32).
-        coordinates: [N, 4] positions in [-1, 1], float32; the fourth is not read.
-        time: one float32 on the device, in [-1, 1]; clamped to it.
-        time_planes: xt, yt, zt of every level, [V, U, C] float32.
-        weights, biases: the trunk's layers and the head's as of `torch.nn.Linear`: one width, 11 outputs.
-        order: int32 [N]; row i of `spaces` and `coordinates` is Gaussian order[i]. Rows of neighbours side by side are faster.
+        spaces: per level the product of the space planes [N, C] (`hexplane_space`), all float32 or
+            all float16. float16 halves the memory traffic and rounds features and network to half
+            precision; sums stay float32.
+        coordinates: positions in [-1, 1], float32 [N, 4]; the fourth column is not read.
+        time: one float32 on the device, clamped to [-1, 1].
+        time_planes: xt, yt, zt of every level, float32 [V, U, C].
+        weights: weight matrices of the trunk's layers and the head as in `torch.nn.Linear`, with
+            one width and 11 outputs.
+        biases: biases of the same layers.
+        order: int32 [N]; row i of `spaces` and `coordinates` belongs to Gaussian order[i].
+            Spatially sorted rows are faster.
+
+    Returns:
+        Deltas [N, 16] in the layout of `scene.layout`.
 
     Raises:
-        InvalidInput: the tensors are not on a CUDA device, or not of one floating type.
-        RuntimeError: shapes do not fit together, or the layers are larger than the kernel takes (`takes_layers`).
+        InvalidInput: if the tensors are not on a CUDA device or have an unsupported dtype.
+        RuntimeError: if shapes do not match, or the layers exceed the kernel's limits
+            (`takes_layers`).
     """
     if coordinates.device.type != "cuda":
         raise InvalidInput(
@@ -61,7 +71,15 @@ def padded_width(width: int) -> int:
 
 
 def takes_layers(channels: int, levels: int, width: int, depth: int, item: int = 4) -> bool:
-    """Whether the kernels take a field of these sizes; `item` is 4 for float32 and 2 for float16 features."""
+    """Return True if the kernels support a field of these sizes.
+
+    Args:
+        channels: channels of a plane.
+        levels: number of resolution levels.
+        width: width of the trunk.
+        depth: number of layers of the trunk.
+        item: bytes per feature: 4 for float32, 2 for float16.
+    """
     padded = padded_width(width)
     features = channels * levels
     stride = features if features * item % 128 == 64 else features + 64 // item

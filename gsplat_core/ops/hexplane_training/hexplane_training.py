@@ -24,12 +24,14 @@ from gsplat_core.scene.layout import RAW_COLUMNS
 
 
 class TrainingState(NamedTuple):
-    """What the forward pass leaves for the backward pass."""
+    """Values of the forward pass saved for the backward pass."""
 
     deltas: Tensor
     """[N, 16] in the layout of `scene.layout`."""
     coordinates: Tensor
-    """[N, 4]: x, y, z in [-1, 1], and 1; a Gaussian whose position is not finite has zeros and is left out."""
+    """[N, 4]: x, y, z in [-1, 1], and 1. Gaussians with a non-finite position have zeros and are
+    skipped.
+    """
     lines: Tensor
     """The time planes interpolated at the time, [U, C] each, concatenated."""
     features: Tensor
@@ -62,7 +64,7 @@ class FieldGradient(NamedTuple):
 
     @property
     def of_planes(self) -> list[Tensor]:
-        """All but the network's, as the ops over the planes take it."""
+        """Return all fields except `network`, in the argument order of the plane ops."""
         return list(self[1:])
 
 
@@ -80,7 +82,7 @@ class AdamOnDevice(NamedTuple):
 
     @property
     def arguments(self) -> tuple[Tensor | float | None, ...]:
-        """In the order in which the ops take them."""
+        """Return the settings in the argument order of the ops."""
         return self.rate, self.step, self.status, *self.betas, self.epsilon
 
 
@@ -100,17 +102,24 @@ def hexplane_train(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> TrainingState:
-    """The field's deltas at `time`, with what the backward pass needs.
+    """Evaluate the HexPlane field (Cao & Johnson 2023) at `time`, saving values for the backward
+    pass.
 
     Args:
-        means: canonical positions [N, 3]; outside the box they are clamped to it.
-        box: [2, 3], the range of the positions.
-        time: one number in [-1, 1].
+        means: canonical positions [N, 3], float32; clamped to the box.
+        box: [2, 3], lower and upper corner of the positions.
+        time: normalised time in [-1, 1], one element.
         planes: xy, xz, yz, xt, yt, zt of every level, [V, U, C], C a multiple of 16.
-        weights, biases: the trunk's layers and the head's (`takes_layers` says which sizes fit).
+        weights: weight matrices of the trunk's layers and the head (`takes_layers` gives valid
+            sizes).
+        biases: biases of the same layers.
+
+    Returns:
+        Deltas [N, 16] and saved values.
 
     Raises:
-        InvalidInput: a tensor is not float32 on one CUDA device. RuntimeError: sizes do not fit.
+        InvalidInput: if a tensor is not float32, or they are not on one CUDA device.
+        RuntimeError: if sizes do not fit.
     """
     _check(means, box, time, *planes, *weights, *biases)
     state = torch.ops.gsplat_core.hexplane_train(means, box, time, list(planes), list(weights), list(biases))
@@ -125,9 +134,19 @@ def hexplane_train_backward(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> FieldGradient:
-    """Gradients for dL/d(deltas) `v_raw` [N, 16], to whose first 3 columns the gradient of the positions through the field is added.
+    """Compute the field's gradients from dL/d(deltas).
 
-    A row of `v_raw` that is not finite counts as zero.
+    Args:
+        v_raw: dL/d(deltas) [N, 16]. The positions' gradient through the field is added to columns 0
+            to 2. Rows with non-finite values count as zero.
+        box: argument of the forward call.
+        state: result of the forward call.
+        planes: argument of the forward call.
+        weights: argument of the forward call.
+        biases: argument of the forward call.
+
+    Returns:
+        Gradients of the network and, in factored form, of the planes.
     """
     _check(v_raw, box, *planes, *weights, *biases)
     network, rows, fractions, dense_sums, v_lines = torch.ops.gsplat_core.hexplane_train_backward(
@@ -150,12 +169,19 @@ def hexplane_planes_adam_(
     adam: AdamOnDevice,
     penalties: Penalties = Penalties(),
 ) -> None:
-    """One step of Adam over all planes in place, gradients and penalties computed in the same pass.
+    """Take one Adam step over all planes in place; gradients and penalties are computed in the same
+    pass.
 
-    A value whose gradient is not finite, and its moments, stay unchanged.
+    Values with a non-finite gradient, and their moments, stay unchanged.
 
     Args:
-        first, second: moments of the planes' shapes.
+        planes: planes of all levels as in `hexplane_train`.
+        first: first moments, with the planes' shapes.
+        second: second moments, with the planes' shapes.
+        time: normalised time of the forward call.
+        gradient: factored gradient.
+        adam: settings of the step.
+        penalties: weights of the regularisers.
     """
     _check(*planes, *first, *second, adam.rate)
     torch.ops.gsplat_core.hexplane_planes_adam_(

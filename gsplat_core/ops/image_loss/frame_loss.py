@@ -34,22 +34,29 @@ def frame_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> FrameLoss:
-    """`image_loss` of colours and expected depth as `render_frame` returns them in FrameMode.TRAINING, without a wait for the device.
+    """Compute `image_loss` for the colours and expected depth of a training frame, without host
+    sync.
 
-    The expected depth is the last channel over max(alpha, 1e-10). Nothing is differentiable: the gradients are results.
+    The inputs are those returned by `render_frame` in FrameMode.TRAINING. The expected depth is the
+    last channel divided by max(alpha, 1e-10). The function is not differentiable; the gradients are
+    part of the result.
 
     Args:
-        image: [H, W, 4] float32 on CUDA: red, green, blue, sum of weight times z.
-        alphas: [H, W] float32.
-        target: [H, W, 3] uint8.
-        mask: [H, W] uint8, non-zero = tissue; None = all tissue.
-        target_depth: [H, W] float32 in mm, 0 = unknown; None = no depth term.
-        ssim_weight: 0..1. With 0 the SSIM is not computed at all.
-        depth_weight: at least 0.
-        squared: as in `image_loss`.
+        image: float32 [H, W, 4] on CUDA: red, green, blue, and sum of weight times z.
+        alphas: float32 [H, W].
+        target: uint8 [H, W, 3].
+        mask: uint8 [H, W], non-zero = tissue; None = all tissue.
+        target_depth: float32 [H, W] in mm, 0 = unknown; None = no depth term.
+        ssim_weight: weight 0..1 of the SSIM term; 0 skips its computation.
+        depth_weight: weight of the depth term, at least 0.
+        squared: quadratic colour term, as in `image_loss`.
+
+    Returns:
+        Loss, its terms, and the gradients dL/dimage and dL/dalphas.
 
     Raises:
-        InvalidInput: shapes, types, device or weights are not as said; `gsplat_core.reference.frame_loss` takes any device and float64.
+        InvalidInput: for wrong shapes, dtypes, devices or weights;
+            `gsplat_core.reference.frame_loss` accepts any device and float64.
     """
     if image.ndim != 3 or image.shape[2] != 4 or image.dtype != torch.float32 or not image.is_cuda:
         raise InvalidInput(

@@ -24,25 +24,34 @@ def image_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> ImageLoss:
-    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) + depth_weight |1/depth - 1/target_depth|, each a mean over tissue.
+    """Compute the photometric and depth loss of a rendered image and its gradients.
 
-    SSIM is that of the masked images (Wang et al. 2004; 11x11 Gaussian of sigma 1.5, zero padding) averaged over tissue pixels. The depth
-    term averages over tissue pixels where both depths are known (> 0). A term over no pixel is 0 with zero gradient.
+    The loss is (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) + depth_weight |1/depth -
+    1/target_depth|. Each term is a mean over tissue pixels. SSIM (Wang et al. 2004; 11x11 Gaussian
+    window of sigma 1.5, zero padding) is computed on the masked images. The depth term uses tissue
+    pixels where both depths are known (> 0). A term without any pixel is 0 and has zero gradient.
 
-    A training step takes `grad_image` and `grad_depth` as they are and needs no autograd graph; `loss.backward()` gives the same ones.
+    A training step uses `grad_image` and `grad_depth` directly and needs no autograd graph;
+    `loss.backward()` gives the same gradients.
 
     Args:
-        image: [H, W, C] float32 in 0..1.
+        image: float32 [H, W, C] in 0..1.
         target: [H, W, C], uint8 (value / 255) or float32.
-        mask: [H, W], non-zero = tissue, any type; None = all tissue. Values elsewhere are not seen, not even NaN.
-        depth: [H, W] float32 in mm, 0 = unknown.
-        target_depth: [H, W] float32 in mm, 0 = unknown; needed with depth.
-        ssim_weight: 0..1. With 0 the SSIM is not computed at all.
-        depth_weight: at least 0.
-        squared: d² / 0.02 of every difference d in place of its L1 |d|: as steep as L1 at d = 0.01, about what a trained picture is off by.
+        mask: [H, W] of any dtype, non-zero = tissue; None = all tissue. Values outside the mask are
+            ignored, including NaN.
+        depth: float32 [H, W] in mm, 0 = unknown.
+        target_depth: float32 [H, W] in mm, 0 = unknown; required with depth.
+        ssim_weight: weight 0..1 of the SSIM term; 0 skips its computation.
+        depth_weight: weight of the depth term, at least 0.
+        squared: use d² / 0.02 of each difference d in place of |d|. Both have the same slope at d =
+            0.01, a typical residual of a trained picture.
+
+    Returns:
+        Loss, its terms, and the gradients of image and depth.
 
     Raises:
-        InvalidInput: shapes, types or weights are not as said; `gsplat_core.reference.image_loss` takes float64.
+        InvalidInput: for wrong shapes, dtypes or weights; `gsplat_core.reference.image_loss`
+            accepts float64.
     """
     if image.ndim != 3 or image.shape != target.shape or not 1 <= image.shape[2] <= MAX_CHANNELS:
         raise InvalidInput(

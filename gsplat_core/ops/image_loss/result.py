@@ -1,4 +1,4 @@
-"""What the image loss returns, compiled or in plain torch."""
+"""Result type of the image loss, shared by the compiled op and the plain-torch reference."""
 
 from __future__ import annotations
 

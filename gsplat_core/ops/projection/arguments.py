@@ -1,4 +1,4 @@
-"""What projection takes and returns: checks, and the packed form. Shared by the compiled op and the reference."""
+"""Argument checks and result types of projection, shared by the compiled op and the reference."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 MAX_EXTENT_SIGMAS = 3.33
-"""Beyond this many standard deviations a fully opaque Gaussian falls below the alpha cut-off of 1/255."""
+"""Distance in standard deviations at which an opaque Gaussian falls below the 1/255
+alpha cut-off.
+"""
 ALPHA_CUTOFF = 1.0 / 255.0
 COMPENSATION_FLOOR = 0.005
 """Smallest antialiasing compensation (Yu et al. 2024, Mip-Splatting, as published in its code), unless another is given."""
@@ -90,8 +92,12 @@ def check_projection_tensors(
 def check_projection_options(
     width: int, height: int, sparse_grad: bool, camera_model: str, compensation_floor: float
 ) -> None:
-    """Raise InvalidInput on an image without pixels, an unknown camera or a floor that is no factor of an opacity,
-    NotImplementedError on what only gsplat has."""
+    """Check the options of a projection.
+
+    Raises:
+        InvalidInput: for an empty image, an unknown camera model or a floor outside 0..1.
+        NotImplementedError: for options that only gsplat supports.
+    """
     if width < 1 or height < 1:
         raise InvalidInput(f"the image must be at least 1x1 px, got width={width}, height={height}")
     if not 0 <= compensation_floor <= 1:

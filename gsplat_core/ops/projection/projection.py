@@ -42,31 +42,44 @@ def fully_fused_projection(
     *,
     compensation_floor: float = COMPENSATION_FLOOR,
 ) -> DenseProjection | PackedProjection:
-    """Project Gaussians to image ellipses, as gsplat 1.5.3 does.
+    """Project 3D Gaussians to 2D image Gaussians by EWA splatting (Zwicker et al. 2001), as gsplat
+    1.5.3.
+
+    A Gaussian with a NaN, an infinity, or a value whose square exceeds float32 is culled and gets
+    zero gradients. Differentiable in means, covars, quats, scales and viewmats. Sums over Gaussians
+    run in a fixed order.
 
     Args:
-        means: [..., N, 3]; `...` are any batch dimensions, the same everywhere.
-        covars: upper triangles [..., N, 6], or None with quats and scales given.
-        quats: [..., N, 4] wxyz, of any length but zero. scales: [..., N, 3].
-        viewmats: world to camera [..., C, 4, 4], OpenCV axes. Ks: [..., C, 3, 3] in pixels, without skew.
+        means: float32 [..., N, 3]; `...` are any batch dimensions, common to all inputs.
+        covars: upper triangles [..., N, 6], or None if quats and scales are given.
+        quats: [..., N, 4] wxyz, of any non-zero length.
+        scales: [..., N, 3], standard deviations.
+        viewmats: world-to-camera [..., C, 4, 4], OpenCV axes.
+        Ks: intrinsics [..., C, 3, 3] in pixels, without skew.
+        width: image width in pixels.
+        height: image height in pixels.
         eps2d: blur in pixels² added to the diagonal of the 2D covariance.
-        near_plane, far_plane: a Gaussian whose centre's z lies outside is culled.
+        near_plane: smallest z of a centre that is not culled.
+        far_plane: largest z of a centre that is not culled.
         radius_clip: a Gaussian with both radii at or below this many pixels is culled.
-        packed: one row per Gaussian that is not culled.
-        calc_compensations: also max(compensation_floor, sqrt(det Σ / det (Σ + blur))) (Yu et al. 2024).
-        camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or "fisheye" (equidistant).
-        opacities: [..., N]; makes the box as tight as the opacity allows, min(3.33, sqrt(2 ln(255 o))) standard
-            deviations, and culls Gaussians that cannot reach an alpha of 1/255.
-        compensation_floor: 0.005 as in gsplat 1.6, or another (1.5.3 has 0); where it holds there is no gradient.
+        packed: return one row per visible pair of camera and Gaussian.
+        sparse_grad: not supported.
+        calc_compensations: also return the opacity compensation max(compensation_floor, sqrt(det Σ
+            / det (Σ + blur))) (Yu et al. 2024).
+        camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or
+            "fisheye" (equidistant).
+        opacities: [..., N]; limits the radii to min(3.33, sqrt(2 ln(255 o))) standard deviations
+            and culls Gaussians that cannot reach an alpha of 1/255.
+        compensation_floor: lower limit of the compensation, without gradient where active; 0.005 in
+            gsplat 1.6, 0 in 1.5.3.
 
     Returns:
-        `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or `PackedProjection`.
+        `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or
+            `PackedProjection`.
 
-    A Gaussian with a NaN or an infinity (or a value whose square leaves float32's range) is culled and gets zero
-    gradients. Differentiable in means, covars, quats, scales and viewmats; sums over Gaussians run in a fixed order.
-
-    Raises InvalidInput for wrong shapes, dtypes (float64 is for `gsplat_core.reference`) or devices, NotImplementedError
-    for sparse_grad and gsplat's other camera models.
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices; `gsplat_core.reference` accepts float64.
+        NotImplementedError: for sparse_grad and gsplat's other camera models.
     """
     inputs = (means, covars, quats, scales, opacities, viewmats, Ks)
     batch_dims = check_projection_tensors(*inputs)

@@ -15,12 +15,17 @@ MOST_SCALARS = 64
 
 
 def store_scalars_(to: Tensor, values: Sequence[float]) -> None:
-    """Write `values`, at most 64, into `to`: float32, contiguous, as many elements.
+    """Write host values into a device tensor without synchronisation.
 
-    On CUDA they travel in the arguments of a launch on the current stream, so that the host neither waits nor keeps them.
+    On CUDA the values are passed as launch arguments on the current stream, so no host buffer is
+    needed.
+
+    Args:
+        to: float32, contiguous.
+        values: at most 64 values, as many as `to` has elements.
 
     Raises:
-        InvalidInput: type, layout or number are not as said.
+        InvalidInput: if dtype, layout or count differ from the above.
     """
     require_float32("store_scalars_", to=to)
     if not to.is_contiguous() or to.numel() != len(values) or len(values) > MOST_SCALARS:

@@ -1,4 +1,7 @@
-"""Semi-global matching (Hirschmüller 2008) of two pictures whose rows correspond, in integers: CPU and CUDA give the same results."""
+"""Semi-global matching (Hirschmüller 2008) of rectified pictures in integer arithmetic.
+
+CPU and CUDA give identical results.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 COUNT_STEP, MOST_DISPARITIES = 16, 256
 """The number of disparities is a multiple of the first, and at most the second."""
 SIXTEENTHS = 16
-"""Of a pixel: what disparities are matched in."""
+"""Disparity units per pixel."""
 UNKNOWN = torch.iinfo(torch.int32).min
 """The disparity of a pixel that was not matched."""
 

@@ -17,11 +17,20 @@ from gsplat_core.scene.cameras import Camera
 
 
 def surface_motion(points: Tensor, flow: Tensor, before: Camera, after: Camera, *, arrived: bool) -> Tensor:
-    """How points [N, 3] move in the world, [N, 3], from the picture of `before` to that of `after`, as `flow` [h, w, 2] says in pixels.
+    """Lift optical flow to the 3D motion of surface points (CPU).
 
-    `points` are where they are in the first picture, or with `arrived` in the second one. Those outside of that picture do not move.
+    Args:
+        points: float32 [N, 3], positions at the time of `before`, or of `after` if `arrived`.
+        flow: float32 [h, w, 2] in pixels, from the picture of `before` to that of `after`.
+        before: pinhole camera of the first picture.
+        after: pinhole camera of the second picture.
+        arrived: `points` are positions at the time of the second picture.
 
-    Raises InvalidInput for wrong shapes, dtypes or devices, and for a camera that is no pinhole.
+    Returns:
+        Motion [N, 3] in the world; zero for points outside the picture.
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices, and for other camera models.
     """
     require_float32("surface_motion", points=points, flow=flow)
     if points.device.type != "cpu":

@@ -1,4 +1,4 @@
-"""How an image is cut into tiles; shared by the compiled ops and the reference."""
+"""Partition of an image into tiles, shared by the compiled ops and the reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which tiles each splat touches, and every tile's splats in depth order."""
+"""Binning of splats into tiles, with each tile's splats sorted by depth (Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -85,20 +85,26 @@ def bin_splats(
     opacities: Tensor | None = None,
     capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`isect_tiles` (sorted) and `isect_offset_encode` in one, without the 64-bit ids that only they need.
+    """Bin splats into tiles: `isect_tiles` (sorted) and `isect_offset_encode` without 64-bit ids.
+
+    The tensors and remaining options are those of `isect_tiles`.
 
     Args:
-        grid: the tiles; the other tensors and options are those of `isect_tiles`.
-        capacity: None makes the lists exactly as long as they must be, for which the host waits on CUDA. A number makes
-            them this long on any device: nothing waits, and the call can be captured in a CUDA graph. Entries that are
-            not used are -1 and lie in front of the first tile's list, so no offset refers to them. When `needed` is
-            larger than the capacity, the lists hold the nearest splats of all images whose tiles fit in whole, and the
-            caller is to call again with more. 0 to 2^31 - 1.
+        grid: tiles of the image.
+        capacity: length of the lists, 0 to 2^31 - 1. None makes them exactly as long as needed, for
+            which the host synchronises on CUDA. A number fixes the length on any device without
+            synchronisation, so a CUDA graph can capture the call. Unused entries are -1 and precede
+            the first tile's list, so no offset refers to them. If `needed` exceeds the capacity,
+            the lists contain the nearest splats of all images whose tiles fit completely, and the
+            caller must repeat the call with a larger capacity.
 
     Returns:
-        tiles_per_gauss int32 [..., N], flatten_ids int32 [M] or [capacity], isect_offsets int32
-        [..., tile_height, tile_width]; and with a capacity `needed`, int64 [1] on the device of the splats: how many entries
-        all splats together have. Compositing takes the lists of either kind.
+        tiles_per_gauss int32 [..., N], flatten_ids int32 [M] or [capacity], and isect_offsets int32
+            [..., tile_height, tile_width]. With a capacity also `needed`, int64 [1] on the splats'
+            device: the total number of entries. Compositing accepts both kinds of lists.
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes, devices or capacity.
     """
     images, chosen = _check(means2d, radii, depths, packed, n_images, image_ids, conics, opacities)
     splats = (*_flat(means2d, radii, depths, conics, opacities), chosen)
@@ -120,7 +126,17 @@ def bin_splats(
 
 
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """Where each tile's entries start in the sorted `isect_ids` of `isect_tiles`: int32 [n_images, tile_height, tile_width]."""
+    """Return the start of each tile's entries in sorted ids.
+
+    Args:
+        isect_ids: int64 [M], sorted ids returned by `isect_tiles`.
+        n_images: number of images.
+        tile_width: tiles per row.
+        tile_height: tiles per column.
+
+    Returns:
+        int32 [n_images, tile_height, tile_width].
+    """
     return torch.ops.gsplat_core.isect_offset_encode(isect_ids, n_images, tile_width, tile_height)
 
 
@@ -165,7 +181,7 @@ def _check(
 def _flat(
     means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor | None, opacities: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-    """All images in one row, without gradients: which tiles a splat touches has none."""
+    """Flatten all images into one dimension and detach, because binning has no gradient."""
     return (
         means2d.detach().reshape(-1, 2),
         radii.reshape(-1, 2),
