@@ -1,7 +1,8 @@
-"""The splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file formats.
+"""Splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file
+formats.
 
-Names are loaded when they are first used: importing the package alone loads neither torch nor the compiled library, so
-`gsplat_core.reference` works where the library was not built.
+Names are imported lazily. Importing the package alone loads neither torch nor the compiled library,
+so `gsplat_core.reference` works without a built library.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ _HOME = {
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
 }
-"""The module that each public name lives in."""
+"""Module that defines each public name."""
 
 
 def __getattr__(name: str) -> Any:

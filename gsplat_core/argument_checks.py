@@ -10,13 +10,20 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 
 def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...], meaning: str) -> None:
-    """Raise InvalidInput unless `tensor` has exactly `shape`; `meaning` names the dimensions, as "[..., N, 3]"."""
+    """Raise InvalidInput unless `tensor` has exactly `shape`.
+
+    Args:
+        name: argument name for the message.
+        tensor: argument.
+        shape: required shape.
+        meaning: symbolic shape for the message, such as "[..., N, 3]".
+    """
     if tuple(tensor.shape) != tuple(shape):
         raise InvalidInput(f"{name} must be {meaning} = {list(shape)}, got {list(tensor.shape)}")
 
 
 def require_trailing(name: str, tensor: Tensor, trailing: tuple[int, ...], meaning: str) -> tuple[int, ...]:
-    """Raise InvalidInput unless the shape ends in `trailing`; returns the leading dimensions."""
+    """Raise InvalidInput unless the shape ends in `trailing`; return the leading dimensions."""
     split = tensor.dim() - len(trailing)
     if split < 0 or tuple(tensor.shape[split:]) != tuple(trailing):
         raise InvalidInput(f"{name} must be {meaning}, got {list(tensor.shape)}")
@@ -33,7 +40,9 @@ def require_same_kind(**tensors: Tensor | None) -> None:
 
 
 def require_float32(op: str, **tensors: Tensor | None) -> None:
-    """Raise InvalidInput unless all given tensors are float32, on one device for which this build has `op`'s kernels."""
+    """Raise InvalidInput unless all tensors are float32 on one device with compiled kernels for
+    `op`.
+    """
     given = {name: tensor for name, tensor in tensors.items() if tensor is not None}
     first = next(iter(given.values()), None)
     for name, tensor in given.items():

@@ -23,15 +23,15 @@ class UserError(Exception):
 
 
 class CoreError(Exception):
-    """Base of everything the core raises on purpose."""
+    """Base of all exceptions raised deliberately by the core."""
 
 
 class InvalidInput(CoreError, ValueError):
-    """A call of an API has an argument of a wrong shape, type or value: a mistake of the calling program, not of its user."""
+    """Argument of a wrong shape, type or value: a bug in the calling program, not a user error."""
 
 
 class InvalidSetting(CoreError, UserError, ValueError):
-    """An option that a user chose (a number of steps, a scale, a name) is out of its range."""
+    """User-chosen option (a number of steps, a scale, a name) out of its range."""
 
 
 class NativeLibraryMissing(CoreError, UserError):
@@ -43,7 +43,7 @@ class BundleError(CoreError, UserError):
 
 
 class BundleCorrupt(BundleError):
-    """A model file has a wrong digest, is truncated or holds values that are not finite."""
+    """A model file has a wrong digest, is truncated or contains non-finite values."""
 
 
 class UnknownFormatVersion(BundleError):
@@ -51,7 +51,7 @@ class UnknownFormatVersion(BundleError):
 
 
 class ExportError(CoreError, UserError):
-    """A model cannot be written in a format of other programs."""
+    """A model cannot be represented in a foreign file format."""
 
 
 class RecordingError(CoreError, UserError):
@@ -63,4 +63,4 @@ class RecordingMissing(RecordingError):
 
 
 class RecordingInvalid(RecordingError):
-    """Counts, sizes, polarity, calibration or video data of a recording are wrong."""
+    """Wrong counts, sizes, mask polarity, calibration or video data in a recording."""

@@ -8,14 +8,17 @@ from pathlib import Path
 
 
 def available_bytes() -> int | None:
-    """Memory that a process can still take without swapping: the system's, or less where a control group or `ulimit -v` limits it. None: not
-    known."""
+    """Return the memory in bytes that the process can still allocate without swapping.
+
+    This is the smallest of the system's available memory and the limits of control group and
+    `ulimit -v`. None if unknown.
+    """
     limits = [limit for limit in (_of_system(), _of_control_group(), _of_process()) if limit is not None]
     return min(limits) if limits else None
 
 
 def in_gib(count: int) -> str:
-    """A number of bytes for people: "3.2 GiB"."""
+    """Format a number of bytes for display, such as "3.2 GiB"."""
     return f"{count / 2**30:.1f} GiB"
 
 

@@ -1,4 +1,4 @@
-"""Implementations that are chosen by name: deformation fields, renderers, sources, sinks."""
+"""Registry of implementations selected by name: deformation fields, renderers, sources, sinks."""
 
 from __future__ import annotations
 
@@ -29,13 +29,21 @@ class Registry(Generic[Kind]):
         self._entries: dict[str, Any] = dict(entries or {})
 
     def add(self, name: str, kind: Kind | str) -> None:
-        """Register `kind` as `name`. Raises InvalidInput when the name is taken."""
+        """Register `kind` as `name`.
+
+        Raises:
+            InvalidInput: if the name is taken.
+        """
         if name in self._entries:
             raise InvalidInput(f"there is a {self.what} {name!r} already; choose another name")
         self._entries[name] = kind
 
     def remove(self, name: str) -> None:
-        """Forget `name`. Raises InvalidSetting when it is not registered."""
+        """Remove the entry of `name`.
+
+        Raises:
+            InvalidSetting: if the name is not registered.
+        """
         self.check(name)
         del self._entries[name]
 
@@ -62,6 +70,10 @@ class Registry(Generic[Kind]):
         return len(self._entries)
 
     def check(self, name: str) -> None:
-        """Raises InvalidSetting, with the known names, when `name` is not registered."""
+        """Check that a name is registered.
+
+        Raises:
+            InvalidSetting: if not; the message lists the known names.
+        """
         if name not in self._entries:
             raise InvalidSetting(f"unknown {self.what} {name!r}; known are {', '.join(self._entries) or 'none'}")

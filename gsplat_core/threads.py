@@ -16,9 +16,10 @@ import torch
 
 
 def use_one_thread() -> None:
-    """Let torch operations of the calling thread use one core from now on. Other threads keep their number.
+    """Limit torch operations of the calling thread to one core permanently.
 
-    torch stores the number for the calling thread, and as the default of threads that have not computed yet. Another thread restores that default.
+    torch stores the number per thread, and as the default of threads that have not computed yet.
+    Another thread restores that default.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -29,9 +30,11 @@ def use_one_thread() -> None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch operations of the calling thread use one core inside the block, or inside the decorated function.
+    """Limit torch operations of the calling thread to one core within a block or decorated
+    function.
 
-    Their results then do not depend on the number of threads. Nested use costs nothing. The outermost use takes about 0.1 ms.
+    Results then do not depend on the number of cores. Nested use costs nothing. The outermost use
+    takes about 0.1 ms.
     """
     before = torch.get_num_threads()
     if before == 1:

@@ -11,10 +11,11 @@ from torch import Tensor
 
 
 def tensor_of(array: NDArray, device: torch.device | str = "cpu") -> Tensor:
-    """The array as a tensor on `device`.
+    """Return the array as a tensor on `device`.
 
-    On the CPU it shares the array's memory when torch allows it. To a GPU it goes by way of page-locked memory, queued on the current
-    stream; the array may be changed as soon as this returns.
+    On the CPU the tensor shares the array's memory if torch permits. The copy to a GPU is staged
+    through page-locked memory and enqueued on the current stream. The array may be changed
+    immediately after the call.
     """
     array = np.ascontiguousarray(array)
     device = torch.device(device)
@@ -30,8 +31,10 @@ def _torch_type(dtype: np.dtype[Any]) -> torch.dtype:
 
 
 class StagedCopies:
-    """Copies of a GPU's tensors in host memory, piece by piece through a little page-locked memory, on a stream of their own: neither the GPU's other
-    work nor other threads wait for a large tensor. For one thread at a time."""
+    """Device-to-host copies in pieces through a small page-locked buffer on a separate stream.
+
+    Neither other GPU work nor other threads wait for a large tensor. Not thread-safe.
+    """
 
     PIECE_BYTES = 1 << 22
 

@@ -1,4 +1,4 @@
-"""Ranges of values that come from outside (a file, a message): stated once, checked before the values are used."""
+"""Ranges of external values (from files or messages), checked before the values are used."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 
 @dataclass(frozen=True)
 class IntegerIn:
-    """An integer from `low` to `high`, both included. A bool is none."""
+    """Integer from `low` to `high`, both included; bools are rejected."""
 
     low: int
     high: int
@@ -19,7 +19,7 @@ class IntegerIn:
         return f"an integer from {self.low} to {self.high}"
 
     def checked(self, name: str, value: object) -> int:
-        """The value; InvalidInput when it is not in the range."""
+        """Return the value, or raise InvalidInput if it is outside the range."""
         if not isinstance(value, int) or isinstance(value, bool) or not self.low <= value <= self.high:
             raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
         return value
@@ -27,7 +27,7 @@ class IntegerIn:
 
 @dataclass(frozen=True)
 class NumberIn:
-    """A finite number from `low` to `high`, both included. A bool is none."""
+    """Finite number from `low` to `high`, both included; bools are rejected."""
 
     low: float
     high: float
@@ -36,7 +36,7 @@ class NumberIn:
         return f"a number from {self.low:g} to {self.high:g}"
 
     def checked(self, name: str, value: object) -> float:
-        """The value; InvalidInput when it is not in the range."""
+        """Return the value, or raise InvalidInput if it is outside the range."""
         # Compared before it becomes a float: an integer may be larger than any float.
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
@@ -46,7 +46,7 @@ class NumberIn:
 
 @dataclass(frozen=True)
 class ListOf:
-    """A list of `shortest` to `longest` values that are each in the range `item`."""
+    """List of `shortest` to `longest` values, each in the range `item`."""
 
     item: IntegerIn | NumberIn
     shortest: int
@@ -57,7 +57,7 @@ class ListOf:
         return f"a list of {lengths} values, each {self.item}"
 
     def checked(self, name: str, value: object) -> list[float]:
-        """The list; InvalidInput when it is none, has another length, or a value out of its range."""
+        """Return the list, or raise InvalidInput for another type, length or value."""
         if not isinstance(value, list | tuple) or not self.shortest <= len(value) <= self.longest:
             raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
         return [self.item.checked(f"{name}[{index}]", each) for index, each in enumerate(value)]
@@ -67,7 +67,7 @@ ValueRange = IntegerIn | NumberIn | ListOf
 
 
 def shortened(value: object, most: int = 80) -> str:
-    """`repr` of a value that may be huge, in at most so many characters."""
+    """Return the `repr` of a possibly huge value, truncated to `most` characters."""
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 256:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, list | tuple | dict | str) and len(value) > 64:
@@ -77,7 +77,9 @@ def shortened(value: object, most: int = 80) -> str:
 
 
 def check_seen_at(time_s: float, window_s: tuple[float, float]) -> None:
-    """Raise InvalidSetting for a time outside of the window (start, end) that a model has seen; all in seconds."""
+    """Raise InvalidSetting for a time outside the model's observed window (start, end),
+    in seconds.
+    """
     start_s, end_s = window_s
     if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
         raise InvalidSetting(

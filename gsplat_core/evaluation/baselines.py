@@ -1,8 +1,9 @@
-"""Trivial baselines that a reconstruction is compared with: copies of earlier frames, means of frames, and optical flow between them.
+"""Trivial baselines of a reconstruction: frame copies, frame means, and optical flow.
 
-A copy of the previous frame is a strong baseline in slow endoscopy. A reconstruction that scores below it shows nothing that a frozen video would not.
-The recording is read twice, with at most ten frames and one sum in memory. Frames are held out by their number, `Frame.seq`. Damaged and withheld
-frames are neither scored nor part of a mean. Where numbers are missing, the previous frame is the last one that arrived.
+A copy of the previous frame is a strong baseline in slow endoscopy. A reconstruction that scores
+lower adds nothing to a frozen video. The recording is read twice, with at most ten frames and one
+sum in memory. Frames are held out by `Frame.seq`. Damaged and withheld frames are neither scored
+nor part of a mean. Where numbers are missing, the previous frame is the last one that arrived.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ImageLike, ScoredMean, psnr_tissue_db, psnrs_db, unit_image
 
 SMALLEST_SIDE_PX = 12
-"""The shortest side that the flow is found for."""
+"""Shortest image side in pixels for which optical flow is computed."""
 _per_thread = threading.local()
 
 
@@ -47,7 +48,11 @@ def half_velocity(before_last: NDArray[np.uint8], last: NDArray[np.uint8]) -> ND
 
 
 def half_way(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """The picture half-way between two: the mean of both, each moved half of the way to the other. It sees the future. As `half_velocity`."""
+    """Interpolate the picture between two frames: the mean of both, each moved half-way to the
+    other.
+
+    Non-causal. Arguments and result are those of `half_velocity`.
+    """
     forward, backward = _flow(before, after), _flow(after, before)
     if forward is None or backward is None:
         return None
@@ -83,7 +88,7 @@ AGES = (1, 2, 3, 5, 8)
 PREVIOUS_FRAME, NEIGHBOUR_MEAN, TRAIN_MEAN = "previous_frame", "neighbour_mean", "train_mean"
 HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
 SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
-"""Baselines that need the frame after the one that they are scored on, which a live system does not have."""
+"""Baselines that use the frame after the scored one, unavailable to a live system."""
 _MAX_THREADS = 4
 
 
@@ -106,7 +111,7 @@ class BaselineScore:
 
 @dataclass(frozen=True)
 class Baselines:
-    """Each baseline, against the tissue pixels of the frame that is scored."""
+    """Scores of each baseline over tissue pixels of the scored frames."""
 
     copies: Mapping[int, BaselineScore] = field(default_factory=dict)
     """Scores by age in frames of the copy that is shown instead of each frame."""
@@ -119,26 +124,28 @@ class Baselines:
     use the next frame), and the mean of all training frames including their tools.
     """
     left_out: Mapping[str, int] = field(default_factory=dict)
-    """Frames that were not scored, by reason."""
+    """Numbers of excluded frames by reason."""
 
     @property
     def previous_frame_db(self) -> float | None:
-        """Frame i-1 shown for frame i, over all frames from the second on: the comparison for live quality."""
+        """PSNR of frame i-1 against frame i, over all frames from the second on; baseline of live
+        quality.
+        """
         return self.copies.get(1, _NOTHING).psnr_tissue_db
 
     @property
     def heldout_previous_frame_db(self) -> float | None:
-        """Frame i-1 shown for held-out frame i."""
+        """PSNR of frame i-1 against held-out frame i."""
         return self.heldout.get(PREVIOUS_FRAME, _NOTHING).psnr_tissue_db
 
     @property
     def heldout_neighbour_mean_db(self) -> float | None:
-        """Mean of frames i-1 and i+1 shown for held-out frame i. It sees the future, which a live system cannot."""
+        """PSNR of the mean of frames i-1 and i+1 against held-out frame i; non-causal."""
         return self.heldout.get(NEIGHBOUR_MEAN, _NOTHING).psnr_tissue_db
 
     @property
     def heldout_train_mean_db(self) -> float | None:
-        """Mean of all training frames shown for every held-out frame."""
+        """PSNR of the mean of all training frames against every held-out frame."""
         return self.heldout.get(TRAIN_MEAN, _NOTHING).psnr_tissue_db
 
 
@@ -212,7 +219,7 @@ class _Values:
 
 
 def _compare(frame: Frame, before: Sequence[Frame], after: Frame | None, ages: Sequence[int], flow: bool) -> _Values:
-    """Score one frame's baselines. before: the frames that came before, newest first."""
+    """Score the baselines of one frame; `before` contains the preceding frames, newest first."""
     found: dict[tuple[str, object], tuple[float, ...]] = {}
 
     def score(group: str, name: object, picture: ImageLike | None) -> None:
@@ -242,7 +249,7 @@ def _tissue_in_both(frame: Frame, other: Frame) -> NDArray[np.uint8] | None:
 
 
 def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Frame, list[Frame], Frame | None]]:
-    """Each frame with up to `most` frames that came before it, newest first, and the one that came after it."""
+    """Yield each frame with up to `most` preceding frames, newest first, and the next frame."""
     window: deque[Frame] = deque(maxlen=most + 2)
     for frame in recording:
         if window and window[-1].image.shape != frame.image.shape:
@@ -257,7 +264,7 @@ def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Fra
 
 
 class _Sums:
-    """A mean for each measure of each baseline."""
+    """Mean of each measure of each baseline."""
 
     def __init__(self) -> None:
         self._means: dict[tuple[str, object], tuple[ScoredMean, ...]] = {}
@@ -285,8 +292,10 @@ class _Sums:
 
 
 class _Pool:
-    """Compares frames in a few threads, a bounded number at a time; results are taken in order. OpenCV and torch work without the
-    interpreter's lock."""
+    """Bounded thread pool that returns results in order.
+
+    OpenCV and torch release the interpreter lock during the comparison.
+    """
 
     def __init__(self) -> None:
         self._threads = min(_MAX_THREADS, cpu_count() or 1)
@@ -330,7 +339,7 @@ class _TrainMean:
         self._count += 1
 
     def image(self) -> NDArray[np.float32] | None:
-        """The mean in 0..1; None without any image."""
+        """Mean in 0..1; None without any image."""
         if self._sum is None:
             return None
         return (self._sum / (255.0 * self._count)).astype(np.float32)

@@ -35,9 +35,9 @@ class FlatDepths(NamedTuple):
     """Depth z [N] of the baselines at the pixels that were given."""
 
     level: Array
-    """The median true depth, at every pixel: a plane across the optical axis."""
+    """Median true depth at every pixel: a plane perpendicular to the optical axis."""
     plane: Array
-    """The plane with the least squared error in z, tilted as it may be."""
+    """Plane of any tilt with the least squared error in z."""
 
 
 def flat_depths(rays: Array, z: Array) -> FlatDepths | None:
@@ -52,10 +52,12 @@ def flat_depths(rays: Array, z: Array) -> FlatDepths | None:
 
 
 def best_plane(rays: Array, z: Array) -> Array | None:
-    """Return the plane n [3] with n · (x, y, z) = 1 that minimises the sum of (1 / (n · ray) - z)², in front of the camera at every pixel given.
+    """Fit the plane n [3] with n · (x, y, z) = 1 that minimises the sum of (1 / (n · ray) - z)².
 
-    The problem is not linear in n. Levenberg and Marquardt's method starts from the best level plane and from two linear fits of 1/z; the best end counts.
-    No step that increases the error is taken, so that the result is never worse than a level plane. None for fewer than three pixels.
+    The plane is in front of the camera at every given pixel. The problem is not linear in n.
+    Levenberg and Marquardt's method starts from the best level plane and from two linear fits of
+    1/z, and the best result is returned. No step that increases the error is accepted, so the
+    result is never worse than a level plane. None for fewer than three pixels.
 
     Args:
         rays: (x/z, y/z, 1) of the pixels [N, 3].
@@ -77,7 +79,7 @@ def best_plane(rays: Array, z: Array) -> Array | None:
 
 
 def _descended(plane: Array, rays: Array, z: Array) -> tuple[Array, float]:
-    """Return the plane at the end of the descent from `plane`, and its squared error."""
+    """Return the plane found by descent from `plane`, and its squared error."""
     found = 1 / (rays @ plane)
     error, damping = float(np.square(found - z).sum()), 1e-3
     for _ in range(MOST_STEPS):
@@ -100,7 +102,10 @@ def _descended(plane: Array, rays: Array, z: Array) -> tuple[Array, float]:
 
 
 def pixels_to_compare(camera: Camera, where: NDArray[np.bool_], most: int, *planes: NDArray[Any]) -> tuple[Array, ...]:
-    """Return rays [N, 3] and the values [N] of each of `planes` [H, W] at no more than about `most` pixels of `where` [H, W], spread evenly."""
+    """Return rays [N, 3] and the values [N] of each plane at evenly spaced pixels.
+
+    At most about `most` pixels of `where` [H, W] are used.
+    """
     chosen = np.flatnonzero(where)
     chosen = chosen[:: max(1, len(chosen) // most)]
     rays = pixel_rays(camera).reshape(-1, 3)[chosen]
@@ -118,9 +123,11 @@ class DepthErrors:
     relative: float
     """Mean absolute error divided by the true depth."""
     scaled_rmse_mm: float
-    """`rmse_mm` after each frame's depth was multiplied by one factor, the median of true over rendered depth: of the shape alone."""
+    """RMSE after scaling each frame by its median of true over rendered depth; measures shape
+    alone.
+    """
     covered: float
-    """Share of these pixels at which the model has depth; the others are in no error."""
+    """Share of tissue pixels with known depth at which the model has depth. Others add no error."""
     frames: int
 
 
@@ -132,7 +139,11 @@ class DepthSums:
         self._frames = 0
 
     def add(self, frame: Frame, depth: NDArray[np.float32]) -> float:
-        """Compare depth z [H, W], 0 = unknown, with the frame's; returns the mean absolute error, NaN where nothing can be compared."""
+        """Compare rendered depth z [H, W], 0 = unknown, with the frame's depth.
+
+        Returns:
+            Mean absolute error, NaN if nothing is comparable.
+        """
         if frame.depth is None:
             return math.nan
         known = np.isfinite(frame.depth) & (frame.depth > 0)
@@ -160,7 +171,7 @@ class DepthSums:
 
     @property
     def errors(self) -> DepthErrors | None:
-        """The means so far; None where no frame could be compared."""
+        """Means so far; None if no frame was comparable."""
         means = {name: mean.mean for name, mean in self._means.items()}
         found = {name: value for name, value in means.items() if value is not None}
         return DepthErrors(**found, frames=self._frames) if len(found) == len(means) else None
@@ -172,16 +183,19 @@ MOST_DEPTH_PIXELS = 8192
 
 @dataclass(frozen=True)
 class DepthShare:
-    """Errors over all compared pixels of all compared frames: tissue, with known depth, at which the model has depth."""
+    """Errors over all compared pixels of all frames.
+
+    Compared are tissue pixels with known depth at which the model has depth.
+    """
 
     rmse_share: float
-    """Root of the mean squared error, divided by the median true depth."""
+    """RMSE divided by the median true depth."""
     scaled_rmse_share: float
     """RMSE share after scaling the model's depth by `scale`; measures the shape alone."""
     plane_rmse_share: float
-    """Error of each frame's best-fit plane (`FlatDepths.plane`), which is fitted to the truth."""
+    """Error of each frame's best-fit plane (`FlatDepths.plane`), a baseline fitted to the truth."""
     level_rmse_share: float
-    """Error of each frame's level plane (`FlatDepths.level`), which is fitted to the truth."""
+    """Error of each frame's level plane (`FlatDepths.level`), a baseline fitted to the truth."""
     median_share: float
     """Median of the absolute error after `scale`, divided by the true depth."""
     rmse: float
@@ -190,19 +204,19 @@ class DepthShare:
     """Scale factor of the whole sequence: the median of true depth over model depth."""
     median_depth: float
     covered: float
-    """Share of the pixels of tissue with known depth at which the model has depth."""
+    """Share of tissue pixels with known depth at which the model has depth."""
     frames: int
 
 
 class DepthShareSums:
-    """Takes frames one at a time; keeps at most `MOST_DEPTH_PIXELS` of each."""
+    """Streaming accumulator of depth samples, at most `MOST_DEPTH_PIXELS` per frame."""
 
     def __init__(self) -> None:
         self._kept: list[NDArray[np.float64]] = []
         self._known = self._both = 0
 
     def add(self, camera: Camera, true: NDArray[Any], shown: NDArray[Any], known: NDArray[np.bool_]) -> None:
-        """Compare depth z [H, W] that a model shows, 0 = nothing there, with the true one where that is known."""
+        """Compare rendered depth z [H, W], 0 = empty, with the true depth where known."""
         both = known & np.isfinite(shown) & (shown > 0)
         self._known += int(known.sum())
         self._both += int(both.sum())
@@ -234,14 +248,14 @@ class DepthShareSums:
 
 
 MOST_PLANE_PIXELS = 8192
-"""Pixels of a frame that its plane is fitted to, spread evenly."""
+"""Number of evenly spaced pixels per frame used to fit its plane."""
 SMOOTH_PX = 5
-"""Points are averaged over so many pixels across before they are differentiated: stored depth has steps."""
+"""Width in pixels of the smoothing before differentiation; quantised depth has steps."""
 
 
 @dataclass(frozen=True)
 class NormalErrors:
-    """Angles between true and shown normals, means over frames; degrees."""
+    """Angles in degrees between true and rendered normals, averaged over frames."""
 
     mean_deg: float
     median_deg: float
@@ -255,7 +269,11 @@ class NormalErrors:
 def normals_of(
     camera: Camera, depth: NDArray[Any], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Unit normals [H, W, 3] of a depth map z [H, W], towards the camera, and where they are known: where all depth around is."""
+    """Compute unit normals [H, W, 3] towards the camera from a depth map z [H, W].
+
+    Returns:
+        Normals and a mask of pixels with known depth all around.
+    """
     points = points_of(camera, np.where(known, depth, 0))
     smooth = cv2.blur(points, (SMOOTH_PX, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE)
     normal = np.cross(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
@@ -268,13 +286,17 @@ def normals_of(
 
 
 class NormalSums:
-    """Takes frames one at a time; the normals of both depths are found in the same way."""
+    """Streaming accumulator of normal errors; both normals are computed from depth in
+    the same way.
+    """
 
     def __init__(self) -> None:
         self._mean, self._median, self._plane, self._level = (ScoredMean() for _ in range(4))
 
     def add(self, camera: Camera, true: NDArray[Any], shown: NDArray[Any], known: NDArray[np.bool_]) -> None:
-        """Compare the surface that a model shows, depth z [H, W], 0 = nothing there, with the true one where that is known."""
+        """Compare the surface of rendered depth z [H, W], 0 = empty, with the true surface where
+        known.
+        """
         compared = known & np.isfinite(shown) & (shown > 0)
         right, both = normals_of(camera, true, compared)
         found, _ = normals_of(camera, shown, compared)
@@ -291,7 +313,7 @@ class NormalSums:
 
     @property
     def errors(self) -> NormalErrors | None:
-        """The means so far; None where nothing could be compared."""
+        """Means so far; None if nothing was comparable."""
         mean, median, plane, level = (each.mean for each in (self._mean, self._median, self._plane, self._level))
         if mean is None or median is None or plane is None or level is None:
             return None

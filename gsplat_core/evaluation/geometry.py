@@ -1,16 +1,19 @@
-"""Geometric accuracy of a finished model over a whole sequence; each measure is reported next to its trivial baseline.
+"""Geometric accuracy of a finished model over a whole sequence, with trivial baselines.
 
-* depth and normals, where the recording has depth: next to the best flat plane;
-* novel views, where it has further cameras or a right eye: next to the left picture;
-* followed points and flow, where it has them: next to no motion;
-* the trajectory, where it has poses and the model was made with others: next to a scope at rest;
-* parts of the deformation: shares of the pictures' change that motion, colour, and size and opacity explain.
+* depth and normals, if the recording has depth; baseline: the best flat plane * novel views, if it
+has further cameras or a right eye; baseline: the left picture * tracked points and flow, if it has
+them; baseline: no motion * trajectory, if it has poses and the model uses others; baseline: a
+static scope * parts of the deformation: shares of the pictures' change explained by motion, by
+colour, and by size and opacity
 
-Lengths are compared in the left camera's coordinates, frame by frame, so the origin of a model does not matter. For a model without a scale of its own,
-the `scaled` figures multiply all of its lengths by one factor for the whole sequence.
+Lengths are compared in the left camera's coordinates frame by frame, so the origin of a model does
+not matter. For a model of unknown scale, the `scaled` figures multiply all lengths by one factor
+for the whole sequence.
 
-A model that repaints tissue instead of moving it shows the right pictures with the wrong motion. `PartSums` therefore renders frames with parts of the
-deformation frozen at a reference time. A part's share is its Shapley value: the mean reduction of the squared difference over all orders of thawing.
+A model that repaints tissue instead of moving it shows correct pictures with wrong motion.
+`PartSums` therefore renders frames with parts of the deformation frozen at a reference time. The
+share of a part is its Shapley value: the mean reduction of the squared difference over all orders
+of unfreezing.
 """
 
 from __future__ import annotations
@@ -46,9 +49,9 @@ PARTS: dict[str, tuple[str, ...]] = {
     COLOUR: ("sh",),
     SIZE: ("log_scales", "logit_opacities"),
 }
-"""The tensors of `Gaussians` that each part changes."""
+"""Tensors of `Gaussians` deformed by each part."""
 PART_FRAMES = 8
-"""Frames that are looked at: each is rendered eight times."""
+"""Number of evaluated frames; each is rendered eight times."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +70,26 @@ class PartShares:
 
 
 class PartSums:
-    """Takes frames one at a time."""
+    """Streaming accumulator of the squared errors for each subset of unfrozen parts."""
 
     def __init__(self, gaussians_at: Callable[[float], Gaussians], reference_s: float) -> None:
-        """gaussians_at: the deformed Gaussians of a model. reference_s: when the frozen parts are taken from."""
+        """Create an empty accumulator.
+
+        Args:
+            gaussians_at: callback that returns the deformed Gaussians at a time.
+            reference_s: time in seconds at which frozen parts are evaluated.
+        """
         self._at, self._reference_s = gaussians_at, reference_s
         self._errors: dict[frozenset[str], float] = {thawed: 0.0 for thawed in _subsets(tuple(PARTS))}
         self._frames = 0
 
     def add(self, frame: Frame, picture_of: Callable[[Gaussians], NDArray[Any]]) -> None:
-        """Render a frame with each choice of parts thawed. picture_of: its picture of Gaussians, [H, W, 3] in 0..1, from its own pose."""
+        """Render a frame with each subset of parts unfrozen.
+
+        Args:
+            frame: reference frame.
+            picture_of: callback that renders Gaussians from the frame's pose, [H, W, 3] in 0..1.
+        """
         moved, frozen = self._at(frame.time_s).tensors(), self._at(self._reference_s).tensors()
         tissue = np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask != 0
         wanted = frame.image[tissue].astype(np.float64) / 255
@@ -115,9 +128,9 @@ def _subsets(names: tuple[str, ...]) -> list[frozenset[str]]:
 
 
 MOST_FRAMES = 48
-"""Frames that are compared, spread evenly over the recording."""
+"""Maximum number of compared frames, spread evenly over the recording."""
 NO_SCALING = 0.005
-"""A factor so near to 1 is taken for 1: the scaled pictures are the others."""
+"""Tolerance around a scale factor of 1 within which the scaled pictures are not rendered again."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +144,7 @@ class Geometry:
     views: tuple[NovelView, ...]
     """Scores rendered at the model's own scale, without scale alignment."""
     scaled_views: tuple[NovelView, ...]
-    """After the one factor of the sequence's depth."""
+    """Scores after scaling the model by the sequence's depth factor."""
     tracking: Tracking | None
     flow: FlowErrors | None
     trajectory: TrajectoryErrors | None
@@ -149,12 +162,16 @@ def evaluate_geometry(
     truth: GroundTruth,
     model_pose: Callable[[Frame], Pose | None] = lambda frame: frame.pose,
 ) -> Geometry:
-    """Measure a model; reads the frames once, and again for the scaled views of a model without scale.
+    """Measure the geometry of a model.
+
+    Reads the frames once, and again for the scaled views of a model without known scale.
 
     Args:
-        frames: of the recording, in order, each time they are iterated; `Frame.seq` counts from 0, as `truth` does.
-        camera: of the frames; its pose counts for frames without one.
-        model_pose: where the model has the left camera at a frame, world-to-camera; None: where `camera` is.
+        frames: frames of the recording, in order on each iteration; `Frame.seq` counts from 0 as in
+            `truth`.
+        camera: camera of the frames; its pose is used for frames without one.
+        model_pose: callback that returns the left camera's world-to-camera pose in model space at a
+            frame; None selects that of `camera`.
     """
     own = lambda frame: _posed(camera, model_pose(frame))
     depth, normals, views = DepthShareSums(), NormalSums(), ViewSums(camera, shown, truth)
@@ -215,14 +232,14 @@ def _known(frame: Frame, true: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:
-    """The model's poses against the recording's; None where they are the same."""
+    """Compare the model's poses with the recording's; None if they are identical."""
     if len(ways) < 3 or all(found is true or np.array_equal(found, true) for found, true in ways):
         return None
     return evaluate_trajectory(np.stack([found for found, _ in ways]), np.stack([true for _, true in ways]))
 
 
 def _picture_from(camera: Camera, frame: Frame) -> Callable[[Gaussians], NDArray[np.float32]]:
-    """Pictures of Gaussians from a camera, with a frame's exposure."""
+    """Return a function that renders Gaussians from a camera with a frame's exposure."""
 
     def picture_of(gaussians: Gaussians) -> NDArray[np.float32]:
         with torch.inference_mode():

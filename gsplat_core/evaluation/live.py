@@ -1,7 +1,8 @@
 """Scores of a live run: the picture on the screen when frame i+1 arrives, against frame i.
 
-The picture on the screen is the last one that was shown before that moment. It belongs to frame i if it was in time, and to an older frame otherwise.
-Pictures that were replaced earlier are not scored. Nothing is scored while a stopped source sends no frames.
+The picture on the screen is the last one displayed before that moment. It shows frame i if it was
+in time, and an older frame otherwise. Pictures replaced earlier are not scored. Nothing is scored
+while a stopped source sends no frames.
 """
 
 from __future__ import annotations
@@ -42,20 +43,20 @@ class Ages:
 
 
 class AgeHistogram:
-    """Takes ages one at a time, into buckets of 1 %."""
+    """Histogram of ages in logarithmic buckets of 1 %."""
 
     def __init__(self) -> None:
         self._counts = [0] * _BUCKETS
         self._max_ms = 0.0
 
     def add(self, age_ms: float) -> None:
-        """Take one age in milliseconds; below a microsecond counts as one."""
+        """Add an age in milliseconds; ages below one microsecond count as one microsecond."""
         self._max_ms = max(self._max_ms, age_ms)
         place = math.ceil(math.log(max(age_ms, _FINEST_MS) / _FINEST_MS) / math.log(_RATIO) - 1e-9)
         self._counts[min(place, _BUCKETS - 1)] += 1
 
     def ages(self) -> Ages | None:
-        """The distribution so far; None without any age."""
+        """Distribution so far; None without any age."""
         count = sum(self._counts)
         if not count:
             return None
@@ -63,7 +64,7 @@ class AgeHistogram:
         return Ages(count, p50_ms, p95_ms, p99_ms, self._max_ms)
 
     def _quantile(self, share: float, count: int) -> float:
-        """The age that this share of all does not exceed."""
+        """Return the age that `share` of all ages do not exceed."""
         reached = 0
         for place, here in enumerate(self._counts):
             reached += here
@@ -75,7 +76,7 @@ class AgeHistogram:
 MOST_BEHIND = 8
 """Largest lateness in frames with a counter of its own; later pictures are counted here too."""
 SETTLING_S = 1.0
-"""The first second, in which a model begins, is in `score` and not in `settled`."""
+"""Start-up time in seconds, excluded from `settled` but included in `score`."""
 NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"
 _MAX_STATES = 16
 _NS_PER_MS = 1e6
@@ -92,7 +93,7 @@ class Shown:
     shown_ns: int
     """Display time of the picture, in nanoseconds on the clock of `arrived_ns`."""
     image: NDArray[np.uint8] | None = None
-    """RGB [H, W, 3]; None where the picture was not kept."""
+    """RGB [H, W, 3]; None if the picture was not kept."""
     state: str = "live"
     """Status label drawn on the picture: `live`, `stale`, `frozen` or `source lost`."""
 
@@ -140,7 +141,7 @@ class LiveSums:
         self._first_s: float | None = None
 
     def picture(self, age_ms: float, state: str) -> None:
-        """A picture was shown, so old and in that state."""
+        """Count a displayed picture by its age in milliseconds and its status label."""
         self._when_shown.add(age_ms)
         known = state in self._states or len(self._states) < _MAX_STATES
         self._states[state if known else "other"] += 1
@@ -183,7 +184,7 @@ class LiveSums:
             )
 
     def leave_out(self, reason: str) -> None:
-        """A frame that is not scored."""
+        """Count a frame that is not scored."""
         self._score.leave_out(reason)
 
     @property
@@ -261,13 +262,13 @@ class _Screen:
         self._sums = sums
 
     def at(self, moment_ns: int) -> Shown | None:
-        """The last picture shown before the moment."""
+        """Return the last picture displayed before a time in nanoseconds."""
         while self._next is not None and self._next.shown_ns < moment_ns:
             self._take()
         return self._now
 
     def rest(self) -> None:
-        """Count the pictures that were shown after the last frame had come."""
+        """Count the pictures displayed after the last frame arrived."""
         while self._next is not None:
             self._take()
 

@@ -1,11 +1,12 @@
-"""Errors of a model's motion: points followed through a sequence, and optical and scene flow from frame to frame.
+"""Errors of a model's motion: tracked points, and frame-to-frame optical and scene flow.
 
-A point is given by its pixel in the first frame that sees it. A model lifts it by its own depth and moves it with the nearest Gaussians. Errors are
-Euclidean, over every later frame that sees the point: in pixels, and in the recording's unit in the coordinates of the left camera. Schmidt et al.,
+A point is defined by its pixel in the first frame that sees it. The model lifts it by its own depth
+and moves it with the nearest Gaussians. Errors are Euclidean, over every later frame that sees the
+point, in pixels and in the recording's unit in left-camera coordinates. Metrics: Schmidt et al.,
 "STIR: Surgical Tattoos in Infrared" (2023), and the STIR challenge of 2024.
 
-Flow compares each pixel with its place in the next frame. A pixel moves by the mean motion of the Gaussians on its ray, weighted as their colours are
-blended.
+Flow compares each pixel with its position in the next frame. A pixel moves by the mean motion of
+the Gaussians on its ray, weighted by their blending weights.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from gsplat_core.scene.projection import Points, at_pixels, inverse, moved, pixe
 
 WITHIN_PX = (4, 8, 16, 32, 64)
 WITHIN_MM = (2, 4, 8, 16, 32)
-"""The challenge's thresholds; its figure is the mean share of points within each of them."""
+"""Distance thresholds of the STIR challenge in mm; the score averages the shares within each."""
 NEIGHBOURS = 8
 LEAST_OPACITY = 0.1
-"""Gaussians that show less than this carry nothing."""
+"""Minimum opacity of Gaussians that carry tracked points."""
 
 
 class CarriedPoints:
-    """Points of the world at one time, and how a model carries them to others: by the mean motion of the Gaussians nearest to them."""
+    """World points that a model moves over time by the mean motion of their nearest Gaussians."""
 
     def __init__(self, model: Model, points: Points, time_s: float) -> None:
         self._model, self._points = model, points
@@ -79,7 +80,7 @@ def _neighbours(gaussians: Gaussians, points: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """Errors over every point and later frame that sees it."""
+    """Errors over all points and later frames that see them."""
 
     median_mm: float
     mean_mm: float
@@ -93,20 +94,20 @@ class TrackErrors:
 
 @dataclass(frozen=True)
 class Tracking:
-    """Points of the tissue, followed."""
+    """Accuracy of tracked tissue points."""
 
     model: TrackErrors
     scaled: TrackErrors
-    """After all of the model's lengths were multiplied by the one factor of the sequence's depth."""
+    """Errors after scaling the model by the sequence's depth factor."""
     still: TrackErrors
     """Baseline without motion: each point keeps its first pixel and its first true depth."""
     points: int
     compared: int
-    """Positions that were compared."""
+    """Number of compared positions."""
 
 
 class TrackSums:
-    """Takes positions in the left camera's coordinates [P, 3] and pixels [P, 2]."""
+    """Error accumulator for positions in left-camera coordinates [P, 3] and pixels [P, 2]."""
 
     def __init__(self) -> None:
         self._mm: list[Points] = []
@@ -157,7 +158,13 @@ class FollowedPoints:
         self._pixels, self._still = TrackSums(), TrackSums()
 
     def add(self, frame: Frame, own: Camera, shown: NDArray[Any]) -> None:
-        """The next frame. own: the model's camera. shown: the model's depth z [H, W]."""
+        """Process the next frame.
+
+        Args:
+            frame: frame of the recording.
+            own: camera of the frame in model space.
+            shown: depth z [H, W] rendered by the model.
+        """
         pose = np.eye(4) if frame.pose is None else frame.pose
         true = moved(pose, self._tracks.points[frame.seq])
         true_px = pixels_of(self._camera, true)
@@ -182,7 +189,7 @@ class FollowedPoints:
         true: Points,
         true_px: Points,
     ) -> None:
-        """Start the points that are seen for the first time: each at its pixel, at the model's depth there."""
+        """Start tracking newly visible points at their pixels, lifted by the model's depth."""
         z = at_pixels(shown, true_px)
         new = np.flatnonzero(seen & ~self._started & (z > 0))
         if not len(new):
@@ -234,7 +241,7 @@ class FlowErrors:
 
     model: EndPointErrors
     scaled: EndPointErrors
-    """After all of the model's lengths were multiplied by the one factor of the sequence's depth."""
+    """Errors after scaling the model by the sequence's depth factor."""
     still: EndPointErrors
     """Baseline without motion; equals the magnitude of the true motion."""
     frames: int
@@ -250,7 +257,7 @@ class _Started:
     """Positions of the pixels' surface points in the model's world, [P, 3]."""
     pixels: Values
     here: NDArray[np.bool_]
-    """[H, W]: which pixels they are."""
+    """Mask [H, W] of the compared pixels."""
     own: Camera
     true: TrueMotion
     true_pose: Values
@@ -269,10 +276,16 @@ class FlowSums:
         self._px: list[Values] = []
         """Errors of the model and of the static baseline for each compared frame, [2, P]."""
         self._mm: list[tuple[Values, Values]] = []
-        """The model's motion and the true one [P, 3], in the axes of the left camera."""
+        """Motion of the model and true motion [P, 3], in left-camera axes."""
 
     def begin(self, frame: Frame, own: Camera, shown: NDArray[Any], tissue: NDArray[np.bool_]) -> None:
-        """A frame to be compared with the next one. own: the model's camera; shown: the model's depth z [H, W]."""
+        """Sample a frame for comparison with the next one.
+
+        Args:
+            frame: frame of the recording.
+            own: camera of the frame in model space.
+            shown: depth z [H, W] rendered by the model.
+        """
         true = self._files.of(frame)
         if true is None:
             return
@@ -290,7 +303,12 @@ class FlowSums:
         self._started = _Started(frame.seq, frame.time_s, points, pixels, here, own, true, pose)
 
     def arrive(self, frame: Frame, own: Camera) -> None:
-        """The next frame, whether it is itself compared or not; own: where the model has its camera."""
+        """Complete the comparison started by `begin` when the next frame arrives.
+
+        Args:
+            frame: next frame, whether or not it is sampled itself.
+            own: camera of the next frame in model space.
+        """
         started, self._started = self._started, None
         if started is None or frame.seq != started.seq + 1:
             return

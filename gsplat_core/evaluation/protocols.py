@@ -1,8 +1,9 @@
 """Offline protocols that render a model for the frames of a recording and score the pictures.
 
-* `evaluate_heldout`: the frames that training never saw, rendered from a finished model;
-* `evaluate_causal`: each frame is predicted before it is learned from. Only its time and pose are known, and its exposure is taken from the frame before;
-* `evaluate_retention`: earlier frames and revisited places, rendered from the final model.
+* `evaluate_heldout`: frames excluded from training, rendered from a finished model *
+`evaluate_causal`: each frame is predicted before it is trained on, from its time and pose and the
+previous frame's exposure * `evaluate_retention`: earlier frames and revisited places, rendered from
+the final model
 """
 
 from __future__ import annotations
@@ -31,30 +32,35 @@ from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db, psnrs_db
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendered picture, in memory of its own."""
+    """Rendered picture that owns its memory."""
 
     image: NDArray[np.uint8]
-    """RGB [H, W, 3] as it is displayed, and as a PNG file would hold it: clipped and rounded to 8 bits."""
+    """RGB [H, W, 3] as displayed: clipped and rounded to 8 bits."""
     unrounded: NDArray[np.float32]
     """RGB [H, W, 3] in 0..1 before the rounding, clipped."""
     depth: NDArray[np.float32]
-    """z [H, W] in the model's unit of length; 0 = nothing there."""
+    """Depth z [H, W] in the model's unit of length; 0 = empty."""
     model_version: int
 
 
 class PictureMaker:
-    """Renders published models for frames: at the frame's time, from its pose, with its exposure. One renderer for all of them."""
+    """Renderer of published models at a frame's time, pose and exposure; reuses one renderer."""
 
     def __init__(self, camera: Camera, device: torch.device | str = "cpu", renderer: str = "alpha") -> None:
-        """camera: of the pictures; a frame with a pose of its own is seen from there."""
+        """Create the renderer; `camera` is used for frames without a pose of their own."""
         self.camera = camera
         self._reads_snapshots = RENDERERS[renderer].capabilities.reads_snapshots
         self._renderer: Renderer = new_renderer(renderer, camera, device)
         self._prepared: Model | Snapshot | None = None
 
     def __call__(self, model: Model | Snapshot, frame: Frame, camera: Camera | None = None) -> Picture:
-        """The model as it would be shown for the frame; with a `camera` of the same size, as that one sees it. Its time is clamped to the
-        model's window."""
+        """Render the model for a frame.
+
+        Args:
+            model: published model; the frame's time is clamped to its window.
+            frame: frame that determines time, pose and exposure.
+            camera: replaces the frame's camera; must have the same size.
+        """
         if camera is None:
             camera = self.camera if frame.pose is None else self.camera.with_pose(frame.pose)
         with torch.inference_mode():
@@ -144,10 +150,10 @@ class Learner(Protocol):
     """Interface of an online learner such as `Reconstructor`."""
 
     def observe(self, frame: Frame, *, train: bool = True) -> object:
-        """Take the next frame and train on it; with `train=False` only move on to its time."""
+        """Train on the next frame; with `train=False` only advance to its time."""
 
     def publish(self) -> Model | Snapshot:
-        """The model as it is now."""
+        """Return the current model."""
 
 
 def published(learner: Learner, frame: Frame) -> Model | Snapshot:
@@ -159,7 +165,10 @@ def published(learner: Learner, frame: Frame) -> Model | Snapshot:
 
 
 def _hidden(frame: Frame, exposure: tuple[float, float, float]) -> Frame:
-    """A frame with this one's number, time and pose and a black picture, so that nothing else of it can reach a prediction."""
+    """Return a frame with only number, time and pose of this one and a black picture.
+
+    Prevents the image from influencing a prediction.
+    """
     return Frame(frame.seq, frame.pts_ns, np.zeros_like(frame.image), pose=frame.pose, exposure=exposure)
 
 
@@ -217,7 +226,7 @@ def _score(frame: Frame, picture: Picture, sums: ScoreSums, record: Record | Non
 
 
 NEAR_SHARE = 0.05
-"""Two positions are one place when they are nearer than this share of the greatest distance between any two; a scale need not be known."""
+"""Distance below which two positions are one place, relative to the largest pairwise distance."""
 NEAR_DEGREES = 10.0
 AWAY = 3.0
 """Least distance of the scope from a place between two stays, in units of "same place".
@@ -225,7 +234,7 @@ AWAY = 3.0
 The distance is the larger of the position and the angle measure of `_distances`.
 """
 MAX_POSES = 2048
-"""Poses that are kept; of a longer stream every second, fourth, ... one is."""
+"""Maximum number of stored poses; longer streams are subsampled by powers of two."""
 Range = tuple[float, float]
 """First and last time, in seconds."""
 
@@ -243,7 +252,7 @@ class Visits:
 
 
 class PlaceFinder:
-    """Takes the pose of each frame; `visits` are the returns. Memory of fixed size."""
+    """Streaming detector of revisited places with bounded memory; `visits` lists the returns."""
 
     def __init__(self) -> None:
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
@@ -251,7 +260,7 @@ class PlaceFinder:
         self._seen = 0
 
     def add(self, time_s: float, world_to_camera: NDArray[np.float64]) -> None:
-        """The next frame's pose [4, 4]."""
+        """Add the pose [4, 4] of the next frame."""
         if self._seen % self._every == 0:
             self._poses.append((time_s, np.asarray(world_to_camera, np.float64)))
             if len(self._poses) == MAX_POSES:
@@ -260,7 +269,7 @@ class PlaceFinder:
         self._seen += 1
 
     def visits(self) -> list[Visits]:
-        """Each return to a place that the scope had left, with the last stay there before it."""
+        """Return each return to a place, paired with the previous stay there."""
         if len(self._poses) < 3:
             return []
         times = [time_s for time_s, _ in self._poses]
@@ -318,7 +327,7 @@ FIRST_FRAMES = 3
 
 @dataclass(frozen=True)
 class PlaceScore:
-    """A place that was seen twice, rendered by the final model at the times and poses of each stay."""
+    """Scores of the final model at a place visited twice, for each stay."""
 
     visits: Visits
     first: Score
@@ -333,7 +342,7 @@ class Retention:
     """Score on the last seconds of the stream."""
     last_range_s: Range
     frozen: BaselineScore
-    """The stream's last frame shown for all of these seconds."""
+    """Baseline: the stream's last frame shown for all of these seconds."""
     places: tuple[PlaceScore, ...]
 
 
@@ -399,7 +408,7 @@ def evaluate_retention(
 
 
 def find_places(frames: Iterable[Frame]) -> list[Visits]:
-    """The places that the scope of a recording came back to, by the poses of its frames; none where they have no poses."""
+    """Return the revisited places of a recording by its poses; empty without poses."""
     finder = PlaceFinder()
     for frame in frames:
         if frame.pose is not None:
@@ -415,11 +424,11 @@ class Return:
     first_db: tuple[float | None, ...]
     """Tissue PSNR of the first frames of the second stay."""
     frames_until_found: int | None
-    """The number, from 1, of the first of its frames that scored `FOUND_DB` or more; None where none did."""
+    """1-based index of the first frame that scored `FOUND_DB` or more; None if none did."""
 
 
 def returns(entries: Iterable[Entry], places: Sequence[Visits]) -> list[Return]:
-    """Read from the log of a live or causal evaluation how good the first frames of each return were."""
+    """Extract the scores of the first frames of each return from a live or causal log."""
     first: list[list[float | None]] = [[] for _ in places]
     count, found = [0] * len(places), [None] * len(places)  # type: list[int], list[int | None]
     for entry in entries:

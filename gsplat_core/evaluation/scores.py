@@ -1,4 +1,4 @@
-"""Sums of fixed size over the frames that a protocol scores, and why the others are left out."""
+"""Constant-size score accumulators of the protocols, and reasons for excluding frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsplat_core.training.metrics import MEASURES, FrameQuality, ImageLike, Qual
 Entry = dict[str, float | int | bool | str | None]
 """The figures of one frame by name; None where a measure does not exist."""
 Record = Callable[[Entry], None]
-"""Takes each frame's figures, in order."""
+"""Callback that receives each frame's figures in order."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Score:
     worst_seq: int | None
     """Sequence number of the frame with the lowest score."""
     left_out: Mapping[str, int]
-    """Frames that were not scored, by reason."""
+    """Numbers of excluded frames by reason."""
 
 
 def why_left_out(frame: Frame) -> str | None:
@@ -75,13 +75,13 @@ class ScoreSums:
         return quality
 
     def take(self, quality: FrameQuality) -> None:
-        """Take the measures of a frame that was compared elsewhere; one that is not finite is not known."""
+        """Add measures computed elsewhere; non-finite values count as missing."""
         self._quality.take(quality)
         if quality.psnr_tissue_db < self._worst:
             self._worst, self._worst_seq = quality.psnr_tissue_db, quality.seq
 
     def leave_out(self, reason: str) -> None:
-        """Count a frame that is not scored."""
+        """Count an excluded frame."""
         self._left_out[reason] += 1
 
     @property
@@ -104,11 +104,11 @@ def measures(quality: FrameQuality) -> Entry:
 
 
 def finite(value: float | None) -> float | None:
-    """The value; None where it is not a finite number."""
+    """Return the value, or None if it is not a finite number."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def number(entry: Entry, name: str) -> float | None:
-    """A figure of an entry; None where it has none of that name."""
+    """Return a named figure of an entry, or None if missing."""
     value = entry.get(name)
     return None if value is None or isinstance(value, str) else float(value)

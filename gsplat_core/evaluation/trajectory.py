@@ -15,19 +15,22 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput
 
 LEAST_PATH_SHARE = 1e-6
-"""A path shorter than this share of its distance from the origin, or than this, is that of a scope at rest."""
+"""Relative path length below which the scope counts as static.
+
+The length is compared with this share of the distance from the origin, and with this value.
+"""
 
 Poses = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Root mean square of the distances between true and estimated positions, divided by the length of the true path."""
+    """RMS position error divided by the length of the true path."""
 
     rigid_share: float
-    """After the best rotation and shift: of estimates that claim to have a scale."""
+    """Error after alignment by rotation and translation, for estimates with metric scale."""
     similarity_share: float
-    """After the best rotation, shift and scale: of the shape of the way alone."""
+    """Error after alignment by a similarity transform, for the shape of the path alone."""
     still_share: float
     """Baseline: error of a static scope at the mean of the true positions."""
     rigid_rmse: float
@@ -35,16 +38,17 @@ class TrajectoryErrors:
     rotation_deg: float
     """Mean angle between true and estimated orientations, after the same rotation."""
     scale: float
-    """The best factor of the estimated lengths."""
+    """Scale factor of the similarity alignment."""
     path: float
     """Length of the true path, in its unit."""
     frames: int
 
 
 def evaluate_trajectory(estimated: Poses, true: Poses) -> TrajectoryErrors | None:
-    """Compare world-to-camera poses [N, 4, 4] of the same frames; None where the true scope does not move.
+    """Compare world-to-camera poses [N, 4, 4] of the same frames; None for a static true scope.
 
-    Raises InvalidInput for fewer than three poses, or two numbers of them.
+    Raises:
+        InvalidInput: for fewer than three poses or different numbers of poses.
     """
     if estimated.shape != true.shape or len(true) < 3:
         raise InvalidInput(
@@ -76,8 +80,10 @@ def _centres(poses: Poses) -> Poses:
 
 
 def _alignment(found: Poses, right: Poses) -> tuple[Poses, float]:
-    """The rotation [3, 3] and the factor that bring `found` nearest to `right`, both about their means; the factor of positions that are all
-    one is 0."""
+    """Return the rotation [3, 3] and scale that align `found` with `right` about their means.
+
+    The scale of coincident positions is 0.
+    """
     a, b = found - found.mean(axis=0), right - right.mean(axis=0)
     u, singular, vt = np.linalg.svd(b.T @ a)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

@@ -1,9 +1,11 @@
 """Scores of views that training did not use: further cameras of a recording, and the right eye.
 
-`ViewSums` scores every further view of a frame over the tissue that training saw, next to the left picture as it is and shifted by the typical distance.
+`ViewSums` scores the further views of a frame over tissue that training observed. Baselines are the
+left picture, unchanged and shifted by the typical disparity.
 
-`evaluate_second_eye` scores the right eye of a model that was trained on the left one. Colours of the two eyes differ by a straight line per channel,
-which is fitted to each picture. Columns that only the right eye sees, a border and tissue hidden by the left eye's tools are left out.
+`evaluate_second_eye` scores the right eye of a model trained on the left one. The colours of both
+eyes differ by a linear map per channel, which is fitted to each picture. Columns visible only to
+the right eye, a border, and tissue hidden by the left eye's tools are excluded.
 """
 
 from __future__ import annotations
@@ -30,27 +32,30 @@ from gsplat_core.training.metrics import PSNR_CAP_DB, ScoredMean
 from gsplat_core.training.right_eye import right_tissue
 
 SAME_DEPTH = 0.02
-"""Two cameras see the same point where its depth agrees by this share."""
+"""Relative depth tolerance within which two cameras see the same point."""
 LEAST_SEEN = 0.05
-"""A frame of which a view and training have less than this share in common is left out."""
+"""Minimum share of a view in common with the training view; other frames are excluded."""
 
 
 @dataclass(frozen=True)
 class NovelView:
-    """Scores of one view, over the pixels of tissue that training saw from its own camera in the same frame."""
+    """Scores of one view over tissue pixels that the training camera sees in the same frame."""
 
     name: str
     model: Score
     left: Score
-    """The left picture, shown as it is."""
+    """Baseline: left picture, unchanged."""
     shifted: Score
-    """The left picture, moved as it would be if all tissue were at its median distance: shifted by the median disparity, for a right eye."""
+    """Baseline: left picture reprojected as if all tissue were at its median distance.
+
+    For a right eye this is a shift by the median disparity.
+    """
     seen: float
     """Share of the view's pixels that were compared."""
 
 
 class NovelViewSums:
-    """Takes the frames of one view."""
+    """Accumulator for the frames of one view."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -81,7 +86,7 @@ class NovelViewSums:
 
     @property
     def score(self) -> NovelView | None:
-        """The means so far; None where nothing was scored."""
+        """Means so far; None if nothing was scored."""
         if not self._frames:
             return None
         scores = self._model.score, self._left.score, self._shifted.score
@@ -125,7 +130,7 @@ def seen_by_both(
 
 
 def moved_picture(left_camera: Camera, image: NDArray[np.uint8], camera: Camera, distance: float) -> NDArray[np.uint8]:
-    """The left picture as a view would show it if everything were on a plane before the left camera, so far away; edges repeated."""
+    """Reproject the left picture to a view as a plane at one distance, with replicated edges."""
     back = inverse(camera.world_to_camera)
     rays = pixel_rays(camera) @ back[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -186,7 +191,7 @@ class ViewSums:
 
     @property
     def scores(self) -> tuple[NovelView, ...]:
-        """The means so far."""
+        """Means so far of all views."""
         return tuple(found for each in self._sums.values() if (found := each.score) is not None)
 
 
@@ -201,12 +206,15 @@ def _views_of(frame: Frame, truth: GroundTruth) -> Iterator[tuple[str, Camera, F
 EVERY = 10
 """Sampling interval in frames; one frame in `EVERY` is scored."""
 BORDER_PX = 10
-"""Left out all around, in a picture of `BORDER_OF_PX` columns or more; in proportion in a smaller one."""
+"""Width in pixels of the excluded border at a picture width of `BORDER_OF_PX` or more.
+
+Proportionally less in smaller pictures.
+"""
 BORDER_OF_PX = 360
 BEYOND_TYPICAL = 1.3
 """Width of the columns visible only to one eye, in typical disparities, if not given."""
 SEARCHED = 0.07
-"""Semi-global matching looks so far, as a share of the width, to both sides of the typical disparity."""
+"""Search range of semi-global matching around the typical disparity, as a share of the width."""
 MODEL = "model"
 SHIFTED, MATCHED, RIGHT_BEFORE = "left_shifted", "semi_global_matching", "previous_right"
 
@@ -216,7 +224,7 @@ class SecondEye:
     """Score of a model in the right eye's view."""
 
     score: Score
-    """`psnr_tissue_db` is the PSNR over the pixels that count; the other measures do not exist here."""
+    """Only `psnr_tissue_db`, the PSNR over compared pixels, is available."""
     baselines: Mapping[str, BaselineScore]
     """Scores by baseline name.
 
@@ -224,7 +232,7 @@ class SecondEye:
     semi-global matching, and the previous right picture.
     """
     left_out_px: int
-    """Columns at the right edge that were left out."""
+    """Number of excluded columns at the right edge."""
 
 
 def evaluate_second_eye(
@@ -347,7 +355,7 @@ def warped_by_disparity(left: NDArray[np.uint8], disparity: NDArray[np.float32])
 
 
 def _counted(frame: Frame, camera: Camera, eye: Camera, disparity_px: float, left_out_px: int) -> NDArray[np.bool_]:
-    """The pixels of the right picture that are compared, bool [H, W]."""
+    """Return the mask [H, W] of compared pixels in the right picture."""
     counted = right_tissue(frame, camera, eye, disparity_px) > 0
     border = round(BORDER_PX * min(1.0, frame.width_px / BORDER_OF_PX))
     inner = np.zeros_like(counted)

@@ -1,4 +1,4 @@
-"""JSON from anyone, read by name and range: no NaN, no duplicate names, bounded nesting."""
+"""Validating JSON reader for untrusted input: no NaN, no duplicate keys, bounded nesting."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsplat_core.errors import BundleCorrupt, InvalidInput
 from gsplat_core.value_ranges import IntegerIn, ListOf, NumberIn, shortened
 
 MAX_NESTING = 16
-"""Objects and lists inside each other."""
+"""Maximum nesting depth of objects and lists."""
 
 
 class JsonObject:
@@ -26,7 +26,7 @@ class JsonObject:
 
     @staticmethod
     def parse(text: bytes, name: str) -> JsonObject:
-        """The object that a file holds; `name` is the file's, for messages."""
+        """Parse a JSON object; `name` identifies the file in messages."""
         try:
             values = json.loads(text.decode(), parse_constant=_refuse_constant, object_pairs_hook=_without_duplicates)
         except (ValueError, RecursionError) as error:

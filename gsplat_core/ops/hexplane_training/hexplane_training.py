@@ -192,10 +192,16 @@ def hexplane_planes_adam_(
 def network_adam_(
     parameters: Sequence[Tensor], gradient: Tensor, first: Tensor, second: Tensor, adam: AdamOnDevice
 ) -> None:
-    """One step of Adam over a network's small tensors in one launch, in place; as `hexplane_planes_adam_` otherwise.
+    """Take one Adam step over all tensors of a network in place, in one launch.
+
+    Values with a non-finite gradient, and their moments, stay unchanged.
 
     Args:
-        parameters: weight and bias of every layer; `gradient`, `first` and `second` have their values concatenated.
+        parameters: weight and bias of every layer.
+        gradient: gradients of all parameters, concatenated.
+        first: first moments, concatenated.
+        second: second moments, concatenated.
+        adam: settings of the step.
     """
     _check(*parameters, gradient, first, second, adam.rate)
     torch.ops.gsplat_core.network_adam_(list(parameters), gradient, first, second, *adam.arguments)
