@@ -54,7 +54,7 @@ class Benchmark:
         return [word.replace("{recordings}", str(recordings)) for word in shlex.split(self.command)]
 
     def stated(self) -> str:
-        """The command as the log states it: without the places of this machine."""
+        """Return the command as logged, without paths of this machine."""
         return "python " + self.command.replace("{recordings}", "$INTRASPLAT_RECORDINGS")
 
 

@@ -1,15 +1,17 @@
-"""Change one line of the product at a time and count how many changes the tests notice.
+"""Mutation testing: change one line of the product at a time and count the changes tests notice.
 
-    python -m tests.mutants --count 60 --seed 1            # what `make mutants` runs
+    python -m tests.mutants --count 60 --seed 1            # as in `make mutants`
     python -m tests.mutants --only operators/display.py --count 10
-    python -m tests.mutants --survivors out/mutants.jsonl   # only those that survived an earlier run
+    python -m tests.mutants --survivors out/mutants.jsonl   # only survivors of an earlier run
 
-A mutant is a module with one expression changed: a comparison turned round or moved by its border, an arithmetic operator or a number exchanged,
-`and` for `or`, `min` for `max`, a condition negated, a call left out. Tests are run with the mutant in the place of the module, in all processes
-that they start, and no file of the checkout is changed. The test files named after the module run first, then those that import it, then those
-that import a module that imports it. The run of a mutant ends at the first failure. A test that also fails without the mutant is flaky: it is
-listed and left out, and the remaining tests decide. A mutant survives when all of them pass. Chosen at random with a seed, in equal parts from
-each folder.
+A mutant is a module with one changed expression: a comparison reversed or shifted at its boundary,
+an arithmetic operator or number replaced, `and` swapped with `or`, `min` with `max`, a condition
+negated, or a call removed. Tests run with the mutant in place of the module, in all processes that
+they start. No file of the checkout is changed. Test files named after the module run first, then
+those that import it, then those that import it indirectly. A run ends at the first failure. A test
+that also fails without the mutant is flaky: it is listed and excluded, and the remaining tests
+decide. A mutant survives if all of them pass. Mutants are drawn at random with a seed, in equal
+parts from each folder.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("operators", "services", "gsplat_core/training", "gsplat_core/geometry", "gsplat_core/endoscope")
 PACKAGES = ("gsplat_core", "operators", "services")
 MOST_TEST_FILES = 24
-"""Test files beyond those that import the module itself."""
+"""Maximum number of test files in addition to those that import the module itself."""
 LIMIT_S = 300.0
 """Time limit in seconds for one run of pytest. A mutant that exceeds it hangs and
 counts as killed.
@@ -43,7 +45,10 @@ counts as killed.
 NO_TESTS = 5
 """Exit code of pytest when every collected test is deselected."""
 PRECHECK_FILES = 3
-"""Test files of the first, short run of pytest; most mutants are killed there, without collecting the remaining files."""
+"""Number of test files in the first, short pytest run.
+
+Most mutants are killed there without collecting the remaining files.
+"""
 COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.GtE, ast.LtE), ast.LtE: (ast.Gt, ast.Lt), ast.Gt: (ast.LtE, ast.GtE), ast.GtE: (ast.Lt, ast.Gt),
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
@@ -91,7 +96,7 @@ class Mutant:
 
 
 def mutants_of(path: Path) -> Iterator[Mutant]:
-    """Every mutant of a module."""
+    """Return every mutant of a module."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for index, node in enumerate(ast.walk(tree)):
         for number in range(len(_changes(node))):
@@ -110,7 +115,7 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
 
 
 def _changes(node: ast.AST) -> list[Callable[[], None]]:
-    """Functions that change the node in place, each in one way."""
+    """Return functions that each change the node in place in one way."""
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
         return [lambda new=new: node.ops.__setitem__(0, new()) for new in COMPARISONS.get(type(node.ops[0]), ())]
     if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _is_text(node):
@@ -156,7 +161,7 @@ def module_name(path: str) -> str:
 
 @cache
 def imports_of(path: Path) -> frozenset[str]:
-    """Our modules that a file imports, in functions too."""
+    """Return the project modules that a file imports, including imports inside functions."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -168,7 +173,7 @@ def imports_of(path: Path) -> frozenset[str]:
 
 @cache
 def importers() -> dict[str, frozenset[Path]]:
-    """Files of the product and of the tests that import each module."""
+    """Return the product and test files that import each module."""
     found = defaultdict(set)
     for folder in (*PACKAGES, "tests"):
         for path in (ROOT / folder).rglob("*.py"):
@@ -268,7 +273,7 @@ def outcome_of(mutant: Mutant, folder: Path) -> Outcome:
 
 
 def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant]:
-    """Random mutants, in equal parts from each folder."""
+    """Draw random mutants, in equal parts from each folder."""
     rng = random.Random(seed)
     groups = [[ROOT / each for each in only]] if only else [sorted((ROOT / folder).rglob("*.py")) for folder in FOLDERS]
     chosen: list[Mutant] = []
@@ -291,7 +296,7 @@ def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant
 
 
 def survivors_of(log: Path) -> list[Mutant]:
-    """The mutants that survived an earlier run, as far as their modules still have these expressions."""
+    """Return the survivors of an earlier run whose expressions still exist."""
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     wanted = {(line["path"], line["change"]) for line in lines if "path" in line and line["killed_by"] is None}
     return [

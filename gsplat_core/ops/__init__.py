@@ -1,1 +1,1 @@
-"""The operations of the core, one folder each: Python wrapper, C++ kernels, registration."""
+"""Operations of the core, one folder each: Python wrapper, C++ and CUDA kernels, registration."""

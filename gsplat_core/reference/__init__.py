@@ -1,4 +1,7 @@
-"""Every operation in plain torch, for any floating-point dtype and device: the oracle of the tests."""
+"""Plain-torch implementations of all operations, for any floating dtype and device.
+
+They are the reference for tests of the compiled ops.
+"""
 
 from gsplat_core.reference.adam import adam_step
 from gsplat_core.reference.compositing import rasterize_to_pixels

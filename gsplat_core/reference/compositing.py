@@ -1,6 +1,7 @@
-"""Alpha compositing of depth-ordered splats in plain torch, any dtype, differentiable: the oracle of the compiled op.
+"""Alpha compositing of depth-sorted splats in plain torch (Kerbl et al. 2023, eq. 3).
 
-Equations of Kerbl et al. 2023 ("3D Gaussian Splatting", eq. 3), with the constants of gsplat 1.6 unless others are given.
+Any floating dtype, differentiable; test reference of the compiled op. Constants default to those of
+gsplat 1.6.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ def rasterize_to_pixels(
     *,
     max_alpha: float = ALPHA_MAX,
 ) -> tuple[Tensor, Tensor]:
-    """Blend splats front to back over every pixel; the same arguments and results as `gsplat_core.rasterize_to_pixels`.
+    """Blend splats front to back over every pixel; see `gsplat_core.rasterize_to_pixels`.
 
-    Tile by tile, each recomputed in the backward pass, so memory stays bounded by one tile and `SPLATS_AT_A_TIME` splats.
+    Tiles are processed one by one and recomputed in the backward pass. Memory is bounded by one
+    tile and `SPLATS_AT_A_TIME` splats.
     """
     image_dims = isect_offsets.shape[:-2]
     tile_height, tile_width = isect_offsets.shape[-2:]
@@ -68,7 +70,7 @@ def rasterize_to_pixels(
 
 
 class _Instances:
-    """The splats in the order of the tiles' lists, and how a tile's splats blend over its pixels."""
+    """Splats in the order of the tile lists, with blending of one tile's splats over its pixels."""
 
     def __init__(
         self,
@@ -110,7 +112,9 @@ class _Instances:
             self.absolute = absolute.view(-1, 2)
 
     def blend(self, tile: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours [P, D] and transmittance [P] behind the tile's splats at the pixel centres [P, 2]."""
+        """Return colours [P, D] and remaining transmittance [P] at the pixel centres [P, 2] of a
+        tile.
+        """
         colors = pixels.new_zeros(len(pixels), self.values[tile].shape[-1] - 6)
         product = through = pixels.new_ones(len(pixels))
         parts = zip(self.ids[tile].split(SPLATS_AT_A_TIME), self.values[tile].split(SPLATS_AT_A_TIME), strict=True)

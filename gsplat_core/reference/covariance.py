@@ -12,7 +12,7 @@ TRIU_COLUMNS = (0, 1, 2, 1, 2, 2)
 
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] as wxyz, which need not be of unit length."""
+    """Convert quaternions [..., 4] (wxyz, any non-zero length) to rotation matrices [..., 3, 3]."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -23,19 +23,22 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
 
 
 def matrix_to_triu(matrix: Tensor) -> Tensor:
-    """The upper triangle (xx, xy, xz, yy, yz, zz) [..., 6] of matrices [..., 3, 3]."""
+    """Return the upper triangles (xx, xy, xz, yy, yz, zz) [..., 6] of matrices [..., 3, 3]."""
     return matrix[..., TRIU_ROWS, TRIU_COLUMNS]
 
 
 def triu_to_matrix(triu: Tensor) -> Tensor:
-    """Symmetric matrices [..., 3, 3] from upper triangles [..., 6]."""
+    """Return symmetric matrices [..., 3, 3] from upper triangles [..., 6]."""
     return triu[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*triu.shape[:-1], 3, 3)
 
 
 def quat_scale_to_covar_preci(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ; see `gsplat_core.quat_scale_to_covar_preci`."""
+    """Compute covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ (Kerbl et al. 2023, eq. 6).
+
+    See `gsplat_core.quat_scale_to_covar_preci`.
+    """
     check_covariance_arguments(quats, scales)
     rotation = quat_to_rotmat(quats)
 

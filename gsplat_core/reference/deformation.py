@@ -1,4 +1,7 @@
-"""Deformation ops in plain torch: the deformation fields' own fallbacks are the oracle of the C++ and CUDA ones."""
+"""Deformation ops in plain torch, re-exported from the fields' own fallback implementations.
+
+They are the test reference of the C++ and CUDA kernels.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fit of disparities in plain torch: the oracle of `gsplat_core.ops.disparity_fit`."""
+"""Disparity refinement in plain torch: test reference of `gsplat_core.ops.disparity_fit`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RESISTANCE, OUTLIER, INDEPENDENT_PIXELS, LEAST_KNOWN = 4.0, 6.0, 20.0, 1e-3
 def fit_disparities(
     left: Tensor, right: Tensor, sixteenths: Tensor, dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, Tensor]:
-    """Disparities and their standard deviations [H, W], in `dtype`."""
+    """Return refined disparities and their standard deviations [H, W] in pixels, in `dtype`."""
     known = sixteenths != UNKNOWN
     there = known.to(dtype)
     start = torch.where(known, sixteenths, 0).to(dtype) / 16
@@ -39,7 +39,7 @@ def fit_disparities(
 
 
 def window(plane: Tensor) -> Tensor:
-    """Gaussian sums around each pixel, with nothing outside of the picture."""
+    """Filter a plane with a Gaussian window and zero padding."""
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=plane.dtype, device=plane.device)
     taps = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
     taps = taps / taps.sum()
@@ -48,7 +48,7 @@ def window(plane: Tensor) -> Tensor:
 
 
 def _taken_from(plane: Tensor, disparity: Tensor) -> Tensor:
-    """Values at the columns that the disparities lead to, linear between pixels."""
+    """Sample a plane at the columns displaced by the disparities, with linear interpolation."""
     width = plane.shape[1]
     columns = (torch.arange(width, dtype=plane.dtype, device=plane.device) - disparity).clamp(0, width - 1)
     first = columns.floor().long()

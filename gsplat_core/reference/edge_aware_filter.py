@@ -1,4 +1,7 @@
-"""The fast global smoother in plain torch: the oracle of `gsplat_core.ops.edge_aware_filter`."""
+"""Fast global smoother (Min et al. 2014) in plain torch.
+
+Test reference of `gsplat_core.ops.edge_aware_filter`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ ROUNDS, ATTENUATION = 3, 0.25
 
 
 def smooth_within_edges(planes: Tensor, guide: Tensor, strength: float, grey_step: float) -> Tensor:
-    """Planes [C, H, W] of any floating dtype; each line by a dense solve."""
+    """Smooth planes [C, H, W] of any floating dtype, solving each line as a dense system."""
     seen = guide.to(planes.dtype).reshape(*guide.shape[:2], -1)
     for _ in range(ROUNDS):
         planes = _along_rows(planes, seen, strength, grey_step)

@@ -21,20 +21,24 @@ from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_C
 def render_frame(
     gaussians: Sequence[Tensor], deltas: Tensor | None, view: View, *, expected_depth: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Deform, activate and render N Gaussians for one camera (Kerbl et al. 2023), differentiable in all of them.
+    """Deform, activate and render N Gaussians for one camera (Kerbl et al. 2023); differentiable.
+
+    Accepts any floating dtype. A Gaussian with a non-finite parameter or delta is culled and gets
+    zero gradients.
 
     Args:
-        gaussians: raw parameters: means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3],
+        gaussians: raw parameters: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3],
             logit_opacities [N], sh [N, B, 3] with B a square.
-        deltas: [N, 16], added to them in the layout of `scene.layout`, or None.
-        view: the camera; its tensors have the Gaussians' dtype.
-        expected_depth: the fourth channel is the weighted mean of z over the splats and not the weighted sum.
+        deltas: [N, 16], added to the raw parameters in the layout of `scene.layout`, or None.
+        view: camera; its tensors have the Gaussians' dtype.
+        expected_depth: normalise the fourth channel to the weighted mean of z; otherwise it is the
+            weighted sum.
 
     Returns:
         Image [H, W, 4] (red, green, blue, depth) and alphas [H, W].
 
-    A Gaussian with a value that is not finite, in its parameters or its deltas, is left out and gets zero gradients.
-    Any floating-point dtype. Raises InvalidInput for wrong shapes.
+    Raises:
+        InvalidInput: for wrong shapes.
     """
     means, quats, log_scales, logit_opacities, sh = gaussians
     n, bases = len(means), sh.shape[1] if sh.dim() == 3 else 0

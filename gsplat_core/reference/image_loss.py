@@ -1,6 +1,6 @@
-"""The image loss and its terms in plain torch: any floating type, differentiable by autograd.
+"""Image loss and its terms in plain torch: any floating dtype, differentiable by autograd.
 
-A term over nothing (no tissue, no valid depth) is 0 with zero gradient, never NaN.
+A term without any pixel (no tissue, no valid depth) is 0 with zero gradient, never NaN.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from gsplat_core.ops.image_loss.result import ImageLoss
 from gsplat_core.reference.ssim import ssim_map
 
 STEEP_AS_L1 = 0.01
-"""The difference at which the squared error is as steep as L1."""
+"""Difference at which the squared error has the slope of L1."""
 
 
 def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
@@ -24,7 +24,7 @@ def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
 
 
 def _tissue(mask: Tensor | None, like: Tensor) -> Tensor:
-    """The mask as booleans [H, W, C]."""
+    """Broadcast the mask to booleans [H, W, C]."""
     if mask is None:
         return torch.ones_like(like, dtype=torch.bool)
     if mask.shape != like.shape[:2]:
@@ -38,12 +38,15 @@ def _same_shape(a: Tensor, b: Tensor, names: str) -> None:
 
 
 def masked_l1(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean absolute error over tissue pixels and channels.
+    """Return the mean absolute error over tissue pixels and channels.
 
     Args:
         image: [H, W, C].
         target: [H, W, C].
         mask: [H, W], non-zero = tissue; None = all.
+
+    Returns:
+        Scalar loss.
     """
     _same_shape(image, target, "image and target")
     keep = _tissue(mask, image)
@@ -53,7 +56,7 @@ def masked_l1(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
 
 
 def masked_squared_error(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean of d² / (2 STEEP_AS_L1) over tissue pixels and channels; arguments as in `masked_l1`."""
+    """Return the mean of d² / (2 STEEP_AS_L1) over tissue pixels; arguments as in `masked_l1`."""
     _same_shape(image, target, "image and target")
     keep = _tissue(mask, image)
     zero = torch.zeros_like(image)
@@ -62,7 +65,10 @@ def masked_squared_error(image: Tensor, target: Tensor, mask: Tensor | None = No
 
 
 def masked_ssim_loss(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """1 - mean structural similarity of the masked images over tissue pixels; arguments as in `masked_l1`."""
+    """Return 1 - mean SSIM (Wang et al. 2004) of the masked images over tissue pixels.
+
+    Arguments are those of `masked_l1`.
+    """
     _same_shape(image, target, "image and target")
     keep = _tissue(mask, image)
     zero = torch.zeros_like(image)

@@ -26,7 +26,11 @@ FISHEYE_SERIES_BELOW = 0.01
 
 
 def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Image points [..., C, N, 2] and Jacobians [..., C, N, 2, 3] of camera-space points [..., C, N, 3]."""
+    """Project with the pinhole model.
+
+    Returns image points [..., C, N, 2] and Jacobians [..., C, N, 2, 3] of camera-space points [...,
+    C, N, 3].
+    """
     x, y, z = p.unbind(-1)
     fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
@@ -48,7 +52,11 @@ def _ortho(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tens
 
 
 def _fisheye(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Equidistant: the image radius is f θ. With s = θ/r and q = (dθ/dr - s)/r², du/dx = fx (s + q x²)."""
+    """Project with the equidistant fisheye model, in which the image radius is f θ.
+
+    With s = θ/r and q = (dθ/dr - s)/r², du/dx = fx (s + q x²). Results have the shapes of
+    `_pinhole`.
+    """
     x, y, z = p.unbind(-1)
     fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     near_axis = (x * x + y * y < (FISHEYE_SERIES_BELOW * z) ** 2) & (z > 0)
@@ -101,7 +109,10 @@ def fully_fused_projection(
     *,
     compensation_floor: float = COMPENSATION_FLOOR,
 ) -> DenseProjection | PackedProjection:
-    """Project Gaussians to image ellipses; see `gsplat_core.fully_fused_projection`."""
+    """Project 3D Gaussians to 2D image Gaussians by EWA splatting (Zwicker et al. 2001).
+
+    See `gsplat_core.fully_fused_projection`.
+    """
     check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
     check_projection_options(width, height, sparse_grad, camera_model, compensation_floor)
     # Unusable Gaussians are replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
@@ -154,7 +165,7 @@ def _usable(
 
 
 def _covariance(usable: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> Tensor:
-    """Covariances in the world [..., N, 3, 3]; the identity for Gaussians that are not usable."""
+    """Return world-space covariances [..., N, 3, 3]; the identity for unusable Gaussians."""
     if covars is not None:
         identity = covars.new_tensor([1, 0, 0, 1, 0, 1])
         return triu_to_matrix(torch.where(usable[..., None], covars, identity))
@@ -167,14 +178,14 @@ def _covariance(usable: Tensor, covars: Tensor | None, quats: Tensor | None, sca
 
 
 class _Ellipses(NamedTuple):
-    """Blurred covariances in the image, [..., C, N]."""
+    """Blurred 2D covariances of splats, [..., C, N]."""
 
     variances: Tensor
-    """[..., C, N, 2]: along x and y."""
+    """Variances along x and y in pixels², [..., C, N, 2]."""
     conics: Tensor
     compensations: Tensor
     positive: Tensor
-    """bool: whether the covariance has an inverse; without one the conic is meaningless."""
+    """bool: the covariance is invertible; otherwise the conic is meaningless."""
 
 
 def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Ellipses:
@@ -193,7 +204,10 @@ def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Elli
 
 @torch.no_grad()
 def _half_sizes(ellipses: _Ellipses, opacities: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Half width and height in pixels [..., C, N, 2] of the box in which alpha reaches its cut-off, and whether it does at all."""
+    """Return half width and height in pixels [..., C, N, 2] of the box where alpha reaches 1/255.
+
+    Also returns a mask of Gaussians that reach it at all.
+    """
     extent = torch.full_like(ellipses.compensations, MAX_EXTENT_SIGMAS)
     visible = torch.ones_like(ellipses.positive)
     if opacities is not None:

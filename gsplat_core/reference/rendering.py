@@ -24,7 +24,9 @@ def bin_splats(
     n_images: int | None = None,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`isect_tiles` (sorted) and `isect_offset_encode` in one; `options` are those of `isect_tiles`."""
+    """Run `isect_tiles` (sorted) and `isect_offset_encode`; `options` are those of
+    `isect_tiles`.
+    """
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, n_images=n_images, **options)
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
     offsets = isect_offset_encode(isect_ids, images, grid.tile_width, grid.tile_height)
@@ -39,7 +41,10 @@ def bin_splats_within(
     capacity: int,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The compiled `bin_splats` with a capacity, of splats that are not packed: the nearest that fit, unused entries first."""
+    """Emulate the compiled `bin_splats` with a capacity, for unpacked splats.
+
+    Keeps the nearest splats that fit; unused entries come first.
+    """
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, **options)
     counts = tiles_per_gauss.reshape(-1)
     nearest_first = torch.argsort(depths.detach().reshape(-1).view(torch.int32).long() & 0xFFFFFFFF, stable=True)

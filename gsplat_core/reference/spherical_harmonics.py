@@ -9,7 +9,10 @@ from gsplat_core.argument_checks import check_spherical_harmonics_arguments
 
 
 def spherical_harmonics_bases(degree: int, directions: Tensor) -> Tensor:
-    """The (degree + 1)² basis functions [..., K] at unit directions [..., 3], in the field's order and signs."""
+    """Evaluate the (degree + 1)² real basis functions [..., K] at unit directions [..., 3].
+
+    Order and signs are those of 3DGS (Kerbl et al. 2023).
+    """
     x, y, z = directions.unbind(-1)
     bases = [torch.full_like(x, 0.28209479177387814)]
     if degree >= 1:
@@ -55,7 +58,7 @@ def spherical_harmonics_bases(degree: int, directions: Tensor) -> Tensor:
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
-    """Sums of spherical harmonics; see `gsplat_core.spherical_harmonics`."""
+    """Evaluate sums of spherical harmonics; see `gsplat_core.spherical_harmonics`."""
     check_spherical_harmonics_arguments(degrees_to_use, dirs, coeffs, masks)
     count = (degrees_to_use + 1) ** 2
     coeffs = coeffs[..., :count, :]

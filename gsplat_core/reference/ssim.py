@@ -1,6 +1,7 @@
-"""Structural similarity (Wang et al. 2004) in plain torch: any floating type, differentiable by autograd.
+"""Structural similarity (Wang et al. 2004) in plain torch: any floating dtype, differentiable.
 
-The field's convention: 11x11 Gaussian window of sigma 1.5, zero padding at the border, C1 = 0.01^2, C2 = 0.03^2, values in 0..1.
+Usual parameters: 11x11 Gaussian window of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, values
+in 0..1.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ C2 = 0.03**2
 
 
 def gaussian_window() -> Tensor:
-    """The 11 taps of the separable window, float64; they sum to 1."""
+    """Return the 11 taps of the separable window, float64, with sum 1."""
     offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=torch.float64)
     taps = torch.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
     return taps / taps.sum()
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """[P, H, W] filtered by the window, zero outside of the image."""
+    """Filter planes [P, H, W] with the window and zero padding."""
     height, width = planes.shape[1:]
     taps = gaussian_window().tolist()
     padded = torch.nn.functional.pad(planes, (WINDOW_RADIUS_PX,) * 4)
@@ -33,11 +34,11 @@ def _blur(planes: Tensor) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity of each pixel and channel (Wang et al. 2004, equation 13).
+    """Compute the structural similarity of each pixel and channel (Wang et al. 2004, equation 13).
 
     Args:
         image: [H, W, C], values in 0..1.
-        target: [H, W, C], the same type.
+        target: [H, W, C], same dtype.
 
     Returns:
         [H, W, C], in -1..1.

@@ -1,4 +1,7 @@
-"""Semi-global matching in plain torch, in whole numbers: the oracle of `gsplat_core.ops.stereo_matching`."""
+"""Integer semi-global matching in plain torch (Hirschmüller 2008).
+
+Test reference of `gsplat_core.ops.stereo_matching`.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,12 @@ UNKNOWN = torch.iinfo(torch.int32).min
 
 
 def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> tuple[Tensor, Tensor]:
-    """Disparities in sixteenths of a pixel, int32 [H, W], and where neither a jump nor a hole is near, bool [H, W]."""
+    """Match rectified grey pictures, uint8 [H, W].
+
+    Returns:
+        Disparities in 1/16 px, int32 [H, W], and a mask [H, W] of pixels without jump or hole
+            nearby.
+    """
     costs = window_costs(left.long(), right.long(), lowest, count)
     messages = (
         _messages_down(costs.transpose(0, 1)).transpose(0, 1)
@@ -95,7 +103,16 @@ def _messages_down(costs: Tensor) -> Tensor:
 
 
 def checked_winners(totals: Tensor, lowest: int) -> Tensor:
-    """The best disparity of each pixel in sixteenths, from totals [H, W, count], where the right eye agrees."""
+    """Select the best disparity of each pixel with sub-pixel interpolation and consistency checks.
+
+    Args:
+        totals: aggregated costs [H, W, count].
+        lowest: smallest disparity in pixels.
+
+    Returns:
+        Disparities in 1/16 px [H, W]; `UNKNOWN` where ambiguous or inconsistent with the right
+            picture.
+    """
     height, width, count = totals.shape
     numbers = torch.arange(count, device=totals.device)
     keys = totals * 256 + numbers  # of equal totals the lowest disparity's

@@ -25,7 +25,7 @@ def isect_tiles(
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of a splat and a tile that it touches; the same arguments and results as `gsplat_core.isect_tiles`."""
+    """List the tiles that each splat touches; see `gsplat_core.isect_tiles`."""
     count = depths.numel()
     images = (n_images or 0) if packed else math.prod(depths.shape[:-1])
     means = means2d.reshape(-1, 2)

@@ -23,7 +23,7 @@ def adam_step(
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> int:
-    """`adam_step_queued`, and the number of rows left alone read at once: on CUDA the host waits for it."""
+    """Run `adam_step_queued` and return the number of skipped rows; synchronises on CUDA."""
     return int(
         adam_step_queued(
             parameter, gradient, first_moment, second_moment, step, learning_rate, betas, epsilon, row_size
@@ -42,23 +42,30 @@ def adam_step_queued(
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> Tensor:
-    """Update `parameter` and its moments in place as torch.optim.Adam does; on CUDA the host does not wait.
+    """Update `parameter` and its moments in place as torch.optim.Adam does, without host sync on
+    CUDA.
 
-    A gradient that is NaN or infinite (or so large that its square is) would stay in the moments for good, so its row of
-    `row_size` consecutive values, parameter and moments, is left as it was.
+    A non-finite gradient, or one with a non-finite square, would corrupt the moments permanently. A
+    row of `row_size` consecutive values with such a gradient keeps its parameters and moments.
 
     Args:
-        parameter, first_moment, second_moment: float32, contiguous, of the gradient's shape.
-        gradient: float32.
-        step: counts from 1.
-        row_size: values that are updated together or not at all; 1 = each for itself. It divides the number of values.
+        parameter: float32, contiguous.
+        gradient: float32, same shape.
+        first_moment: float32, contiguous, same shape.
+        second_moment: float32, contiguous, same shape.
+        step: step number from 1.
+        learning_rate: learning rate.
+        betas: decay rates of the moments.
+        epsilon: term added to the denominator.
+        row_size: number of values that are updated together or not at all; divides the number of
+            values.
 
     Returns:
-        How many rows were left alone, int64 [] on the device.
+        Number of skipped rows, int64 [] on the device.
 
     Raises:
-        InvalidInput: shapes or devices differ, a tensor is not float32 or not contiguous, or step is below 1;
-            `gsplat_core.reference.adam` takes any floating type.
+        InvalidInput: if shapes or devices differ, a tensor is not float32 or not contiguous, or
+            step is below 1. `gsplat_core.reference.adam` accepts any floating dtype.
     """
     _check(parameter, gradient, first_moment, second_moment, row_size)
     if step < 1:

@@ -1,9 +1,8 @@
-"""Basis-function deformation: bumps in time to per-Gaussian deltas, their gradients, and gradients fused with lazy Adam.
+"""Basis-function deformation: per-Gaussian deltas from bumps in time, gradients, fused lazy Adam.
 
-The maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32, on the CPU and on CUDA.
-
-On CUDA nothing waits for the device, and where `tau` and the learning rates are tensors there, a captured launch reads them anew whenever
-it is replayed.
+Maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32 on CPU and
+CUDA. On CUDA the host does not synchronise. If `tau` and the learning rates are device tensors, a
+captured launch reads them at every replay.
 """
 
 from __future__ import annotations
@@ -22,16 +21,25 @@ from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
 from gsplat_core.scene.layout import RAW_COLUMNS
 
 RATES = 6
-"""Learning rates: position, rotation, log-scale, colour, centres, widths."""
+"""Number of learning rates: position, rotation, log-scale, colour, centres, widths."""
 
 
 def basis_field(
     centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, padded: bool = False
 ) -> Tensor:
-    """Deltas [N, 13] at `tau` of bumps with `centers`, `log_widths` [N, B] and `weights` [N, B, 13]; differentiable.
+    """Return the deltas at `tau`; differentiable.
 
-    A bump more than 4 widths away contributes nothing and gets no gradient. `tau` is a number, or one float32 on the field's
-    device. With `padded` the deltas are [N, 16], the frame path's layout; the last three columns are 0.
+    A bump more than 4 widths away contributes nothing and gets no gradient.
+
+    Args:
+        centers: float32 [N, B].
+        log_widths: float32 [N, B].
+        weights: float32 [N, B, 13].
+        tau: normalised time, a number or one float32 on the field's device.
+        padded: append three zero columns, the frame path's layout.
+
+    Returns:
+        Deltas [N, 13], or [N, 16] if padded.
     """
     _check(centers, log_widths, weights)
     return torch.ops.gsplat_core.basis_field(centers, log_widths, weights, _scalars("tau", tau, centers, 1), padded)
@@ -40,9 +48,10 @@ def basis_field(
 def basis_field_backward(
     gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of (centers, log_widths, weights) for dL/d(delta) `gradient`; exactly zero for inactive bumps.
+    """Return the gradients of (centers, log_widths, weights); exactly zero for inactive bumps.
 
-    `gradient` is [N, 13], or [N, 16] of which the last three columns are not looked at.
+    Args:
+        gradient: dL/d(deltas) [N, 13], or [N, 16] of which the last three columns are ignored.
     """
     _check(centers, log_widths, weights)
     _check_gradient(gradient, centers)
@@ -62,10 +71,11 @@ def basis_field_backward_adam_(
     betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
 ) -> None:
-    """Gradients and one lazy Adam step of every bump active at `tau`, in place and in one pass.
+    """Compute gradients and take one lazy Adam step of every bump active at `tau`, in place.
 
-    Arguments as `gsplat_core.reference.basis_field_backward_adam_`; every tensor that is updated must be contiguous. `gradient`
-    may be [N, 16] as in `basis_field_backward`; `tau` and `learning_rates` may be float32 tensors on the field's device.
+    Arguments are those of `gsplat_core.reference.basis_field_backward_adam_`. Updated tensors must
+    be contiguous. `gradient` may be [N, 16]. `tau` and `learning_rates` may be float32 device
+    tensors.
     """
     centers = field[0]
     _check(*field)
@@ -85,9 +95,10 @@ def basis_field_backward_adam_(
 def basis_field_move_to_(
     centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, target: Tensor
 ) -> None:
-    """Change `weights` in place, as little as that can be done, so that the deltas at `tau` are `target` [N, 13].
+    """Change `weights` minimally in place so that the deltas at `tau` become `target` [N, 13].
 
-    Arguments as `gsplat_core.reference.basis_field_move_to_`; `weights` must be contiguous.
+    Arguments are those of `gsplat_core.reference.basis_field_move_to_`; `weights` must be
+    contiguous.
     """
     _check(centers, log_widths, weights)
     if target.shape != (centers.shape[0], CHANNELS):
@@ -99,9 +110,10 @@ def basis_field_move_to_(
 def basis_field_add_colours_(
     centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, change: Tensor
 ) -> None:
-    """Change `weights` in place so that the colours at `tau` change by `change` [N, 3]; other times change as little as they can.
+    """Change `weights` in place so that the colours at `tau` change by `change` [N, 3].
 
-    Maths and exceptions as `gsplat_core.reference.basis_field_add_colours_`.
+    Maths and exceptions are those of `gsplat_core.reference.basis_field_add_colours_`. Colours at
+    other times change as little as possible.
     """
     _check(centers, log_widths, weights)
     if change.shape != (centers.shape[0], 3):
@@ -113,7 +125,7 @@ def basis_field_add_colours_(
 
 
 def _scalars(name: str, values: float | Sequence[float] | Tensor, like: Tensor, count: int) -> Tensor:
-    """`count` float32 on the device of `like`. Numbers travel in a launch's arguments, so that the host does not wait."""
+    """Return float32 values on the device of `like`; numbers are passed as launch arguments."""
     if not isinstance(values, Tensor):
         numbers = [float(v) for v in values] if isinstance(values, Sequence) else [float(values)]
         if len(numbers) != count:

@@ -14,20 +14,30 @@ from torch import Tensor
 from gsplat_core.scene.layout import BASIS_GROUPS, COLOUR, RAW_COLUMNS, width_of
 
 BUMP_REACH = 4.0
-"""A bump further than this many widths from the time contributes nothing: exp(-16) is 1e-7 of its height."""
+"""Truncation radius of a bump in widths; its height there is exp(-16) = 1e-7."""
 
 LEAST_SQUARED_HEIGHTS = 1e-2
-"""Sum of the squared heights of the bumps at a time below which they are left alone: weights would become huge."""
+"""Minimum sum of squared bump heights at a time. Below it, weights would become huge."""
 
 
 def basis_field(
     centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, padded: bool = False
 ) -> Tensor:
-    """Sum of truncated bumps in time: delta[n] = sum_b exp(-u^2) weights[n, b], u = (tau - center) / width, |u| <= 4.
+    """Evaluate truncated bumps in time: delta[n] = sum_b exp(-u²) weights[n, b] for |u| <= 4.
 
-    After the basis functions of Deform3DGS (Yang et al. 2024, eq. 5), with one timing shared by all channels. `centers` and
-    `log_widths` are [N, B], `weights` [N, B, C], `tau` in the units of the centres; returns [N, C]. NaN in a centre or width
-    reaches the Gaussian's deltas (it is not mistaken for an inactive bump). `padded` appends zero columns up to `RAW_COLUMNS`.
+    u = (tau - center) / width. Based on the basis functions of Deform3DGS (Yang et al. 2024, eq.
+    5), with timing shared by all channels. NaN in a centre or width propagates to the Gaussian's
+    deltas.
+
+    Args:
+        centers: [N, B].
+        log_widths: [N, B].
+        weights: [N, B, C].
+        tau: time in the units of the centres.
+        padded: append zero columns up to `RAW_COLUMNS`.
+
+    Returns:
+        Deltas [N, C].
     """
     u = (tau - centers) * torch.exp(-log_widths)
     inactive = u.abs() > BUMP_REACH
@@ -40,9 +50,10 @@ def basis_field(
 def basis_field_backward(
     gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of (centers, log_widths, weights) for dL/d(delta) `gradient` [N, C]; exactly zero for inactive bumps.
+    """Return the gradients of (centers, log_widths, weights); exactly zero for inactive bumps.
 
-    Columns of `gradient` beyond C are not looked at.
+    Args:
+        gradient: dL/d(deltas) [N, C]; further columns are ignored.
     """
     gradient = gradient[:, : weights.shape[2]]
     inverse_width = torch.exp(-log_widths)
@@ -111,11 +122,12 @@ def basis_field_backward_adam_(
 def basis_field_move_to_(
     centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, target: Tensor
 ) -> None:
-    """Let the deltas at `tau` be `target` [N, C], in place, with the least change of the weights.
+    """Change the weights minimally in place so that the deltas at `tau` become `target` [N, C].
 
-    With heights h_b = exp(-u_b^2) (see `basis_field`), the weights that add up to a change and have the smallest norm are
-    h_b / sum(h^2) times it. Other times change by exp(-d^2 / 2) of it, d bump spacings away, as training on that frame alone
-    would make them. A row that would not be finite is left alone.
+    Let h_b = exp(-u_b^2) be the bump heights (see `basis_field`). The minimum-norm weight change is
+    h_b / sum(h^2) times the change of the deltas. The deltas at d bump spacings from `tau` change
+    by exp(-d^2 / 2) of it, as by training on that frame alone. Rows with a non-finite result are
+    skipped.
     """
     with torch.no_grad():
         change = target - basis_field(centers, log_widths, weights, tau)

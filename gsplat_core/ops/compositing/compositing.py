@@ -1,4 +1,4 @@
-"""Alpha compositing of depth-ordered splats (Kerbl et al. 2023, "3D Gaussian Splatting", eq. 3), with gradients."""
+"""Alpha compositing of depth-sorted splats (Kerbl et al. 2023, eq. 3), with gradients."""
 
 from __future__ import annotations
 
@@ -29,25 +29,39 @@ def rasterize_to_pixels(
     *,
     max_alpha: float = 0.99,
 ) -> tuple[Tensor, Tensor]:
-    """Blend splats front to back over every pixel. Names and results of gsplat 1.5.3; `...` are the images.
+    """Blend splats front to back over every pixel. Names and results are those of gsplat 1.5.3.
 
-    alpha = min(max_alpha, opacity exp(-sigma)) at the pixel's centre, sigma the quadratic form of the conic. A splat with alpha
-    below 1/255 or sigma below 0 is skipped; one that would leave a transmittance of 1e-4 or less ends the pixel. A splat with
-    a value that is not finite is skipped and has no gradient. Where alpha is clamped, opacity, mean and conic have no gradient.
+    alpha = min(max_alpha, opacity exp(-sigma)) at the pixel's centre, where sigma is the quadratic
+    form of the conic. Splats with alpha below 1/255 or sigma below 0 are skipped. Blending of a
+    pixel ends before the splat that would reduce the transmittance to 1e-4 or less. Splats with a
+    non-finite value are skipped and have no gradient. Where alpha is clamped, opacity, mean and
+    conic have no gradient. The result does not depend on the number of threads.
 
     Args:
-        means2d: [..., N, 2] pixels; pixel (0, 0) has its centre at (0.5, 0.5). Packed: [nnz, 2].
-        conics: [..., N, 3] upper triangle of the inverse covariance, 1/pixels^2. Packed: [nnz, 3].
+        means2d: [..., N, 2] pixels, `...` being the images; the centre of pixel (0, 0) is (0.5,
+            0.5).
+            Packed: [nnz, 2].
+        conics: [..., N, 3], upper triangle of the inverse covariance, 1/pixels^2. Packed: [nnz, 3].
         colors: [..., N, D], any D. Packed: [nnz, D].
         opacities: [..., N] in 0..1. Packed: [nnz].
-        tile_size: pixels on a side; any, 16 is fastest.
-        isect_offsets: int32 [..., tile_height, tile_width] and flatten_ids: int32 [M], of `isect_tiles`.
-        backgrounds: [..., D]; masks: bool [..., tile_height, tile_width], a tile with False shows the background only.
-        absgrad: the backward pass leaves the sum over pixels of |dL/dmeans2d| in `means2d.absgrad` (AbsGS, Ye et al. 2024).
-        max_alpha: 0.99 as in gsplat 1.6, or another from 1/255 to below 1; gsplat 1.5.3 has 0.999.
+        image_width: width in pixels.
+        image_height: height in pixels.
+        tile_size: side of a tile in pixels; 16 is fastest.
+        isect_offsets: int32 [..., tile_height, tile_width], from `isect_offset_encode`.
+        flatten_ids: int32 [M], from `isect_tiles`.
+        backgrounds: [..., D].
+        masks: bool [..., tile_height, tile_width]; a tile with False shows only the background.
+        packed: splats are packed rows.
+        absgrad: the backward pass stores the sum over pixels of |dL/dmeans2d| in `means2d.absgrad`
+            (AbsGS, Ye et al. 2024).
+        max_alpha: upper limit of alpha, from 1/255 to below 1; 0.99 in gsplat 1.6, 0.999 in 1.5.3.
 
-    Returns colors [..., image_height, image_width, D] and alphas [..., image_height, image_width, 1], float32. Raises InvalidInput
-    for wrong shapes, types or limits. The result is the same for any number of threads.
+    Returns:
+        Colours float32 [..., image_height, image_width, D] and alphas float32 [..., image_height,
+            image_width, 1].
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or limits.
     """
     channels = colors.shape[-1] if colors.ndim else 0
     image_dims = isect_offsets.shape[:-2]

@@ -1,4 +1,6 @@
-"""Covariance and precision matrices from rotations and scales, compiled (Kerbl et al. 2023, equation 6)."""
+"""Covariance and precision matrices from rotations and scales (Kerbl et al. 2023, eq.
+6), compiled.
+"""
 
 from __future__ import annotations
 

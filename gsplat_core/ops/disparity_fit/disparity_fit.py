@@ -12,12 +12,12 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 
 class Fitted(NamedTuple):
-    """Disparities and how well the pictures tell them."""
+    """Refined disparities with their uncertainty."""
 
     px: Tensor
-    """[H, W] float32; 0 where unknown."""
+    """Disparity in pixels, float32 [H, W]; 0 where unknown."""
     error_px: Tensor
-    """[H, W] float32: standard deviation; infinite where unknown."""
+    """Standard deviation in pixels, float32 [H, W]; infinite where unknown."""
 
 
 def fit_disparities(left: Tensor, right: Tensor, sixteenths: Tensor) -> Fitted:

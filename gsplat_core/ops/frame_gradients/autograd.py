@@ -1,4 +1,4 @@
-"""Autograd for `render_frame`: its raw parameters and deltas get the gradient of `render_frame_backward`."""
+"""Autograd wrapper of `render_frame`, with gradients of raw parameters and deltas."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 TRAINING = 1
-"""`FrameMode.TRAINING`, which is defined in a module that imports this one."""
+"""Value of `FrameMode.TRAINING`, duplicated here to avoid a circular import."""
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

@@ -1,7 +1,7 @@
-"""The gradient of `render_frame` with respect to raw Gaussians and their deltas, and the same with Adam over the Gaussians.
+"""Backward pass of `render_frame` for raw Gaussians and deltas, optionally fused with Adam.
 
-Formulas of Kerbl et al. 2023, appendix A, with the chain rule through the activations; CUDA only, float32. Neither waits for the
-device, and both can be captured in a CUDA graph.
+Formulas: Kerbl et al. 2023, appendix A, with the chain rule through the activations. CUDA only,
+float32. No call synchronises with the host, and a CUDA graph can capture both.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.frame.frame import Frame
 
 RATES = len(GAUSSIAN_TENSORS)
-"""Learning rates of the fused Adam: one for each of `GAUSSIAN_TENSORS`."""
+"""Number of learning rates of the fused Adam: one for each of `GAUSSIAN_TENSORS`."""
 
 
 class RawGradients(NamedTuple):
@@ -35,17 +35,22 @@ class RawGradients(NamedTuple):
 
 
 class GaussianAdam(NamedTuple):
-    """Adam's state over the Gaussians (Kingma and Ba 2015). Tensors are read on the device, so that a captured graph sees new values."""
+    """State of Adam over the Gaussians (Kingma and Ba 2015).
+
+    Tensors are read on the device, so a captured graph uses new values at each replay.
+    """
 
     first_moments: Sequence[Tensor]
-    """Five tensors of the Gaussians' shapes, contiguous, each of memory of its own; so are the next ones."""
+    """Five contiguous tensors with the Gaussians' shapes and separate memory; also
+    `second_moments`.
+    """
     second_moments: Sequence[Tensor]
     rates: Tensor
     """float32 [5], the learning rates in the order of the tensors."""
     step: Tensor
-    """int64 or int32 [1], counted from 1 (less is taken for 1)."""
+    """Step number from 1, int64 or int32 [1]; smaller values count as 1."""
     skipped: Tensor
-    """int64 [5]; the rows that were left unchanged are added to it."""
+    """int64 [5]; incremented by the number of unchanged rows of each tensor."""
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 
@@ -57,7 +62,9 @@ class ColourCorrection(NamedTuple):
     """
 
     residuals: Tensor
-    """[H, W, 4]: red, green, blue of tissue (1, else 0) times (picture wanted - picture shown), and tissue."""
+    """[H, W, 4]: tissue mask times (target - rendered) for red, green, blue; and the
+    tissue mask.
+    """
     relaxation: Tensor
     """float32 [1]."""
 
@@ -155,7 +162,7 @@ def render_frame_backward_adam_(
 def _check(
     op: str, gaussians: Sequence[Tensor], deltas: Tensor | None, view: View, v_image: Tensor, v_alphas: Tensor | None
 ) -> None:
-    """The ops check the forward results against these sizes."""
+    """Check arguments; the compiled ops check the forward results against these sizes."""
     check_inputs(op, gaussians, deltas, view, v_image=v_image, v_alphas=v_alphas)
     require_shape("v_image", v_image, (view.height, view.width, 4), "[H, W, 4]")
     if v_alphas is not None:

@@ -1,7 +1,7 @@
-"""HexPlane features: plane samples multiplied, their gradients, and the two halves of factorised inference.
+"""HexPlane features (Cao & Johnson 2023), their gradients, and factorised inference.
 
-Shapes and maths are those of `gsplat_core.reference.hexplane_features`, `hexplane_space` and `hexplane_modulate`; float32 on
-the CPU. Gradients are the same for any number of threads.
+Shapes and maths are those of `gsplat_core.reference.hexplane_features`, `hexplane_space` and
+`hexplane_modulate`; float32 on the CPU. Gradients do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,20 +19,27 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 def hexplane_features(
     coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor, xt: Tensor, yt: Tensor, zt: Tensor
 ) -> Tensor:
-    """Product [N, C] of six plane samples at `coordinates` [N, 4] in [-1, 1]; planes [V, U, C]. Differentiable."""
+    """Return the product [N, C] of six plane samples; differentiable.
+
+    Args:
+        coordinates: x, y, z, t in [-1, 1], [N, 4].
+        xy: plane [V, U, C], as the other five planes.
+    """
     planes = (xy, xz, yz, xt, yt, zt)
     _check(coordinates, planes, 3)
     return torch.ops.gsplat_core.hexplane_features(coordinates, *planes)
 
 
 def hexplane_space(coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor) -> Tensor:
-    """Product [N, C] of the space planes alone, for inference (not differentiable)."""
+    """Return the product [N, C] of the space-plane samples, for inference (not differentiable)."""
     _check(coordinates, (xy, xz, yz), 3)
     return torch.ops.gsplat_core.hexplane_space(coordinates, xy, xz, yz)
 
 
 def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor, zt: Tensor) -> Tensor:
-    """`space` [N, C] times the samples of three lines [U, C], for inference (not differentiable)."""
+    """Multiply `space` [N, C] by samples of three lines [U, C], for inference (not
+    differentiable).
+    """
     _check(coordinates, (xt, yt, zt), 2)
     if space.shape != (coordinates.shape[0], xt.shape[1]):
         raise InvalidInput(f"space must be [{coordinates.shape[0]}, {xt.shape[1]}], got {list(space.shape)}")
@@ -46,10 +53,18 @@ def hexplane_decode(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> Tensor:
-    """Features of all levels (`spaces` [N, C], times three `lines` [U, C] each when given) through an MLP: [N, outputs].
+    """Decode the features of all levels with an MLP, for inference (not differentiable).
 
-    For inference (not differentiable): a block of Gaussians passes all layers without leaving the cache. Arguments as
-    `gsplat_core.reference.hexplane_decode`; RuntimeError when the layers do not fit together.
+    A block of Gaussians passes all layers without leaving the cache.
+
+    Args:
+        spaces: features [N, C] of each level.
+
+    Returns:
+        [N, outputs].
+
+    Raises:
+        RuntimeError: if the layers do not fit together.
     """
     for tensor in (coordinates, *spaces, *lines, *weights, *biases):
         if tensor.dtype != torch.float32:

@@ -15,7 +15,10 @@ from gsplat_core.scene.layout import COLOUR, HEAD_GROUPS, OPACITY, RAW_COLUMNS, 
 
 
 def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Bilinear samples [N, C] of `plane` [V, U, C] at `u`, `v` in [-1, 1] (corners aligned, clamped at the border)."""
+    """Sample `plane` [V, U, C] bilinearly at `u`, `v` in [-1, 1]; returns [N, C].
+
+    Corners are aligned, and coordinates are clamped at the border.
+    """
     grid = torch.stack([u, v], dim=-1)[None, None]
     image = plane.permute(2, 0, 1)[None]
     sampled = torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
@@ -23,15 +26,23 @@ def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 PLANE_AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
-"""Axes (u, v) of the six planes xy, xz, yz, xt, yt, zt; a plane is stored [size of v, size of u, channels]."""
+"""Axes (u, v) of the planes xy, xz, yz, xt, yt, zt.
+
+A plane is stored as [size of v, size of u, channels].
+"""
 
 
 def hexplane_features(
     coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor, xt: Tensor, yt: Tensor, zt: Tensor
 ) -> Tensor:
-    """Product of six bilinear plane samples (HexPlane, Cao and Johnson 2023, eq. 3), one level.
+    """Return the product of six bilinear plane samples of one level (Cao & Johnson 2023, eq. 3).
 
-    `coordinates` [N, 4] are x, y, z, t in [-1, 1]; planes are [V, U, C] for the axes of PLANE_AXES. Returns [N, C].
+    Args:
+        coordinates: x, y, z, t in [-1, 1], [N, 4].
+        xy: plane [V, U, C], as the other five planes, with the axes of PLANE_AXES.
+
+    Returns:
+        Features [N, C].
     """
     product = None
     for plane, (a, b) in zip((xy, xz, yz, xt, yt, zt), PLANE_AXES, strict=True):
@@ -42,13 +53,18 @@ def hexplane_features(
 
 
 def hexplane_space(coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor) -> Tensor:
-    """The part of `hexplane_features` that does not depend on time: the product of the space planes [N, C]."""
+    """Return the time-independent part of `hexplane_features`: the product [N, C] of
+    space planes.
+    """
     x, y, z = coordinates[:, 0], coordinates[:, 1], coordinates[:, 2]
     return sample_plane(xy, x, y) * sample_plane(xz, x, z) * sample_plane(yz, y, z)
 
 
 def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor, zt: Tensor) -> Tensor:
-    """`space` [N, C] times the samples of three lines [U, C], the time planes already interpolated at one time."""
+    """Multiply `space` [N, C] by samples of three lines [U, C].
+
+    The lines are the time planes interpolated at one time.
+    """
     product = space
     for axis, line in enumerate((xt, yt, zt)):
         u = coordinates[:, axis]
@@ -63,10 +79,13 @@ def hexplane_decode(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> Tensor:
-    """Features through an MLP with ReLU between its layers: [N, outputs].
+    """Decode features with an MLP with ReLU between its layers.
 
-    The features of a level are its `spaces` [N, C], times its three `lines` [U, C] when these are given; the levels are put
-    side by side. `weights` [outputs, inputs] and `biases` [outputs] are those of `torch.nn.Linear`, layer by layer.
+    Args:
+        spaces: features [N, C] of each level; levels are concatenated.
+
+    Returns:
+        [N, outputs].
     """
     levels = list(spaces)
     if lines:

@@ -1,7 +1,7 @@
-"""The HexPlane field's deltas at one time, from its cached space features: on CUDA, for the fused frame path.
+"""HexPlane deltas at one time from cached space features, on CUDA for the fused frame path.
 
-Maths of `gsplat_core.reference.hexplane_deltas`. The time is read from device memory and nothing waits for the host, so a call can be
-captured in a CUDA graph and replayed with another time.
+Maths: `gsplat_core.reference.hexplane_deltas`. The time is read from device memory and the host
+does not synchronise, so a CUDA graph can capture the call and replay it with another time.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def hexplane_deltas(
 
 
 def padded_width(width: int) -> int:
-    """The width that the kernels give a layer of `width`; 0: it is wider than they take."""
+    """Return the kernels' padded size of a layer of `width`; 0 if it exceeds their limit."""
     return next((size for size in (32, 64, 128) if width <= size), 0)
 
 

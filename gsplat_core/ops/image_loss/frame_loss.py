@@ -1,4 +1,4 @@
-"""The training loss of a frame of the fused path, with its gradients, on CUDA."""
+"""Training loss of a frame of the fused path, with its gradients, on CUDA."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 
 class FrameLoss(NamedTuple):
-    """A loss with its gradients, ready for `render_frame_backward`."""
+    """Loss with its gradients, the input of `render_frame_backward`."""
 
     loss: Tensor
     """Scalar."""
     terms: Tensor
-    """[3]: L1 or squared error, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight."""
+    """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth
+    L1.
+    """
     grad_image: Tensor
     """dL/dimage [H, W, 4]."""
     grad_alphas: Tensor
-    """dL/dalphas [H, W]; not 0 where the depth term is."""
+    """dL/dalphas [H, W]; non-zero only through the depth term."""
 
 
 def frame_loss(

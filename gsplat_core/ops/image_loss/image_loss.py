@@ -1,4 +1,7 @@
-"""The training loss of one frame and its gradients in one fused op: masked L1 or squared error, SSIM and inverse-depth L1 over tissue."""
+"""Training loss of one frame and its gradients as a fused op.
+
+Terms are masked L1 or squared error, SSIM (Wang et al. 2004) and inverse-depth L1 over tissue.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from gsplat_core.ops.image_loss.result import ImageLoss
 from gsplat_core.ops.ssim.ssim import MAX_CHANNELS
 
 STEEP_AS_L1 = 0.01
-"""kSteepAsL1 of `image_loss.h`: the difference at which the squared error is as steep as L1."""
+"""Difference at which the squared error has the slope of L1; `kSteepAsL1` of `image_loss.h`."""
 
 
 def image_loss(

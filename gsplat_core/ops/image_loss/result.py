@@ -8,12 +8,16 @@ from torch import Tensor
 
 
 class ImageLoss(NamedTuple):
-    """A loss with its gradients, ready to be fed to the renderer's backward op."""
+    """Image loss with its gradients, the input of the renderer's backward op."""
 
     loss: Tensor
     """Scalar; differentiable in image and depth."""
     terms: Tensor
-    """[3]: L1 or squared error, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight. Not differentiable."""
+    """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth
+    L1.
+
+    Not differentiable.
+    """
     grad_image: Tensor
     """dL/dimage [H, W, C]. Not differentiable."""
     grad_depth: Tensor | None

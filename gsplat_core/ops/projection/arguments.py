@@ -64,7 +64,11 @@ def check_projection_tensors(
     viewmats: Tensor,
     Ks: Tensor,
 ) -> tuple[int, ...]:
-    """Raise InvalidInput on shapes, dtypes or devices that do not go together; returns the batch dimensions."""
+    """Check shapes, dtypes and devices of a projection's tensors; return the batch dimensions.
+
+    Raises:
+        InvalidInput: if they do not match.
+    """
     *batch, n = require_trailing("means", means, (3,), "[..., N, 3]") or (None,)
     if n is None:
         raise InvalidInput(f"means must be [..., N, 3], got {list(means.shape)}")

@@ -1,4 +1,4 @@
-"""Numbers that change from frame to frame, from the host to device memory that captured launches read."""
+"""Transfer of per-frame scalars from the host to device memory read by captured launches."""
 
 from __future__ import annotations
 

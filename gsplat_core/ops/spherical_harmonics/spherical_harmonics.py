@@ -1,4 +1,4 @@
-"""Sums of real spherical harmonics, compiled (Sloan 2013, "Efficient Spherical Harmonic Evaluation")."""
+"""Evaluation of real spherical harmonics, compiled (Sloan 2013, "Efficient SH Evaluation")."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
-    """Colours [..., 3] of directions, as gsplat 1.5.3 does: the plain sum, without the 0.5 that makes it a colour.
+    """Evaluate spherical harmonics in given directions, as gsplat 1.5.3.
+
+    Returns the plain sum, without the offset of 0.5 that makes it a colour. Differentiable in dirs
+    and coeffs.
 
     Args:
-        degrees_to_use: 0 to 4.
-        dirs: [..., 3], of any length but zero.
-        coeffs: [..., K, 3] with K >= (degrees_to_use + 1)²; the leading dimensions may also broadcast to those of dirs,
-            which saves copying them for every camera.
-        masks: bool [...]; where false the result and the gradients are 0, and nothing is computed.
+        degrees_to_use: degree, 0 to 4.
+        dirs: float32 [..., 3], of any non-zero length.
+        coeffs: float32 [..., K, 3] with K >= (degrees_to_use + 1)². Leading dimensions may
+            broadcast to those of dirs, which avoids a copy per camera.
+        masks: bool [...]; where false, the result and its gradients are 0 and nothing is computed.
 
-    Differentiable in dirs and coeffs. Raises InvalidInput for wrong shapes, dtypes or devices.
+    Returns:
+        Colours [..., 3].
+
+    Raises:
+        InvalidInput: for wrong shapes, dtypes or devices.
     """
     check_spherical_harmonics_arguments(degrees_to_use, dirs, coeffs, masks)
     require_float32("spherical_harmonics", dirs=dirs, coeffs=coeffs)

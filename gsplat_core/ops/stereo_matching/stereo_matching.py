@@ -14,28 +14,41 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 COUNT_STEP, MOST_DISPARITIES = 16, 256
-"""The number of disparities is a multiple of the first, and at most the second."""
+"""Granularity and maximum of the number of disparities."""
 SIXTEENTHS = 16
 """Disparity units per pixel."""
 UNKNOWN = torch.iinfo(torch.int32).min
-"""The disparity of a pixel that was not matched."""
+"""Value of pixels without a match."""
 
 
 class Matches(NamedTuple):
-    """A disparity for each pixel of the left picture."""
+    """Disparity of each pixel of the left picture."""
 
     sixteenths: Tensor
-    """[H, W] int32: x in the left picture minus x in the right one, in sixteenths of a pixel; `UNKNOWN` where none was found."""
+    """int32 [H, W]: x in the left picture minus x in the right one, in 1/16 px; `UNKNOWN` if
+    unmatched.
+    """
     one_surface: Tensor
-    """[H, W] bool: whether neither a jump of disparity nor a hole is near."""
+    """bool [H, W]: no disparity jump or hole nearby."""
 
 
 def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> Matches:
-    """Match two grey pictures [H, W] uint8 for the disparities `lowest` to `lowest + count - 1`, checked from the right eye, without small patches.
+    """Match two rectified grey pictures by semi-global matching (Hirschmüller 2008).
 
-    On CUDA nothing waits for the device. It needs `5 * H * W * count` bytes there, and less than half of that on the CPU.
+    Results are checked for left-right consistency, and small patches are removed. On CUDA the host
+    does not synchronise. CUDA needs `5 * H * W * count` bytes, the CPU less than half of that.
 
-    Raises InvalidInput for other shapes and types, and for a `count` that is no multiple of 16 or more than 256.
+    Args:
+        left: uint8 [H, W].
+        right: uint8 [H, W].
+        lowest: smallest disparity in pixels.
+        count: number of disparities, a multiple of 16 up to 256.
+
+    Returns:
+        Disparities for the left picture.
+
+    Raises:
+        InvalidInput: for other shapes, dtypes or counts.
     """
     if left.ndim != 2 or left.shape != right.shape or left.dtype != torch.uint8 or right.dtype != torch.uint8:
         raise InvalidInput(

@@ -1,6 +1,7 @@
-"""Motion of surface points in the world, from the flow between two pictures: compiled, for the CPU.
+"""3D motion of surface points from optical flow, compiled, for the CPU.
 
-`gsplat_core.training.surface_motion` has the same in plain torch, for any floating dtype and device.
+`gsplat_core.training.surface_motion` implements it in plain torch for any floating dtype and
+device.
 """
 
 from __future__ import annotations

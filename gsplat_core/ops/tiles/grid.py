@@ -6,11 +6,13 @@ from typing import NamedTuple
 
 
 class TileGrid(NamedTuple):
-    """Square tiles that cover an image, in the order in which `isect_tiles` takes them."""
+    """Grid of square tiles covering an image; the fields are in the argument order of
+    `isect_tiles`.
+    """
 
     tile_size: int
     """Side of a tile in pixels."""
     tile_width: int
-    """Tiles across."""
+    """Number of tiles per row."""
     tile_height: int
-    """Tiles down."""
+    """Number of tiles per column."""

@@ -30,24 +30,34 @@ def isect_tiles(
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of a splat and a tile that it touches, by image, tile and depth. Names and results of gsplat 1.5.3.
+    """List the tiles that each splat touches, sorted by image, tile and depth (Kerbl et al. 2023).
+
+    Names and results are those of gsplat 1.5.3.
 
     Args:
-        means2d: [..., N, 2] pixels, float32; `...` are the images. Packed: [nnz, 2].
-        radii: [..., N, 2] pixels, int32; a splat with a radius of 0 is invisible. Packed: [nnz, 2].
-        depths: [..., N], float32. Packed: [nnz].
-        tile_size: pixels on a side; tile_width, tile_height: tiles across and down.
-        sort: by image, tile and depth (ties by index); otherwise by splat.
-        segmented: accepted for gsplat's sake; the result is the same.
-        packed: with n_images, image_ids [nnz] and gaussian_ids [nnz] (the latter is not needed here).
-        conics, opacities: [..., N, 3] and [..., N]. With both, only tiles in which alpha reaches 1/255 (over the rectangle of
-            the tile's pixel centres) are listed, else all tiles of the box mean +- radius, as gsplat does.
+        means2d: float32 [..., N, 2] pixels, `...` being the images. Packed: [nnz, 2].
+        radii: int32 [..., N, 2] pixels; a splat with a zero radius is culled. Packed: [nnz, 2].
+        depths: float32 [..., N]. Packed: [nnz].
+        tile_size: side of a tile in pixels.
+        tile_width: tiles per row.
+        tile_height: tiles per column.
+        sort: sort by image, tile and depth (ties by index); otherwise the order is by splat.
+        segmented: accepted for compatibility with gsplat; the result is the same.
+        packed: splats are packed rows; requires n_images and image_ids.
+        n_images: number of images of packed splats.
+        image_ids: image [nnz] of each packed splat.
+        gaussian_ids: accepted for compatibility with gsplat; not used.
+        conics: [..., N, 3]. With opacities, only tiles in which alpha reaches 1/255 within the
+            rectangle of pixel centres are listed. Otherwise all tiles of the box mean ± radius are
+            listed, as in gsplat.
+        opacities: [..., N].
 
     Returns:
-        tiles_per_gauss int32 [..., N], isect_ids int64 [M] (image | tile | 32 bits of depth), flatten_ids int32 [M] (index into
-        the flattened [..., N], or into nnz).
+        tiles_per_gauss int32 [..., N], isect_ids int64 [M] (image | tile | 32 bits of depth), and
+            flatten_ids int32 [M] (index into the flattened [..., N], or into nnz).
 
-    Raises InvalidInput for wrong shapes or types.
+    Raises:
+        InvalidInput: for wrong shapes or dtypes.
     """
     images, chosen = _check(means2d, radii, depths, packed, n_images, image_ids, conics, opacities)
     tiles_per_gauss, isect_ids, flatten_ids = torch.ops.gsplat_core.isect_tiles(
@@ -150,7 +160,7 @@ def _check(
     conics: Tensor | None,
     opacities: Tensor | None,
 ) -> tuple[int, Tensor | None]:
-    """The number of images, and the image of every packed splat."""
+    """Check the arguments; return the number of images and the image of every packed splat."""
     shape = tuple(depths.shape)
     expected = {"means2d": (means2d, 2), "radii": (radii, 2)} | ({} if conics is None else {"conics": (conics, 3)})
     for name, (tensor, last) in expected.items():
