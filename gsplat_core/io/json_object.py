@@ -35,34 +35,34 @@ class JsonObject:
         return JsonObject(values, name)
 
     def nested(self, key: str) -> JsonObject:
-        """The object of that name."""
+        """Return a nested object."""
         return JsonObject(self.values.get(key), f"{self.name}: {key}")
 
     def integer(self, key: str, wanted: IntegerIn) -> int:
-        """The integer of that name."""
+        """Return an integer in the range `wanted`."""
         return int(self._checked(key, wanted))
 
     def number(self, key: str, wanted: NumberIn) -> float:
-        """The number of that name."""
+        """Return a number in the range `wanted`."""
         return float(self._checked(key, wanted))
 
     def matrix(self, key: str, size: int, wanted: NumberIn) -> list[list[float]]:
-        """`size` rows of as many numbers."""
+        """Return a square matrix: `size` rows of `size` numbers."""
         return self._matrix(key, self.values.get(key), size, wanted)
 
     def matrices(self, key: str, size: int, wanted: NumberIn, most: int) -> list[list[list[float]]]:
-        """1 to `most` matrices, each of `size` rows of as many numbers."""
+        """Return a list of 1 to `most` square matrices."""
         listed = self.values.get(key)
         if not isinstance(listed, list) or not 1 <= len(listed) <= most:
             raise BundleCorrupt(f"{self.name}: {key} must be a list of 1 to {most} matrices, got {shortened(listed)}")
         return [self._matrix(f"{key}[{index}]", rows, size, wanted) for index, rows in enumerate(listed)]
 
     def numbers(self, key: str, wanted: NumberIn, most: int) -> list[float]:
-        """1 to `most` numbers."""
+        """Return a list of 1 to `most` numbers."""
         return [float(value) for value in self._checked(key, ListOf(wanted, 1, most))]
 
     def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
-        """Two numbers in order, at most `longest` apart."""
+        """Return two ordered numbers at most `longest` apart."""
         start, end = self._checked(key, ListOf(wanted, 2, 2))
         if not start <= end <= start + longest:
             raise BundleCorrupt(
@@ -78,14 +78,14 @@ class JsonObject:
         return value
 
     def boolean(self, key: str) -> bool:
-        """True or false."""
+        """Return a boolean."""
         value = self.values.get(key)
         if not isinstance(value, bool):
             raise BundleCorrupt(f"{self.name}: {key} must be true or false, got {shortened(value)}")
         return value
 
     def digest(self, key: str) -> str:
-        """A SHA-256."""
+        """Return a SHA-256 digest in hexadecimal."""
         value = self.values.get(key)
         if not isinstance(value, str) or len(value) != 64 or set(value) - set("0123456789abcdef"):
             raise BundleCorrupt(

@@ -1,4 +1,4 @@
-"""Opening a file of a model that may come from anyone: plain files only, without waiting, and none outside its folder."""
+"""Safe opening of untrusted model files: regular files only, non-blocking, inside their folder."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "
 
 
 class TriangleMesh(NamedTuple):
-    """Positions and triangles."""
+    """Vertex positions and triangles of a mesh."""
 
     vertices: NDArray[np.float64]
     """[V, 3]."""
@@ -34,7 +34,11 @@ class TriangleMesh(NamedTuple):
 
 
 def read_surface(path: Path) -> TriangleMesh:
-    """The mesh of a file. Raises InvalidSetting, which names the file and the fault."""
+    """Read a mesh.
+
+    Raises:
+        InvalidSetting: if the file cannot be used; the message names the file and the defect.
+    """
     readers = {".ply": _read_ply, ".stl": _read_stl, ".obj": _read_obj}
     reader = readers.get(path.suffix.lower())
     if reader is None:

@@ -1,4 +1,6 @@
-"""Reading ahead: the next items of an iterator are made in a thread of their own while the present one is used."""
+"""Read-ahead: a thread produces the next items of an iterator while the current one is
+processed.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ def read_ahead(items: Generator[T, None, None], name: str, ahead: int = ITEMS_AH
 
 
 class _Made(Generic[T]):
-    """Items that one thread makes and another one takes."""
+    """Bounded queue between the producing thread and the consumer."""
 
     def __init__(self, ahead: int) -> None:
         self._ahead = ahead
@@ -45,7 +47,7 @@ class _Made(Generic[T]):
         self._error: BaseException | None = None
 
     def fill(self, items: Generator[T, None, None]) -> None:
-        """The life of the thread that makes them."""
+        """Run the producing thread."""
         error: BaseException | None = None
         try:
             try:
@@ -62,7 +64,7 @@ class _Made(Generic[T]):
             self._changed.notify_all()
 
     def taken(self) -> Generator[T, None, None]:
-        """The items, in the thread that takes them."""
+        """Yield the items in the consumer's thread."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._items or self._done)
@@ -76,7 +78,7 @@ class _Made(Generic[T]):
             raise error
 
     def stop(self) -> None:
-        """Let the thread end after the item that it is making."""
+        """Stop the producing thread after its current item."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

@@ -1,7 +1,8 @@
-"""Cameras of recordings: intrinsics, poses and stereo calibrations, in the files of data sets and calibration programs.
+"""Cameras of recordings: intrinsics, poses and stereo calibrations from data-set files.
 
-`cameras.json` gives a pinhole K and for each frame its file and its camera-to-world pose. `poses.npy` gives the poses apart from the intrinsics. Stereo
-calibrations are read from the text, JSON, YAML, INI and MATLAB layouts that docs/recordings.md lists.
+`cameras.json` contains a pinhole K, and file and camera-to-world pose of each frame. `poses.npy`
+contains poses without intrinsics. Stereo calibrations are read from the text, JSON, YAML, INI and
+MATLAB layouts listed in docs/recordings.md.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ from gsplat_core.io.recordings.plain_files import (
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
 
 DEFAULT_FOCAL_FACTOR = 0.9
-"""Focal length in units of the longer image side where nothing is known: 58° across, as common endoscopes have."""
+"""Default focal length in units of the longer image side: 58° field of view, usual in
+endoscopes.
+"""
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_LENGTH = 1e9
 """Largest camera coordinate in the recording's unit, and largest focal length in pixels.
@@ -46,7 +49,7 @@ _ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Calibration:
-    """The camera of frame 0, and the pose of every frame where it is known."""
+    """Camera of frame 0, and the pose of every frame if known."""
 
     camera: Camera
     poses: NDArray[np.float64] | None
@@ -59,7 +62,11 @@ class Calibration:
 def default_calibration(
     root: Path, width_px: int, height_px: int, findings: Findings, *, poses_known: bool = False
 ) -> Calibration:
-    """A stated guess: pinhole, f = 0.9 of the longer side, principal point in the middle. poses_known: from elsewhere; nothing is assumed of them."""
+    """Return a default calibration with a warning: pinhole, f = 0.9 of the longer side, centred.
+
+    Args:
+        poses_known: poses come from elsewhere, so nothing is assumed about them.
+    """
     camera = default_camera(width_px, height_px)
     still = "" if poses_known else " and no camera motion"
     findings.warn(
@@ -71,17 +78,18 @@ def default_calibration(
 
 
 def default_camera(width_px: int, height_px: int) -> Camera:
-    """The camera that is assumed where none is known: a pinhole, f = 0.9 of the longer side, principal point in the middle."""
+    """Return the default camera: pinhole, f = 0.9 of the longer side, centred principal point."""
     return Camera.from_focal(DEFAULT_FOCAL_FACTOR * max(width_px, height_px), width_px, height_px)
 
 
 def read_poses_bounds(
     path: Path, frame_count: int, width_px: int, height_px: int, findings: Findings
 ) -> Calibration | None:
-    """LLFF's `poses_bounds.npy`: N x 17 = 3x5 [R | t | (H, W, f)] and near, far.
+    """Read LLFF's `poses_bounds.npy`: N x 17 = 3x5 [R | t | (H, W, f)] and near, far.
 
-    The poses are camera-to-world in OpenCV axes, as the endoscopic data sets store them; LLFF's permutation of axes is
-    not applied (gsplat's and Deform3DGS's loaders apply one to EndoNeRF's identity poses).
+    Poses are camera-to-world in OpenCV axes, as stored by the endoscopic data sets. LLFF's axis
+    permutation is not applied (gsplat's and Deform3DGS's loaders apply one to EndoNeRF's identity
+    poses).
     """
     advice = "Save N x 17 float64 numbers: 3x5 [R | t | (H, W, f)], near, far for each frame, in frame order"
 
@@ -126,7 +134,7 @@ def read_poses_bounds(
 
 
 def read_json(path: Path, findings: Findings) -> dict[str, Any] | None:
-    """A JSON object from a file of bounded size, each key once."""
+    """Read a JSON object from a file of bounded size with unique keys."""
     try:
         with open_plain(path) as stream:
             data = stream.read(MAX_JSON_BYTES + 1)
@@ -161,7 +169,7 @@ def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Camera | None:
-    """width, height, fx, fy, cx, cy and an optional model ("pinhole") from a JSON object."""
+    """Read width, height, fx, fy, cx, cy and an optional model ("pinhole") from a JSON object."""
     values = {key: number(content.get(key)) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     wrong = [key for key, value in values.items() if value is None]
     if wrong:
@@ -184,7 +192,7 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
 
 
 def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Findings) -> NDArray[np.float64] | None:
-    """World-to-camera [N, 4, 4] from camera-to-world [N, 3, 4]; each must be a rotation and a translation."""
+    """Convert camera-to-world [N, 3, 4] to world-to-camera [N, 4, 4]; each must be rigid."""
     rotation, translation = camera_to_world[:, :, :3], camera_to_world[:, :, 3]
     if np.abs(translation).max() > MAX_LENGTH:
         index = int(np.argmax((np.abs(translation) > MAX_LENGTH).any(axis=1)))
@@ -214,7 +222,7 @@ def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Fin
 
 
 def number(value: object) -> float | None:
-    """A finite number from JSON, or None."""
+    """Return a finite number from JSON, or None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -225,7 +233,7 @@ def number(value: object) -> float | None:
 
 POSES_FILE = "poses.npy"
 TRAILER = b"\nposes estimated by IntraSplat\n"
-"""Bytes behind the array, by which a file of this program is recognised. NumPy ignores them."""
+"""Bytes after the array that identify a file written by this program. NumPy ignores them."""
 _POSES_ADVICE = "Save [N, 4, 4] numbers: for each frame the pose from camera to world, OpenCV axes"
 
 
@@ -252,7 +260,11 @@ def read_poses(path: Path, frame_count: int, findings: Findings) -> NDArray[np.f
 
 
 def write_poses(path: Path, world_to_camera: NDArray[np.float64], *, overwrite: bool = True) -> None:
-    """The file for poses [N, 4, 4]. Raises OSError where it cannot be written."""
+    """Write poses [N, 4, 4] to a file.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     camera_to_world = np.linalg.inv(world_to_camera)
     camera_to_world[:, 3] = [0, 0, 0, 1]
     with PartialFile(path, overwrite=overwrite) as partial:
@@ -267,7 +279,7 @@ _STEREO_ADVICE = "docs/recordings.md has the layouts; correct the file, or remov
 
 
 class _Unusable(Exception):
-    """Why the numbers cannot be found."""
+    """Reason why calibration values cannot be determined."""
 
 
 def read_stereo_calibration(folder: Path, findings: Findings) -> tuple[StereoCalibration, tuple[Path, ...]] | None:

@@ -27,7 +27,7 @@ from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 
 class FrameImages(Protocol):
-    """Images of one size in frame order: a video or a list of files."""
+    """Interface of images of one size in frame order, from a video or a list of files."""
 
     files: tuple[Path, ...]
     numbers: list[int | None]
@@ -40,7 +40,7 @@ class FrameImages(Protocol):
     """Frame rate in Hz; None if the files do not state it."""
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
-        """Frame after frame; None where one cannot be read at all."""
+        """Yield the pictures in order; None for one that cannot be read at all."""
         ...
 
 
@@ -55,7 +55,7 @@ class _Beside(NamedTuple):
 
 @dataclass(frozen=True)
 class Contents:
-    """A recording that has passed the checks that need no decoding."""
+    """Recording that passed all checks except decoding."""
 
     root: Path
     layout: str
@@ -70,13 +70,13 @@ class Contents:
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
     rectification: Rectification | None = None
-    """Makes both eyes' pictures a rectified pair; `calibration` is that of the left one then."""
+    """Rectification of both eyes; `calibration` is then that of the rectified left camera."""
     other_files: tuple[Path, ...] = ()
     """Calibration and description files."""
 
     @property
     def fields(self) -> frozenset[str]:
-        """The optional fields that every frame has."""
+        """Optional fields that every frame has."""
         has = {
             "right_image": self.right is not None,
             "depth": self.depth is not None,
@@ -165,7 +165,7 @@ class Contents:
         )
 
     def files(self) -> list[Path]:
-        """Every file that is read, sorted."""
+        """Return every file that is read, sorted."""
         parts = (self.images, self.right, self.masks, self.depth)
         return sorted({*self.other_files, *(path for part in parts if part for path in part.files)})
 
@@ -175,7 +175,13 @@ class Contents:
 
 
 def digest_of(root: Path, files: Sequence[Path]) -> str:
-    """sha256 over files: for each in order, its name inside `root`, its length and its bytes. Raises RecordingInvalid."""
+    """Return the sha256 over name, length and bytes of each file, in order.
+
+    Names are relative to `root`.
+
+    Raises:
+        RecordingInvalid: if a file cannot be read.
+    """
     digest = hashlib.sha256()
     for path in files:
         name = path.relative_to(root).as_posix() if path != root else path.name

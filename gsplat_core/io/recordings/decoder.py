@@ -1,8 +1,9 @@
-"""Decoding packet by packet, with every sign of damage that the decoder gives.
+"""Packet-wise video decoding that collects every sign of damage from the decoder.
 
-After damage, arithmetic decoding often reads past the end of a picture. FFmpeg's H.265 and VP8 decoders do so without a report. `OverrunProbe` gives a
-second decoder the same packets with other bytes behind each. Complete pictures decode the same; a difference proves that the first decoder read bytes that
-were never recorded. The probe costs a second decoding.
+After damage, arithmetic decoding often reads past the end of a picture. FFmpeg's H.265 and VP8
+decoders do so silently. `OverrunProbe` therefore decodes the same packets a second time with
+different padding. Complete pictures are identical. A difference proves that the first decoder read
+bytes that were never recorded. The probe doubles the decoding cost.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Ticket:
 
 
 class OverrunProbe:
-    """The second decoder."""
+    """Second decoder, fed with differently padded packets."""
 
     def __init__(self, context: av.VideoCodecContext, length_bytes: int) -> None:
         self._context = context
@@ -49,7 +50,7 @@ class OverrunProbe:
         self._pictures: dict[int, int] = {}
 
     def decode(self, packet: av.Packet | None, number: int) -> None:
-        """The packet that the first decoder was given; complaints do not count, as those of the first one do."""
+        """Decode the packet that the first decoder received; errors are ignored."""
         padded = None
         if packet is not None:
             padded = av.Packet(padded_packet(bytes(packet), self._length_bytes))
@@ -112,7 +113,7 @@ _OPTIONS = {
 }
 _STRICT = {"libdav1d": {"strict": "1"}}
 _WITHOUT_DELAY = frozenset({"vp8", "vp9", "av1", "mjpeg", "ffv1", "png", "huffyuv", "prores", "dnxhd"})
-"""A packet's picture comes out as the packet goes in."""
+"""Codecs whose decoders return a packet's picture immediately."""
 NO_PICTURE = "the decoder gave no picture for it"
 _QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
 
@@ -137,7 +138,12 @@ class PictureDecoder:
     """Decoder of one video stream that identifies damaged packets."""
 
     def __init__(self, stream: av.VideoStream, *, probe: bool = True) -> None:
-        """probe: decode twice where only that shows some kinds of damage (H.265, VP8), which takes twice as long."""
+        """Create a decoder for a stream.
+
+        Args:
+            stream: video stream.
+            probe: decode twice for codecs whose damage is otherwise undetectable (H.265, VP8).
+        """
         known = stream.codec_context
         name = known.codec.canonical_name
         self.doubts: dict[int, str] = {}
@@ -150,8 +156,13 @@ class PictureDecoder:
             self._probe = OverrunProbe(_context(known, _DECODERS.get(name, name)), length_bytes(name, known.extradata))
 
     def decode(self, packet: av.Packet | None, number: int, shown: bool) -> list[tuple[int, av.VideoFrame]]:
-        """The frames that come out when a packet goes in, each with the number of its own packet; None at the end, for those that
-        are still inside. `shown`: the packet has a picture to show."""
+        """Decode a packet and yield the finished frames, each with the number of its own packet.
+
+        Args:
+            packet: next packet; None at the end flushes the decoder.
+            number: packet number.
+            shown: the packet has a displayed picture.
+        """
         if packet is not None:
             packet.opaque = Ticket(number)
             if packet.is_corrupt:
@@ -185,7 +196,7 @@ class PictureDecoder:
 
 
 def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecContext:
-    """A decoder for a stream: the stream's own, or one of another name."""
+    """Create a decoder context for a stream, with the stream's own decoder or a named one."""
     context = known
     if decoder is not None:
         context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
@@ -203,19 +214,21 @@ def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecC
 
 
 class PictureConverter:
-    """Makes RGB pictures of a stream's frames.
+    """Converter of a stream's frames to RGB; one instance per stream.
 
-    One for each stream: FFmpeg sets up a conversion once for all frames of one size and format. Setting it up for every frame takes longer
-    than decoding, and starts a thread for every core of the machine.
+    FFmpeg prepares a conversion once per size and format. Preparing it for every frame takes longer
+    than decoding and starts a thread for every core.
     """
 
     def __init__(self, rotation: int) -> None:
-        """rotation: degrees counter-clockwise by which pictures are turned; a multiple of 90 or ignored."""
+        """Create a converter; `rotation` is counter-clockwise in degrees, ignored unless a multiple
+        of 90.
+        """
         self._reformatter = VideoReformatter()
         self._turns = _QUARTER_TURNS.get(rotation, 0)
 
     def picture(self, frame: av.VideoFrame) -> NDArray[np.uint8]:
-        """RGB uint8 [H, W, 3]: the bytes that OpenCV gives for the same frame, turned upright."""
+        """Return an upright RGB uint8 picture [H, W, 3], with the same bytes as OpenCV."""
         # By way of BGR: FFmpeg's conversions to RGB round otherwise for some formats. One thread: more take longer to wake than to convert.
         bgr = self._reformatter.reformat(frame, format="bgr24", interpolation=Interpolation.BICUBIC, threads=1)
         image = np.asarray(cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2RGB), dtype=np.uint8)

@@ -43,11 +43,11 @@ class Findings:
     warnings: list[Finding] = field(default_factory=list)
 
     def problem(self, file: Path | str, message: str, advice: str, *, missing: bool = False) -> None:
-        """Note a fault that makes the recording unusable."""
+        """Record a defect that makes the recording unusable."""
         self._add_problem(Finding(printable(file), printable(message), advice, missing))
 
     def warn(self, file: Path | str, message: str, advice: str) -> None:
-        """Note a stated fallback, or something odd that does not stop the recording from being read."""
+        """Record a fallback or an oddity that does not prevent reading."""
         self.warnings.append(Finding(printable(file), printable(message), advice))
 
     def add(self, others: Findings) -> None:
@@ -83,5 +83,5 @@ class ValidationReport:
 
     @property
     def ok(self) -> bool:
-        """The recording can be read from the first frame to the last."""
+        """True if the recording can be read from the first frame to the last."""
         return not self.problems

@@ -1,4 +1,4 @@
-"""The parts of a recording: images, masks and depth, one file for each frame, checked as they are read."""
+"""Readers of recordings with one image, mask or depth file per frame, checked on reading."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from gsplat_core.scene.frames import Frame
 
 POLARITY_SAMPLES = 16
 MAX_TOOL_SHARE = 0.5
-"""Tools cover 5-35 % of surgical frames; a class that covers more than half of the pixels is the tissue."""
+"""Largest plausible share of tool pixels. Tools cover 5-35 %; a larger class is the tissue."""
 
 
 class ImageFiles:
@@ -51,7 +51,7 @@ class ImageFiles:
         self.fps = fps
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
-        """Frame after frame; None where one cannot be decoded."""
+        """Yield the pictures in order; None for one that cannot be decoded."""
         for path in self.files:
             try:
                 yield decode_picture(path)
@@ -67,7 +67,7 @@ class MaskFiles:
         self.files = tuple(files)
 
     def read(self, index: int, findings: Findings) -> NDArray[np.uint8] | None:
-        """[H, W]; 1 = tissue, 0 = tool."""
+        """Read a mask [H, W]; 1 = tissue, 0 = tool."""
         path = self.files[index]
         try:
             mask = decode_plane(path)
@@ -91,7 +91,9 @@ class MaskFiles:
         return (~tool).astype(np.uint8)
 
     def check_polarity(self, findings: Findings) -> float | None:
-        """The share of tool pixels over frames spread evenly; a problem where it cannot be that of tools."""
+        """Return the share of tool pixels over evenly spaced frames; an implausible share is a
+        problem.
+        """
         indices = np.unique(np.linspace(0, len(self.files) - 1, POLARITY_SAMPLES).round().astype(int))
         shares = []
         for index in indices:
@@ -111,7 +113,9 @@ class MaskFiles:
 
 
 class DepthFiles:
-    """Depth maps: 8- or 16-bit PNG in units of `unit_mm`, or float .npy in millimetres; 0 = unknown."""
+    """Reader of depth maps: 8- or 16-bit PNG in units of `unit_mm`, or float .npy in mm; 0 =
+    unknown.
+    """
 
     def __init__(self, files: Sequence[Path], width_px: int, height_px: int, unit_mm: float) -> None:
         self.files = tuple(files)
@@ -119,7 +123,7 @@ class DepthFiles:
         self._shape = (height_px, width_px)
 
     def read(self, index: int, findings: Findings) -> NDArray[np.float32] | None:
-        """z in millimetres, float32 [H, W]."""
+        """Read depth z in mm, float32 [H, W]."""
         path = self.files[index]
         depth = self._array(path, findings) if path.suffix.lower() == ".npy" else self._image(path, findings)
         if depth is None:
@@ -247,7 +251,7 @@ def check_pairing(
 
 
 def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """An image at another size: mean over each pixel's area when smaller."""
+    """Resize an image; area-averaged when reduced."""
     shrinks = width_px <= image.shape[1] and height_px <= image.shape[0]
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=interpolation), dtype=np.uint8)
@@ -259,7 +263,7 @@ def resize_nearest(plane: NDArray, width_px: int, height_px: int) -> NDArray:
 
 
 def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
-    """A frame at another size: images by the mean over areas, masks and depth by the nearest pixel."""
+    """Resize a frame: images by area averaging, masks and depth by nearest-neighbour sampling."""
     if (width_px, height_px) == (frame.width_px, frame.height_px):
         return frame
     planes = {

@@ -128,11 +128,11 @@ def frame_times(files: Sequence[Path], findings: Findings) -> tuple[float, ...] 
 
 
 MAX_NAME = 512
-"""Longest file name, folders included."""
+"""Maximum length of a file name including folders."""
 
 
 def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calibration] | None:
-    """The images that `cameras.json` names, in its order, and their cameras."""
+    """Read the images named by `cameras.json`, in its order, and their cameras."""
     path = root / "cameras.json"
     content = read_json(path, findings)
     if content is None:
@@ -184,7 +184,10 @@ def _pose(value: object, path: Path, index: int, findings: Findings) -> np.ndarr
 
 
 def _inside(root: Path, name: object, path: Path, index: int, findings: Findings) -> Path | None:
-    """The file that a document names, held inside the folder: no absolute path, no `..`, no link that leads out."""
+    """Resolve a file named by a document, inside the folder.
+
+    Absolute paths, `..` and links out of the folder are problems.
+    """
     relative = isinstance(name, str) and 0 < len(name) <= MAX_NAME and "\0" not in name
     if relative:
         posix, windows = PurePosixPath(str(name)), PureWindowsPath(str(name))
@@ -300,7 +303,7 @@ def _video_folder(path: Path, videos: Sequence[Path], findings: Findings) -> Con
 
 
 def _video_pair(path: Path, left: Path, right: Path, findings: Findings) -> Contents | None:
-    """A video for each eye."""
+    """Open a pair of videos, one per eye."""
     if not (stays_inside(path, left, findings) and stays_inside(path, right, findings)):
         return None
     images = open_video(left, findings)

@@ -57,16 +57,18 @@ class Cluster(NamedTuple):
     """Cluster that is complete in the file."""
 
     end: int
-    """The byte behind it."""
+    """Byte position after the cluster."""
     time: int
     """Cluster timestamp in the file's unit; FFmpeg writes milliseconds."""
     intact: bool
-    """False: its CRC-32 is wrong."""
+    """False if the CRC-32 is wrong."""
 
 
 def whole_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterator[Cluster]:
-    """The clusters of a file's first `size` bytes, up to the first one that is cut off or has no timestamp. Without `check_sums` only a few
-    bytes of each are read, and all of them count as intact."""
+    """Yield the clusters in the first `size` bytes, up to the first truncated or untimed one.
+
+    Without `check_sums` only a few bytes of each cluster are read, and all count as intact.
+    """
     at = others = 0
     while at < size and others < _MOST_OTHERS:
         element = _element(stream, at)
@@ -129,7 +131,9 @@ def _element(stream: BinaryIO, at: int) -> tuple[int, int, int | None] | None:
 
 
 def _number(data: bytes, most_bytes: int) -> tuple[int, int] | None:
-    """A number of variable width, its marker bit included, and its width in bytes."""
+    """Parse a variable-width EBML number; return its value with the marker bit, and its width in
+    bytes.
+    """
     if not data or not data[0]:
         return None
     width = 9 - data[0].bit_length()
@@ -157,21 +161,25 @@ _ISO_FIRST_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wid
 
 
 class UnusableContainer(Exception):
-    """Why a container cannot be used; the checks turn it into a finding."""
+    """Reason why a container cannot be used; callers convert it to a finding."""
 
 
 @dataclass(frozen=True)
 class Container:
-    """A container that is complete."""
+    """Complete container."""
 
     demuxer: str
-    """FFmpeg's name of the one demuxer that may read it."""
+    """Name of the only FFmpeg demuxer permitted to read the file."""
     damaged_bytes: tuple[tuple[int, int], ...] = ()
     """Byte ranges [begin, end) of the file whose checksum is wrong."""
 
 
 def recognise(stream: BinaryIO) -> Container:
-    """The container of a video file. Raises UnusableContainer for an unknown one and for one that is cut off."""
+    """Recognise the container of a video file.
+
+    Raises:
+        UnusableContainer: if it is unknown or truncated.
+    """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     head = stream.read(16)
@@ -191,7 +199,10 @@ def recognise(stream: BinaryIO) -> Container:
 
 
 def _check_iso(stream: BinaryIO, size: int) -> None:
-    """Walk the top-level boxes of an MP4 (ISO/IEC 14496-12, 4.2): all of them complete, and the index among them."""
+    """Check that all top-level boxes of an MP4 are complete and include the index.
+
+    Format: ISO/IEC 14496-12, section 4.2.
+    """
     seen: set[bytes] = set()
     at = 0
     while at + 8 <= size:
@@ -216,7 +227,9 @@ def _check_iso(stream: BinaryIO, size: int) -> None:
 
 
 def _check_riff(stream: BinaryIO, size: int) -> None:
-    """Walk the top-level RIFF chunks of an AVI: long files have several of them (OpenDML), each of them complete."""
+    """Check that all top-level RIFF chunks of an AVI are complete; long files have several
+    (OpenDML).
+    """
     for kind, end in _riff_chunks(stream, size):
         if end > size:
             raise UnusableContainer(
@@ -291,7 +304,10 @@ def is_shown(codec: str, data: bytes) -> bool:
 
 
 def length_bytes(codec: str, extradata: bytes | None) -> int:
-    """Bytes of the length before each unit of H.264 and H.265 in MP4 and Matroska; 0 for start codes, as in AVI, and other codecs."""
+    """Return the size of the length prefix of H.264 and H.265 units in MP4 and Matroska.
+
+    0 for start codes, as in AVI, and for other codecs.
+    """
     if codec not in ("h264", "hevc") or not extradata:
         return 0
     at = 4 if codec == "h264" else 21
@@ -309,7 +325,7 @@ def _h265_kind(unit: bytes) -> int | None:
 
 
 def _check_units(data: bytes, width: int, pictures: frozenset[int], kind: Callable[[bytes], int | None]) -> str | None:
-    """Units (NAL units) that fill the packet exactly, each of them well-formed, and one of them part of a picture."""
+    """Check that well-formed NAL units fill the packet exactly and include a part of a picture."""
     found = False
     for unit in _units(data, width):
         if not unit:

@@ -31,11 +31,15 @@ from gsplat_core.io.recordings.findings import Findings
 
 
 class UnreadableFile(Exception):
-    """Why a file cannot be read; the checks turn it into a finding."""
+    """Reason why a file cannot be read; callers convert it to a finding."""
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a plain file for reading. Raises UnreadableFile for a missing file and for everything that is no plain file."""
+    """Open a regular file for reading.
+
+    Raises:
+        UnreadableFile: if the file is missing or not regular.
+    """
     try:
         return open_regular(path)
     except FileNotFoundError as error:
@@ -81,12 +85,12 @@ def stays_inside(root: Path, path: Path, findings: Findings) -> bool:
 
 
 def all_stay_inside(root: Path, files: list[Path], findings: Findings) -> bool:
-    """`stays_inside` for files of one folder that has been checked: only those that are links themselves are looked at."""
+    """Run `stays_inside` for files of one checked folder; only links need to be resolved."""
     return all(stays_inside(root, path, findings) for path in files if path.is_symlink())
 
 
 MAX_HEADER_BYTES = 4096
-"""NumPy writes 128 bytes for a plain array."""
+"""Maximum header size; NumPy writes 128 bytes for a plain array."""
 _NUMBER_KINDS = "fiu"
 _HEADER_READERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}
 
@@ -105,7 +109,7 @@ class ArrayHeader:
 
     @property
     def bytes(self) -> int:
-        """Bytes of the data, in Python's integers: no shape overflows."""
+        """Size of the data in bytes, computed without overflow."""
         count = self.dtype.itemsize
         for length in self.shape:
             count *= length
@@ -123,7 +127,11 @@ def read_header(path: Path) -> ArrayHeader:
 
 
 def read_array(path: Path, wrong: Callable[[ArrayHeader], str | None]) -> NDArray[np.generic]:
-    """The array, once `wrong` has nothing against its header. Raises UnreadableFile; takes no memory before that."""
+    """Read an array after `wrong` has accepted its header; allocates nothing before.
+
+    Raises:
+        UnreadableFile: if the file is invalid or `wrong` returns a reason.
+    """
     with open_plain(path) as stream:
         header = _header(stream)
         if complaint := wrong(header):
@@ -174,7 +182,7 @@ class Picture:
     image: NDArray[np.uint8]
     """RGB uint8 [H, W, 3]."""
     damage: str | None = None
-    """Why some of it may be the decoder's guess; None for a picture that was decoded without any sign of damage."""
+    """Reason why parts may be the decoder's guess; None without any sign of damage."""
 
 
 class DamagedFrames:
@@ -200,7 +208,7 @@ class DamagedFrames:
             self._more = True
 
     def numbers(self) -> str:
-        """The numbers, as in `3, 7-12`."""
+        """Return the frame numbers as text, such as `3, 7-12`."""
         runs = [str(first) if first == last else f"{first}-{last}" for first, last in self._runs]
         return ", ".join(runs + ["…"] * self._more)
 
@@ -251,7 +259,7 @@ def jpeg_damage(data: bytes) -> str | None:
 
 
 MAX_PIXELS = 64 * 1024 * 1024
-"""Largest image that is decoded (8192 x 8192); surgical video is 8 Mpx at most."""
+"""Largest decoded image (8192 x 8192); surgical video has 8 Mpx at most."""
 MAX_FILE_BYTES = 512 * 1024 * 1024
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -260,7 +268,7 @@ _JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 
 class UnreadableImage(UnreadableFile):
-    """Why an image cannot be decoded; the checks turn it into a finding."""
+    """Reason why an image cannot be decoded; callers convert it to a finding."""
 
 
 class _QuietDecoders:
@@ -302,19 +310,23 @@ def quiet_decoder() -> Iterator[None]:
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that puts 2.png before 10.png; for zero-padded names the same as sorting by name."""
+    """Return a sort key that orders 2.png before 10.png."""
     parts = re.split(r"(\d+)", path.name)
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def frame_number(path: Path) -> int | None:
-    """The last number in a file's name: 12 for `frame-000012.color.png`."""
+    """Return the last number in a file's name: 12 for `frame-000012.color.png`."""
     numbers = re.findall(r"\d+", path.stem)
     return int(numbers[-1]) if numbers else None
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels as the PNG or JPEG header announces it. Raises UnreadableImage."""
+    """Read (width, height) in pixels from the PNG or JPEG header.
+
+    Raises:
+        UnreadableImage: if the header is invalid.
+    """
     try:
         with open_plain(path) as stream:
             width, height = _announced_size(stream)
@@ -361,10 +373,13 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def decode_picture(path: Path) -> Picture:
-    """A frame: RGB uint8 [H, W, 3], grey repeated, alpha dropped. Raises UnreadableFile.
+    """Decode a frame to RGB uint8 [H, W, 3]; grey is replicated and alpha dropped.
 
-    A JPEG that libjpeg had to repair is handed out as a damaged picture. EXIF rotation is not applied: the header's size is
-    the image's size.
+    A JPEG repaired by libjpeg is returned as a damaged picture. EXIF rotation is not applied, so
+    the size equals that of the header.
+
+    Raises:
+        UnreadableFile: if the file cannot be decoded.
     """
     data, size = _read(path)
     decoded = None if data.startswith(PNG_SIGNATURE) else decode_jpeg(data)
@@ -377,7 +392,11 @@ def decode_picture(path: Path) -> Picture:
 
 
 def decode_plane(path: Path) -> NDArray[np.generic]:
-    """The pixels of a PNG or JPEG as stored, 8 or 16 bit, [H, W] or [H, W, C]. Raises UnreadableFile for a damaged one too."""
+    """Decode the stored pixels of a PNG or JPEG, 8 or 16 bit, [H, W] or [H, W, C].
+
+    Raises:
+        UnreadableFile: if the file is damaged or cannot be decoded.
+    """
     data, size = _read(path)
     if not data.startswith(PNG_SIGNATURE) and (damage := jpeg_damage(data)):
         raise UnreadableImage(f"the image data is damaged: {damage}")
@@ -387,7 +406,7 @@ def decode_plane(path: Path) -> NDArray[np.generic]:
 
 
 def _read(path: Path) -> tuple[bytes, tuple[int, int]]:
-    """The file's bytes, complete to its end mark, and the (width, height) that its header announces."""
+    """Read a file up to its end mark; return the bytes and the (width, height) of its header."""
     size = image_size(path)
     with open_plain(path) as stream:
         data = stream.read(MAX_FILE_BYTES + 1)
@@ -402,7 +421,7 @@ def _read(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 
 def _check_png(data: bytes) -> None:
-    """Every chunk complete and with a right CRC-32 (PNG 5.3), up to the end mark: all damage to a PNG shows here."""
+    """Check that every chunk of a PNG is complete with a valid CRC-32 (PNG 5.3)."""
     at = len(PNG_SIGNATURE)
     while at + 12 <= len(data):
         length, kind = struct.unpack(">I4s", data[at : at + 8])
@@ -438,7 +457,7 @@ def _check_size(pixels: NDArray[np.generic], size: tuple[int, int]) -> None:
 
 
 def list_images(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
-    """The images of a folder in frame order; hidden files (`._x.png`, `.DS_Store`) are not images."""
+    """List the images of a folder in frame order, without hidden files (`._x.png`, `.DS_Store`)."""
     return sorted(
         (p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")), key=natural_key
     )

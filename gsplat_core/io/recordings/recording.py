@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 MAX_REPORTED_PROBLEMS = 100
 _DAMAGE_ADVICE = "Damaged frames are shown, but neither trained on nor scored; copy the file again from its source"
 MIN_SCALED_SIDE_PX = 8
-"""Shortest side that `scale` may lead to."""
+"""Minimum side in pixels after scaling."""
 
 
 @runtime_checkable
 class Recording(Protocol):
-    """Frames that can be read again and again, one at a time."""
+    """Interface of re-iterable frame sources that read one frame at a time."""
 
     name: str
     frame_count: int
@@ -41,23 +41,23 @@ class Recording(Protocol):
     camera: Camera
     """The camera of frame 0."""
     notes: tuple[str, ...]
-    """Fallbacks that were taken, in sentences."""
+    """Sentences about fallbacks that were applied."""
     fields: frozenset[str]
     """Optional frame fields that are present: any of mask, depth, right_image and pose."""
     stereo_baseline_mm: float | None
-    """Distance of the right eye along the camera's x axis, where it is known."""
+    """Distance of the right eye along the camera's x axis in mm, if known."""
 
     @property
     def digest(self) -> str:
-        """sha256 of the input files."""
+        """Return the sha256 of the input files."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames from the first to the last, decoded as they are asked for."""
+        """Yield all frames in order, decoded on demand."""
         ...
 
     def camera_at(self, index: int) -> Camera:
-        """The camera of one frame."""
+        """Return the camera of one frame."""
         ...
 
 
@@ -86,18 +86,20 @@ class FileRecording:
         return self._contents.digest()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames in order. Raises RecordingInvalid at the first one that cannot be read."""
-        # Python 3.12 closes an inner generator only when the outer one is collected, unless asked to.
-        with closing(self._contents.frames(Findings(strict=True), self.frame_count)) as frames:
-            for frame in frames:
-                assert frame is not None  # a strict collector has raised
-                yield resized_frame(frame, self.width_px, self.height_px)
+        """Yield the frames in order.
+
+        Raises:
+            RecordingInvalid: at the first frame that cannot be read.
+        """
+        for frame in self._contents.frames(Findings(strict=True), self.frame_count):
+            assert frame is not None  # a strict collector has raised
+            yield resized_frame(frame, self.width_px, self.height_px)
 
     def __len__(self) -> int:
         return self.frame_count
 
     def camera_at(self, index: int) -> Camera:
-        """The camera of one frame; where poses are not known, that of frame 0."""
+        """Return the camera of one frame; that of frame 0 if poses are unknown."""
         if not 0 <= index < self.frame_count:
             raise InvalidInput(f"frame {index} is not in the recording {self.name} of {self.frame_count} frames")
         poses = self._contents.calibration.poses

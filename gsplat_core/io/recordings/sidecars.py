@@ -56,12 +56,14 @@ class Beside:
         return tuple(path for path in found if path is not None)
 
     def description(self) -> dict[str, Any]:
-        """fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each optional."""
+        """Read fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each
+        optional.
+        """
         path = self._file(DESCRIPTION_FILE)
         return (_read_description(path, self._size, self._findings) if path else None) or {}
 
     def poses(self) -> Calibration | None:
-        """The cameras of `poses_bounds.npy`."""
+        """Read the cameras of `poses_bounds.npy`."""
         path = self._file("poses_bounds.npy")
         return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
 
@@ -71,17 +73,17 @@ class Beside:
         return read_poses(path, self._images.frame_count, self._findings) if path else None
 
     def right(self) -> ImageFiles | None:
-        """The right eye."""
+        """Return the images of the right eye."""
         files = self._sequence("images_right", "right image")
         return ImageFiles(files, *self._size) if files else None
 
     def masks(self) -> MaskFiles | None:
-        """Tool masks."""
+        """Return the tool masks."""
         files = self._sequence("masks", "mask")
         return MaskFiles(files) if files else None
 
     def depth(self, unit_mm: float | None) -> DepthFiles | None:
-        """Depth maps; `unit_mm` is the length of one grey value, None where it is not stated."""
+        """Return the depth maps; `unit_mm` is the length of one grey value, None if not stated."""
         files = self._sequence("depth", "depth map")
         if not files:
             return None
@@ -94,7 +96,7 @@ class Beside:
         return DepthFiles(files, *self._size, unit_mm)
 
     def valid_mask(self) -> NDArray[np.uint8] | None:
-        """[H, W]; 1 inside the scope's circle."""
+        """Read the mask [H, W] of the scope's circular image; 1 is inside."""
         path = self._file("valid_mask.png")
         return _read_valid_mask(path, self._size, self._findings) if path else None
 
@@ -111,7 +113,7 @@ class Beside:
         return self._folder / name
 
     def _sequence(self, name: str, what: str) -> Sequence[Path] | None:
-        """The files of a folder that has one for each frame."""
+        """Return the files of a folder with one file per frame."""
         folder = self._there(name)
         if folder is None or not stays_inside(folder.parent, folder, self._findings):
             return None
@@ -158,7 +160,7 @@ def _read_valid_mask(path: Path, size: tuple[int, int], findings: Findings) -> n
 
 
 def _read_description(path: Path, size: tuple[int, int], findings: Findings) -> dict[str, Any] | None:
-    """fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each optional."""
+    """Read and check `recording.json`; see `description`."""
     if (content := read_json(path, findings)) is None:
         return None
     if content.get("format") != RECORDING_FORMAT or content.get("version") != RECORDING_VERSION:

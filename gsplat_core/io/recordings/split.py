@@ -1,6 +1,7 @@
-"""The field's held-out protocol: frames with (i - 1) % 8 == 0 (1, 9, 17, …) are for testing, the rest for training.
+"""Held-out split of the field: frames with (i - 1) % 8 == 0 (1, 9, 17, …) for testing.
 
-It is that of EndoGaussian, Deform3DGS and SurgicalGaussian on EndoNeRF's clips, which have no official split.
+EndoGaussian, Deform3DGS and SurgicalGaussian use it on EndoNeRF's clips, which have no official
+split.
 """
 
 from __future__ import annotations

@@ -200,7 +200,11 @@ class MotionFiles:
 
 
 def open_motion(folder: Path, frame_count: int) -> MotionFiles | None:
-    """The motion that the folder of a recording knows; None where it knows none. Raises RecordingInvalid for too few files."""
+    """Open the motion files of a recording; None without any.
+
+    Raises:
+        RecordingInvalid: if there are too few files.
+    """
     flow = _motion_files(folder, "flow", frame_count)
     return None if flow is None else MotionFiles(flow, _motion_files(folder, "scene_flow", frame_count) or ())
 
@@ -231,30 +235,32 @@ def _read_motion(path: Path, channels: int, frame: Frame) -> NDArray[np.float32]
 
 
 MOST_POINTS = 4096
-"""Points that are followed."""
+"""Maximum number of tracked points."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points of the tissue over time."""
+    """Trajectories of tissue points."""
 
     points: NDArray[np.float64]
     """[frames, points, 3], in the recording's world."""
     seen: NDArray[np.bool_]
-    """[frames, points]: whether the left eye sees the point."""
+    """bool [frames, points]: visibility in the left eye."""
 
 
 @dataclass(frozen=True)
 class TissueBehindTools:
-    """Pictures and depth of a recording as they are behind its tools."""
+    """Pictures and depth of a recording with transparent tools."""
 
     images: tuple[Path, ...]
     depth: DepthFiles
 
     def of(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]] | None:
-        """Return picture [H, W, 3] and depth z [H, W] in mm of a frame of the recording, at the frame's size; None after the last one.
+        """Return picture [H, W, 3] and depth z [H, W] in mm at the frame's size; None after the
+        last frame.
 
-        Raises RecordingInvalid for a file that cannot be read.
+        Raises:
+            RecordingInvalid: if a file cannot be read.
         """
         if frame.seq >= len(self.images):
             return None

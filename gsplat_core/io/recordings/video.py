@@ -1,4 +1,4 @@
-"""Video files: the container is indexed first, then its packets are decoded in order, without seeking."""
+"""Video files: the container is indexed first, then decoded in order without seeking."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class VideoIndex:
     damaged: dict[int, str]
     """Damage reported by the container, by packet number."""
     frame_count: int
-    """Pictures that are shown, those included that a damaged container has lost."""
+    """Number of displayed pictures, including those lost to container damage."""
     ordered: bool
     """True if `positions` is reliable.
 
@@ -47,7 +47,11 @@ def is_picture(packet: av.Packet) -> bool:
 
 
 def open_container(file: BinaryIO, container: Container) -> av.container.InputContainer:
-    """Open with the one demuxer that the file's first bytes name. Raises av.FFmpegError."""
+    """Open a file with the demuxer determined from its first bytes.
+
+    Raises:
+        av.FFmpegError: if it cannot be opened.
+    """
     with captured_log():
         return av.open(
             file, mode="r", format=container.demuxer, metadata_errors="replace", options={"max_pixels": "67108864"}
@@ -55,7 +59,7 @@ def open_container(file: BinaryIO, container: Container) -> av.container.InputCo
 
 
 def read_index(opened: av.container.InputContainer, stream: av.VideoStream, container: Container) -> VideoIndex:
-    """Read all packets of a stream once."""
+    """Read all packets of a stream once to build the index."""
     times: list[int | None] = []
     shown = bytearray()
     keys = bytearray()
@@ -90,7 +94,7 @@ def read_index(opened: av.container.InputContainer, stream: av.VideoStream, cont
 
 
 def _frame_duration(stream: av.VideoStream) -> Fraction | None:
-    """Time units from one frame to the next; None where the frame rate is not known."""
+    """Return the frame duration in time units; None if the frame rate is unknown."""
     rate = frame_rate(stream)
     if not rate or not stream.time_base:
         return None
@@ -100,7 +104,7 @@ def _frame_duration(stream: av.VideoStream) -> Fraction | None:
 def _positions(
     times: list[int | None], shown: bytearray, lost: dict[int, str], duration: Fraction | None, reordered: bool
 ) -> tuple[array, int, bool]:
-    """The order of showing; where the container is damaged, a gap in time counts as the frames that are missing in it."""
+    """Return the display order; after container damage, a time gap counts as missing frames."""
     visible = [number for number in range(len(times)) if shown[number]]
     known = [times[number] for number in visible if times[number] is not None]
     timed = len(known) == len(visible) and len(set(known)) == len(known)
@@ -122,11 +126,11 @@ def _positions(
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN -c:v libx264 OUT.mp4)"
 _MOST_LATE = 64
-"""Packets: no decoder holds a frame longer."""
+"""Maximum delay of a decoder in packets."""
 
 
 class VideoFrames:
-    """The frames of a video file, in order, decoded one at a time."""
+    """Frames of a video file, decoded sequentially."""
 
     def __init__(self, path: Path, container: Container, index: VideoIndex, fps: float, rotation: int) -> None:
         self.path = path
@@ -141,7 +145,10 @@ class VideoFrames:
         self._rotation = rotation
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
-        """Frame after frame; a damaged one is marked. A video that ends early is a problem, and so is a change of size."""
+        """Yield the pictures in order, with damaged ones marked.
+
+        A premature end or a change of size is a problem.
+        """
         try:
             yield from self._frames(findings)
         except (UnreadableFile, OSError, av.FFmpegError) as error:  # it was whole when it was opened
@@ -193,7 +200,7 @@ class VideoFrames:
         return first
 
     def _decoded(self, spread: DamageSpread) -> Generator[tuple[int, Picture], None, None]:
-        """The pictures as the decoder gives them, each with its position."""
+        """Yield the decoded pictures with their display positions."""
         with _opened(self.path, self._container) as (container, stream):
             decoder, converter = PictureDecoder(stream), PictureConverter(self._rotation)
             for number, packet in _numbered(container, stream):
@@ -258,7 +265,7 @@ def _opened(path: Path, container: Container) -> Iterator[tuple[av.container.Inp
 
 
 def _numbered(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[int, av.Packet | None]]:
-    """The packets that hold data, numbered as in the index, and None at the end."""
+    """Yield the packets with data, numbered as in the index, then None."""
     number = 0
     packets = iter(container.demux(stream))
     while True:
@@ -349,7 +356,7 @@ def _rotation(path: Path, container: Container) -> int:
 def _with_first_frame(
     path: Path, container: Container, index: VideoIndex, fps: float, findings: Findings
 ) -> VideoFrames | None:
-    """The video, where its first frame is whole: everything begins with it."""
+    """Return the video if its first frame is intact, because it initialises the scene."""
     video = VideoFrames(path, container, index, fps, _rotation(path, container))
     first = video.look_at_first()
     if first is None:

@@ -1,1 +1,1 @@
-"""A deforming surgical scene with exact ground truth, rendered by ray casting."""
+"""Synthetic deforming surgical scene with exact ground truth, rendered by ray casting."""

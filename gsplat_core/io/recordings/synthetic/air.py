@@ -14,13 +14,15 @@ from gsplat_core.scene.cameras import Camera
 Array = NDArray[np.floating]
 
 CLOUD_MM = 9.0
-"""Size of a cell of the noise that the smoke's density is made of."""
+"""Cell size in mm of the noise that forms the smoke density."""
 CELLS = 64
 DRIFT_MM_S = (11.0, -7.0)
 PUFF_PERIOD_S = 2.9
-"""Smoke comes and goes."""
+"""Period in seconds with which the smoke density varies."""
 SMOKE_MM = 74.0
-"""Smoke of strength 1 lets exp(-1) of the light through on a way so long, where and when it is as dense as it is on average."""
+"""Path length in mm over which smoke of strength 1 and mean density transmits exp(-1)
+of the light.
+"""
 SMOKE_COLOUR = (0.42, 0.41, 0.44)
 EXPOSURE_PERIODS_S = (1.9, 3.1)
 EXPOSURE_STOPS = (0.45, 0.25)
@@ -32,14 +34,14 @@ class Air:
     """Smoke and exposure as functions of time."""
 
     smoke: float
-    """Strength; 0: none."""
+    """Strength of the smoke; 0 for none."""
     exposure_changes: bool
     clouds: Array
-    """Noise [CELLS, CELLS] from 0 to about 2, mean 1, that repeats at its edges."""
+    """Periodic noise [CELLS, CELLS] from 0 to about 2, mean 1."""
 
     @classmethod
     def from_seed(cls, seed: np.random.SeedSequence, smoke: float, exposure_changes: bool) -> Air:
-        """The air of a scene."""
+        """Create the smoke and exposure of a scene."""
         noise = np.random.default_rng(seed).standard_normal((CELLS, CELLS)).astype(np.float32)
         wide = np.pad(noise, 4, mode="wrap")
         soft = cv2.GaussianBlur(wide, (0, 0), 1.0)[4:-4, 4:-4]
@@ -80,7 +82,9 @@ class Air:
         return np.asarray(np.float32(self.exposure_at(time_s)) * radiance, np.float32)
 
     def _transmitted(self, camera: Camera, ray_x: Array, ray_y: Array, depth: Array, time_s: float) -> Array:
-        """The share of light [H, W] that gets through: by the density where the ray is half-way."""
+        """Return the transmitted share of light [H, W], from the density at the middle
+        of each ray.
+        """
         half = np.float32(0.5) * depth
         local = np.stack([ray_x * half, ray_y * half, half], axis=-1)
         r, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]

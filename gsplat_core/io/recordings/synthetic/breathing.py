@@ -1,4 +1,4 @@
-"""The breathing of synthetic tissue: a phase over time, of equal or unequal halves, at a steady or a wandering rate."""
+"""Breathing of synthetic tissue: a phase over time with adjustable symmetry and rate."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ import numpy as np
 PERIOD_S = 3.4
 """Mean period of a breath, in seconds."""
 WANDER_PERIODS_S = (6.1, 9.7)
-"""The rate is off by two waves of these periods, of two and of three breaths."""
+"""Periods of the two waves that modulate the rate: about two and three breaths."""
 
 
 @dataclass(frozen=True)
 class Breathing:
-    """The phase of breathing at each time. A sine of it is at its lowest at -pi/2 and at its highest at pi/2."""
+    """Phase of breathing over time. Its sine has the minimum at -pi/2 and the maximum at pi/2."""
 
     start: float
-    """Phase at time 0, before its halves are made unequal."""
+    """Phase at time 0, before the asymmetry is applied."""
     ratio: float = 1.0
-    """Duration of the falling half of a breath over that of the rising one (expiration over inspiration)."""
+    """Expiration to inspiration ratio: duration of the falling half over that of the
+    rising half.
+    """
     wander: float = 0.0
-    """Largest deviation of the rate, as a share of it."""
+    """Largest relative deviation of the rate."""
     wander_phases: tuple[float, float] = (0.0, 0.0)
 
     def phase(self, time_s: float) -> float:
@@ -32,7 +34,9 @@ class Breathing:
         return float(uniform) if self.ratio == 1 else unequal(float(uniform), self.ratio)
 
     def _ahead_s(self, time_s: float) -> float:
-        """Return the time by which breathing is ahead per unit of `wander`: the integral of a deviation between -1 and 1."""
+        """Return the time lead per unit of `wander`: the integral of a deviation
+        between -1 and 1.
+        """
         waves = (
             period / (2 * np.pi) * (np.sin(2 * np.pi * time_s / period + phase) - np.sin(phase))
             for period, phase in zip(WANDER_PERIODS_S, self.wander_phases, strict=True)
@@ -41,9 +45,10 @@ class Breathing:
 
 
 def unequal(phase: float, ratio: float) -> float:
-    """Return a phase whose sine falls `ratio` times as long as it rises, for one that advances uniformly. Smooth, and equal at multiples of pi.
+    """Map a uniform phase to one whose sine falls `ratio` times as long as it rises.
 
-    The map is tan(after / 2) = k tan(before / 2); the rising half then takes 2 atan(1 / k) of a turn of 2 pi.
+    The map is smooth and preserves multiples of pi: tan(after / 2) = k tan(before / 2). The rising
+    half takes 2 atan(1 / k) of a turn of 2 pi.
     """
     k = 1 / np.tan(np.pi / 2 / (1 + ratio))
     turns = round(phase / (2 * np.pi))

@@ -18,17 +18,17 @@ RADIUS_MM = 23.0
 LENGTH_MM = 150.0
 """Distance in mm from the origin to the closed end of the tube."""
 TEXTURE_MM = 72.0
-"""Texture has its own size at this distance, and is drawn out along the nearer wall."""
+"""Distance in mm at which the texture has its true size; nearer walls stretch it."""
 FOLD_SHARE = 0.045
 """Height of the folds as a share of the tube's radius."""
 FOLDS = 13.0
-"""Folds between two distances: so many radians for each unit of the logarithm of the distance."""
+"""Angular frequency of the folds, in radians per unit of the logarithm of the distance."""
 FOLD_TILT = (1.1, -0.7)
-"""Folds are no perfect rings."""
+"""Tilt of the folds, which are not perfect rings."""
 
 
 class Colon(Tissue):
-    """A tube of tissue that moves as the open sheet does, without a tool."""
+    """Tube of tissue without a tool, with the motion of the open sheet."""
 
     focal_factor = 0.62
     exposed_mm = 42.0
@@ -37,7 +37,7 @@ class Colon(Tissue):
     tools = False
 
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """See `Tissue.first_guess`: on the ellipsoid without its folds."""
+        """Intersect the rays with the ellipsoid without folds; see `Tissue.first_guess`."""
         shape = np.array([1 / RADIUS_MM, 1 / RADIUS_MM, 1 / LENGTH_MM], np.float32)
         start, along = origin * shape, directions * shape
         a = np.einsum("hwi,hwi->hw", along, along)

@@ -23,29 +23,29 @@ class Extras:
     scene: str = "open"
     """`open`: a sheet of tissue with a tool; `colon`: a tube along its axis."""
     third: bool = False
-    """A third camera's pictures and depth in `views/third/`, for evaluation alone."""
+    """Write a third camera's pictures and depth to `views/third/`, for evaluation only."""
     flow: bool = False
-    """Optical flow and scene flow from each frame to the next."""
+    """Write optical flow and scene flow from each frame to the next."""
     tracks: bool = False
     """Write the visibility of each point of `tracks.npy` in each frame."""
     behind: bool = False
-    """Pictures and depth of the tissue as they are behind the tool, in its shadow, in `behind/`, for evaluation alone."""
+    """Write pictures and depth with transparent tools to `behind/`, for evaluation only."""
     smoke: float = 0.0
-    """Strength; 1 is dense."""
+    """Strength of the smoke; 1 is dense."""
     depth_noise_mm: float = 0.0
     """Standard deviation in mm of the depth noise at a distance of 74 mm.
 
     It grows with the squared distance. The noise-free depth is written as well.
     """
     exposure_changes: bool = False
-    """Let the exposure go up and down."""
+    """Let the exposure vary over time."""
 
     breathing_ratio: float = 1.0
-    """Duration of expiration over that of inspiration."""
+    """Expiration to inspiration ratio of the durations."""
     rate_wander: float = 0.0
-    """Largest deviation of the breathing rate, as a share of it."""
+    """Largest relative deviation of the breathing rate."""
     scope_path: str = "usual"
-    """Way of a moving scope: `usual`, the same for every seed, or `seeded`, another one for each."""
+    """Path of a moving scope: `usual` is identical for all seeds, `seeded` depends on the seed."""
 
     def __post_init__(self) -> None:
         if self.scene not in ("open", "colon"):
@@ -63,7 +63,10 @@ class Extras:
             raise InvalidSetting(f"scope_path must be 'usual' or 'seeded', got {self.scope_path!r}")
 
     def described(self) -> dict[str, object]:
-        """Return the fields for `recording.json`. Those that later versions added are left out at their defaults, so that recordings keep their bytes."""
+        """Return the fields for `recording.json`.
+
+        Fields of later versions are omitted at their defaults, so recordings keep their bytes.
+        """
         added = ("breathing_ratio", "rate_wander", "scope_path")
         return {
             name: value for name, value in asdict(self).items() if name not in added or value != getattr(CLEAR, name)

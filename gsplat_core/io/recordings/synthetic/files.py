@@ -1,4 +1,4 @@
-"""The files of a synthetic recording, frame by frame."""
+"""Per-frame files of a synthetic recording."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class FrameRow:
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Writes the files of one frame at a time, in any order."""
+    """Writer of the files of one frame at a time, in any order."""
 
     scene: SyntheticScene
     folder: Path
@@ -40,7 +40,7 @@ class FrameFiles:
     extras: Extras
 
     def make_folders(self) -> None:
-        """The folders that the files go into."""
+        """Create the folders of the files."""
         names = ["images", "masks", "depth"]
         names += ["images_right"] if self.stereo else []
         names += [f"views/third/{name}" for name in ("images", "masks", "depth")] if self.extras.third else []
@@ -51,7 +51,7 @@ class FrameFiles:
             (self.folder / name).mkdir(parents=True)
 
     def write(self, index: int) -> FrameRow:
-        """Write one frame. It depends on its index alone."""
+        """Write one frame; the result depends only on its index."""
         scene, extras, time_s = self.scene, self.extras, index / self.fps
         left = scene.render(time_s)
         self._view(self.folder, index, left)
@@ -78,7 +78,7 @@ class FrameFiles:
         return FrameRow(pose_bounds, scene.track(time_s), seen_points(scene, left, time_s) if extras.tracks else None)
 
     def finish(self, rows: list[FrameRow]) -> None:
-        """Write the files that are of all frames."""
+        """Write the files shared by all frames."""
         np.save(self.folder / "poses_bounds.npy", np.stack([row.pose_bounds for row in rows]))
         np.save(self.folder / "tracks.npy", np.stack([row.track for row in rows]).astype(np.float32))
         if self.extras.tracks:
@@ -94,7 +94,7 @@ class FrameFiles:
         save_depth(folder / "depth" / _name(index, "depth"), eye.depth)
 
     def _noisy(self, depth: NDArray[Any], index: int) -> NDArray[Any]:
-        """Depth as a matcher finds it: its error grows with the square of the distance."""
+        """Add noise to the depth as from a stereo matcher: it grows with the squared distance."""
         random = np.random.default_rng((self.seed, index, 3))
         spread = self.extras.depth_noise_mm * np.square(depth / np.float32(TISSUE_DISTANCE_MM))
         return np.maximum(depth + spread * random.standard_normal(depth.shape, np.float32), np.float32(DEPTH_UNIT_MM))

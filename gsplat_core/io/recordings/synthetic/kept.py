@@ -127,7 +127,7 @@ def _keep(recording: RenderedRecording, path: Path, most_bytes: int) -> None:
 
 
 def _make_room(folder: Path, most_bytes: int) -> None:
-    """Remove files until the others take no more than that; another process may do so, too."""
+    """Evict files until the rest fits into `most_bytes`; other processes may do so concurrently."""
     files = []
     for path in folder.glob(f"*{SUFFIX}"):
         with contextlib.suppress(FileNotFoundError):
@@ -148,7 +148,7 @@ def _digest(asked: Asked) -> str:
 
 @cache
 def _renderer() -> str:
-    """Changes with the code that makes the pictures."""
+    """Return a digest of the renderer's source code."""
     whole = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         whole.update(path.read_bytes())

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 
 LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
-"""Two light fibres at the scope's tip, around its middle."""
+"""Positions of the two light fibres in mm, around the centre of the scope's tip."""
 REFERENCE_MM = 66.0
-"""A white surface facing the scope at this distance is exposed as 1."""
+"""Distance in mm at which a white surface facing the scope has radiance 1."""
 SHADOW_MM = (0.0, -7.0, 0.0)
 """Origin of the shadow rays, above the fibres so that shadows are not hidden behind the tool."""
 
@@ -29,7 +29,7 @@ class Lamp:
     fibres: Array
     """[2, 3]."""
     axis: Array
-    """The middle of the beam, a unit vector [3]."""
+    """Beam axis, a unit vector [3]."""
     shadow_from: Array
     """[3]."""
     reference_mm: float = REFERENCE_MM
@@ -37,7 +37,12 @@ class Lamp:
 
     @classmethod
     def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM) -> Lamp:
-        """The light seen from an eye that looks where the scope does; `scope_x_mm` is where the middle of the scope's tip is on its x axis."""
+        """Return the light source for an eye that looks in the scope's direction.
+
+        Args:
+            scope_x_mm: x coordinate of the centre of the scope's tip.
+            reference_mm: distance at which a white surface has radiance 1.
+        """
         fibres = np.array(LIGHTS_MM, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
         above = fibres.mean(axis=0) + np.array(SHADOW_MM, np.float32)
         return cls(fibres, np.array([0, 0, 1], np.float32), above, reference_mm)

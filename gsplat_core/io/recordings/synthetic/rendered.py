@@ -1,4 +1,4 @@
-"""A synthetic recording that is rendered into memory, and never written."""
+"""Synthetic recording rendered into memory and never written to disk."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Asked:
     camera: Literal["fixed", "moving"] = "fixed"
     stereo: bool = False
     extras: Extras = CLEAR
-    """Options of the generator; only breathing and scope path are used."""
+    """Generator options; only breathing and scope path are used."""
 
 
 class RenderedRecording:
-    """Frames with masks, depth and poses as the generator knows them; a `Recording` that needs no disk."""
+    """In-memory recording: frames with the generator's masks, depth and poses."""
 
     notes: tuple[str, ...] = ()
 
@@ -55,18 +55,22 @@ class RenderedRecording:
         self.stereo_baseline_mm = BASELINE_MM if asked.stereo else None
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames, in order."""
+        """Yield the frames in order."""
         return iter(self._frames)
 
     def camera_at(self, index: int) -> Camera:
-        """The camera of one frame."""
+        """Return the camera of one frame."""
         pose = self._frames[index].pose
         assert pose is not None
         return self.camera.with_pose(pose)
 
 
 def render_recording(asked: Asked, progress: Callable[[int, int], None] | None = None) -> RenderedRecording:
-    """The recording that `synthesize` writes, in memory. Raises InvalidSetting for arguments out of range, as `synthesize`."""
+    """Render the recording that `synthesize` would write.
+
+    Raises:
+        InvalidSetting: if an argument is out of range.
+    """
     frames, fps = asked.frames, asked.fps
     check_arguments(frames, asked.width_px, asked.height_px, fps, asked.seed, asked.camera)
     threads = threads_that_fit(asked.width_px, asked.height_px)

@@ -1,7 +1,8 @@
-"""Ray casting of tissue and tool, lit from the scope's tip: image, depth and tool mask of one camera.
+"""Ray caster for tissue and tool lit from the scope's tip: image, depth and tool mask.
 
-Each pixel's ray is cut with the deformed tissue by Newton's method on the material coordinates (u, v), so depth is that
-of the surface itself, not of a mesh. A pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
+Each ray is intersected with the deformed tissue by Newton's method on the material coordinates (u,
+v), so depth is exact and not that of a mesh. A pixel (column i, row j) has its centre at (i + 0.5,
+j + 0.5).
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ class Eye:
     image: NDArray[np.uint8]
     """sRGB [H, W, 3]."""
     depth: Array
-    """z of the first surface on the ray through the pixel's centre, tool or tissue, in mm [H, W]."""
+    """Depth z in mm [H, W] of the first surface, tool or tissue, on the ray of each
+    pixel centre.
+    """
     tool: NDArray[np.bool_]
-    """[H, W]; every pixel that the tool covers in part."""
+    """bool [H, W]; pixels at least partly covered by the tool."""
     tissue_depth: Array
-    """z of the tissue, also behind the tool [H, W]."""
+    """Depth z in mm [H, W] of the tissue, also behind the tool."""
     u: Array
     v: Array
 
@@ -99,7 +102,7 @@ def render_eye(
 
 
 def pixel_rays(camera: Camera) -> tuple[Array, Array]:
-    """x/z and y/z of the rays through the pixel centres, [H, W] each."""
+    """Return x/z and y/z of the rays through the pixel centres, [H, W] each."""
     column = (np.arange(camera.width_px) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     row = (np.arange(camera.height_px) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     ray_x, ray_y = np.meshgrid(column.astype(np.float32), row.astype(np.float32))
@@ -109,7 +112,10 @@ def pixel_rays(camera: Camera) -> tuple[Array, Array]:
 def cast_tissue(
     tissue: Tissue, tug: Tug, camera: Camera, ray_x: Array, ray_y: Array, time_s: float
 ) -> tuple[Array, Array, SurfacePoints]:
-    """The material point (u, v) that each ray meets: Newton's method on X - ray_x Z = 0, Y - ray_y Z = 0."""
+    """Intersect rays with the tissue and return the material points (u, v).
+
+    Newton's method solves X - ray_x Z = 0 and Y - ray_y Z = 0.
+    """
     r = camera.world_to_camera[:3, :3].astype(np.float32)
     t = camera.world_to_camera[:3, 3].astype(np.float32)
     directions = np.stack([ray_x, ray_y, np.ones_like(ray_x)], axis=-1) @ r

@@ -1,4 +1,7 @@
-"""A synthetic scene as functions of time: tissue, tool, air and cameras; each frame can be rendered on its own."""
+"""Synthetic scene as a function of time: tissue, tool, air and cameras.
+
+Each frame can be rendered independently.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +29,23 @@ SCENES: dict[str, type[Tissue]] = {"open": Tissue, "colon": Colon}
 
 @dataclass(frozen=True)
 class Sway:
-    """The way of a moving scope: a sine along each axis and one about its own, at 0 at time 0."""
+    """Trajectory of a moving scope: a sine along each axis and a sinusoidal roll, all 0
+    at time 0.
+    """
 
     periods_s: tuple[float, float, float, float] = (4.1, 5.3, 6.7, 4.7)
-    """Along x, y and z, and of the roll."""
+    """Periods in seconds of the motion along x, y and z, and of the roll."""
     reaches: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    """Factors of the usual amplitudes."""
+    """Factors on the usual amplitudes."""
     phases: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod
     def seeded(cls, rng: np.random.Generator) -> Sway:
-        """Another way: periods of 0.7 to 1.5 times the usual ones, 0.6 to 1.3 times as far, at other phases."""
+        """Draw another trajectory: 0.7 to 1.5 times the usual periods, 0.6 to 1.3 times the
+        amplitudes.
+
+        Phases are random.
+        """
         periods = np.array(cls.periods_s) * rng.uniform(0.7, 1.5, 4)
         return cls(
             *(tuple(each.tolist()) for each in (periods, rng.uniform(0.6, 1.3, 4), rng.uniform(0, 2 * np.pi, 4)))
@@ -74,7 +83,7 @@ class SyntheticScene:
     def from_seed(
         cls, seed: int, width_px: int, height_px: int, duration_s: float, moving: bool, extras: Extras = CLEAR
     ) -> SyntheticScene:
-        """The scene of a seed; another size shows the same scene."""
+        """Create the scene of a seed; the picture size does not change the scene."""
         kind = SCENES[extras.scene]
         camera = Camera.from_focal(kind.focal_factor * max(width_px, height_px), width_px, height_px)
         seeds = np.random.SeedSequence(seed).spawn(3)
@@ -90,7 +99,7 @@ class SyntheticScene:
         return cls(tissue, ToolMotion(tool, cycles=int(duration_s // CYCLE_S) + 1), camera, moving, air, sway)
 
     def camera_at(self, time_s: float, view: View = "left") -> Camera:
-        """A camera's intrinsics and where it is; the left one at time 0 is at the world's origin."""
+        """Return a camera at a time; the left camera at time 0 is at the world's origin."""
         left = self._left_at(time_s)
         return left if view == "left" else left.with_pose(self.left_to(view) @ left.world_to_camera)
 
@@ -135,18 +144,18 @@ class SyntheticScene:
         return self.motion.tug(time_s) if self.tissue.tools else NO_TUG
 
     def parts(self, time_s: float) -> list[Part]:
-        """The tool at a time; none where no tool works."""
+        """Return the capsules of the tool at a time; empty in scenes without a tool."""
         return self.motion.parts(self.tissue, time_s) if self.tissue.tools else []
 
     def track(self, time_s: float) -> NDArray[np.float32]:
-        """A grid of material points in the world [63, 3], mm."""
+        """Return a grid of material points in the world [63, 3] in mm."""
         u, v = np.meshgrid(np.linspace(-32, 32, 9, dtype=np.float32), np.linspace(-24, 24, 7, dtype=np.float32))
         points = self.tissue.points(u.ravel(), v.ravel(), time_s, self.tug(time_s))
         return np.stack(points.position, axis=1)
 
 
 def _looking(towards: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
-    """The rotation of a camera that looks along a direction: its axes as rows."""
+    """Return the rotation of a camera looking in a direction; its rows are the camera's axes."""
     forward = towards / np.linalg.norm(towards)
     right = np.cross([-np.sin(roll), np.cos(roll), 0], forward)
     right /= np.linalg.norm(right)

@@ -24,7 +24,10 @@ def shade_tissue(
     camera: Camera,
     lamp: Lamp,
 ) -> Array:
-    """Linear radiance [H, W, 3] of the tissue: scattering that bleeds red, and a wet film over a fine relief."""
+    """Return the linear radiance [H, W, 3] of the tissue.
+
+    Combines scattering that bleeds red with a wet film over a fine relief.
+    """
     reflectance, slope = tissue.texture.sample(u, v)
     turn = camera.world_to_camera[:3, :3].T.astype(np.float32)
     along_u = np.stack(points.along_u, axis=-1) @ turn
@@ -78,7 +81,10 @@ def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
 
 
 def shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lamp: Lamp) -> Array:
-    """Linear radiance [N, 3] of the tool: dark polymer shaft, brushed steel that mirrors the pink surroundings."""
+    """Return the linear radiance [N, 3] of the tool.
+
+    The shaft is dark polymer, the jaws are brushed steel reflecting pink surroundings.
+    """
     metal = (material != SHAFT)[:, None]
     base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
     base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
@@ -102,7 +108,7 @@ def _unit(vector: Array) -> Array:
 
 
 def develop(radiance: Array) -> NDArray[np.uint8]:
-    """Exposure with a soft shoulder, then the sRGB curve (IEC 61966-2-1)."""
+    """Convert radiance to a picture: soft-shoulder tone curve, then sRGB (IEC 61966-2-1)."""
     exposed = 1 - np.exp(np.float32(-1.45) * radiance)
     curve = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(np.clip(np.round(255 * curve), 0, 255), np.uint8)

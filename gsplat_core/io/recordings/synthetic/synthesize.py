@@ -37,9 +37,12 @@ from gsplat_core.memory import available_bytes, in_gib
 
 MAX_SEED = 2**63 - 1
 SCENE_BYTES = 1120
-"""Memory while the tissue's texture is made, for each pixel of a square with the longer side: its texels follow the resolution (measured)."""
+"""Measured memory during texture generation, in bytes per pixel of a square of the longer side.
+
+The number of texels follows the resolution.
+"""
 FRAME_BYTES = 300
-"""Memory while one frame is rendered, for each of its pixels (measured)."""
+"""Measured memory during the rendering of one frame, in bytes per pixel."""
 
 
 def synthesize(
@@ -55,12 +58,16 @@ def synthesize(
     extras: Extras = CLEAR,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write a synthetic recording with exact ground truth into the folder `out`, and return it.
+    """Write a synthetic recording with exact ground truth into the folder `out` and return the
+    folder.
 
-    The same arguments give the same bytes. The folder appears when it is complete; one that an earlier call wrote is
-    replaced, any other that is not empty is refused. `progress(done, frames)` is called after each frame.
+    Equal arguments give equal bytes. The folder appears once complete. A folder written by an
+    earlier call is replaced; any other non-empty folder is refused. `progress(done, frames)` is
+    called after each frame.
 
-    Raises InvalidSetting for arguments out of range, and for an `out` that holds anything else, is a link or the root of a disk.
+    Raises:
+        InvalidSetting: if an argument is out of range, or `out` has foreign content, is a link or
+            is the root of a disk.
     """
     check_arguments(frames, width_px, height_px, fps, seed, camera)
     target = Path(out)

@@ -22,7 +22,7 @@ _WRITTEN = re.compile(
     rf"|images_right/{_FRAME}color\.png|true_depth/{_FRAME}depth\.png|(scene_)?flow/\d{{6}}\.npy"
     r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json"
 )
-"""The files that this module writes."""
+"""Pattern of the files written by `synthesize`."""
 _FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for name in ("images", "masks", "depth")) | {
     "images_right",
     "true_depth",
@@ -34,8 +34,12 @@ _FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for na
 
 
 def check_target(target: Path) -> None:
-    """Raises InvalidSetting unless `target` can be replaced whole without losing anything that `synthesize` did not write; OSError for a
-    name that cannot be one."""
+    """Check that `target` can be replaced without losing foreign files.
+
+    Raises:
+        InvalidSetting: if it contains anything that `synthesize` did not write.
+        OSError: if the name is impossible.
+    """
     try:
         os.lstat(target)
     except FileNotFoundError:

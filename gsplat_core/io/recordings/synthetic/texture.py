@@ -1,6 +1,7 @@
-"""The colour of tissue: noise of several octaves in pink, islands of fat, branching vessels, fine relief, wetness.
+"""Colour of tissue: multi-octave noise, islands of fat, branching vessels, fine relief, wetness.
 
-Made in millimetres of the undeformed sheet: a finer texel shows the same tissue in more detail.
+The texture is defined in millimetres of the undeformed sheet, so finer texels show the same tissue
+in more detail.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ class TissueTexture:
         return np.asarray(reflectance, np.float32), np.asarray(slope, np.float32)
 
     def _noise(self, rng: np.random.Generator, cells_mm: tuple[float, ...], gain: float) -> Array:
-        """Sum of value noises with these cell sizes, each weaker by `gain`; mean 0, standard deviation about 1."""
+        """Sum value noises of the cell sizes, each weaker by `gain`; mean 0, standard deviation
+        about 1.
+        """
         total = np.zeros((self.size, self.size), np.float32)
         power, weight = 0.0, 1.0
         for cell_mm in cells_mm:
@@ -81,7 +84,7 @@ class TissueTexture:
         return total / np.float32(np.sqrt(power))
 
     def _vessels(self, rng: np.random.Generator, count: int, width_mm: float, blur_mm: float) -> tuple[Array, Array]:
-        """Branching trees that wander and thin out: their cover 0..1 and a raised relief."""
+        """Draw branching vessel trees; return their cover 0..1 and a raised relief."""
         canvas = np.zeros((self.size, self.size), np.uint8)
         stack = []
         for _ in range(count):

@@ -26,7 +26,9 @@ TUG_RADIUS_MM = 12.0
 
 @dataclass(frozen=True)
 class Tug:
-    """The tissue's local displacement by a tool: `pull` at the material point `grasp`, fading like a Gaussian."""
+    """Local displacement by a tool: `pull` at the material point `grasp` with a
+    Gaussian falloff.
+    """
 
     grasp: tuple[float, float]
     pull: tuple[float, float, float]
@@ -73,13 +75,16 @@ class Tissue:
         ]
         self._tilt = rng.uniform(-0.10, 0.10, 2)
         self.breathing = Breathing(float(rng.uniform(0, 2 * np.pi)))
-        """Replaced where a recording asks for another one."""
+        """Default; replaced if a recording requests other breathing."""
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
         self.texture = TissueTexture(rng, texel_mm)
 
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """Material points near those that rays from `origin` [3] along `directions` [H, W, 3] meet, for Newton's method: on the plane at
-        the mean distance."""
+        """Return start values of Newton's method for the ray intersections.
+
+        The rays from `origin` [3] along `directions` [H, W, 3] are intersected with the plane at
+        the mean distance.
+        """
         s = (np.float32(TISSUE_DISTANCE_MM) - origin[2]) / directions[..., 2]
         return origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
 

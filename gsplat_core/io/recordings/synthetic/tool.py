@@ -1,6 +1,6 @@
-"""A grasper that comes in through a port, takes hold of the tissue, tugs and lets go.
+"""Grasper that enters through a port, grasps the tissue, tugs and releases it.
 
-Its shape is a signed distance function (tapered capsules), found by sphere tracing.
+Its shape is a signed distance function of tapered capsules, intersected by sphere tracing.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class ToolHits:
     """Intersections of rays with the tool."""
 
     distance_mm: Array
-    """Along the ray; infinity where it meets nothing before the limit."""
+    """Distance along the ray; infinity without a hit before the limit."""
     cover: Array
-    """0..1: share of the pixel, by how close its ray passes."""
+    """Coverage of the pixel, 0..1, by the ray's distance from the tool."""
     normal: Array
-    """[..., 3] where hit."""
+    """Surface normal [..., 3] at hits."""
     material: NDArray[np.int8]
 
 
@@ -67,14 +67,16 @@ class ToolMotion:
         self._pulls = np.stack([2.8 + side, 1.8 - side, np.full(cycles + 1, -6.0)], axis=1)
 
     def tug(self, time_s: float) -> Tug:
-        """The pull on the tissue, 0 outside the middle half of a cycle."""
+        """Return the pull on the tissue; 0 outside the middle half of a cycle."""
         cycle, phase = self._phase(time_s)
         strength = np.sin(np.pi * np.clip((phase - 0.25) / 0.5, 0, 1)) ** 2
         pull = self._pulls[cycle] * strength
         return Tug(self._grasp(cycle), (float(pull[0]), float(pull[1]), float(pull[2])))
 
     def parts(self, tissue: Tissue, time_s: float) -> list[Part]:
-        """The tool's parts in world millimetres. While it tugs, its tip holds the grasped material point."""
+        """Return the tool's capsules in world mm. During a tug the tip holds the grasped material
+        point.
+        """
         cycle, phase = self._phase(time_s)
         tug = self.tug(time_s)
         held = tissue.position(tug.grasp, time_s, tug)
@@ -121,7 +123,10 @@ def _smooth(x: float) -> float:
 
 
 def distance(parts: list[Part], points: Array) -> tuple[Array, NDArray[np.int8]]:
-    """Distance of points [N, 3] to the tool (a little less than the true one where a part tapers), and the nearest part."""
+    """Return the distance of points [N, 3] to the tool and the index of the nearest part.
+
+    The distance is slightly underestimated where a part tapers.
+    """
     x, y, z = np.ascontiguousarray(points.T)
     nearest = np.full(len(points), np.inf, np.float32)
     which = np.zeros(len(points), np.int8)
@@ -141,9 +146,10 @@ def distance(parts: list[Part], points: Array) -> tuple[Array, NDArray[np.int8]]
 
 
 def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm: Array, pixel_rad: float) -> ToolHits:
-    """Sphere tracing of unit rays [N, 3] from one origin up to a limit for each.
+    """Sphere-trace unit rays [N, 3] from one origin up to a limit for each (Hart 1996).
 
-    J. C. Hart, "Sphere tracing", The Visual Computer 12 (1996). `pixel_rad` is a pixel's angle, for the cover.
+    J. C. Hart, "Sphere tracing", The Visual Computer 12 (1996). `pixel_rad` is the angle of a
+    pixel, used for coverage.
     """
     count = len(rays)
     if not parts:
@@ -188,7 +194,9 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
 
 
 def may_meet(parts: list[Part], start: Array, rays: Array) -> NDArray[np.intp]:
-    """The rays that pass near the tool: those that meet one of a chain of spheres around it."""
+    """Select the rays that pass near the tool: those that hit one of a chain of
+    bounding spheres.
+    """
     shaft = parts[-1]
     axis = (shaft.a - shaft.b) / np.linalg.norm(shaft.a - shaft.b)
     tip = max(float((part.b - shaft.a) @ axis) for part in parts)

@@ -12,7 +12,7 @@ from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.scene.cameras import Camera
 
 HIDDEN_MM = 0.5
-"""A material point so far behind the surface that its pixel shows is hidden by a fold of the tissue."""
+"""Depth difference in mm from which a material point counts as hidden by a fold."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,6 @@ def seen_points(scene: SyntheticScene, eye: Eye, time_s: float) -> NDArray[np.bo
 
 
 def projected(camera: Camera, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels [N, 2] and z [N] of points in the world [N, 3]."""
+    """Project world points [N, 3]; return pixels [N, 2] and z [N]."""
     local = points.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     return (local @ camera.K.T)[:, :2] / local[:, 2:], local[:, 2]
