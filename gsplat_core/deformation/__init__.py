@@ -1,4 +1,4 @@
-"""Deformation fields: how canonical Gaussians move in time."""
+"""Deformation fields, which move canonical Gaussians over time."""
 
 from __future__ import annotations
 

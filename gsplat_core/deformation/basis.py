@@ -1,9 +1,11 @@
-"""Per-Gaussian basis functions in time: bumps that move, turn, scale and colour each Gaussian, local in time.
+"""Basis-function deformation: temporal bumps that move, rotate, scale and colour each Gaussian.
 
-The idea is Deform3DGS's (Yang et al. 2024), with one timing per bump shared by all channels, colour added, and truncated bumps. One time touches few of
-them, so reading, training and storing a stretch of time cost the same for any length of the stream.
+Based on Deform3DGS (Yang et al. 2024), with one timing per bump shared by all channels, added
+colour, and truncated bumps. Only few bumps are active at any time, so the cost of evaluation,
+training and storage per unit of time does not depend on the length of the stream.
 
-Inside the field, time is counted in bump spacings from the first column, tau = (time_s - origin_s) / spacing_s. Column b starts with centre b and width 1.
+Internal time is counted in bump spacings from the first column: tau = (time_s - origin_s) /
+spacing_s. Column b starts with centre b and width 1.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
 class BasisSlot:
-    """A basis field with capacity for more Gaussians and more bumps than it has; those that are not in use are inert."""
+    """Reusable basis field with spare capacity for Gaussians and bumps; unused places are inert."""
 
     def __init__(self, source: BasisField, rows: int) -> None:
         # A ring has its places from the start, and the copy has the same ones.
@@ -91,7 +93,7 @@ class BasisSlot:
         return True
 
     def _continue(self, source: Continuation | None, count: int) -> None:
-        """Continue as `source` does, or not at all."""
+        """Copy the source's continuation, or disable the own one."""
         mine = self.field.continuation
         if mine is None:
             return
@@ -116,7 +118,7 @@ class BasisSlot:
         self._in_use = [to[:count, :bumps] for to in mine]
 
     def exact_copy(self) -> DeformationField:
-        """A field of as many Gaussians and bumps as are in use."""
+        """Return a field with only the Gaussians and bumps in use."""
         copied = self.field._copy_of(self._used[0])
         if self.field.continuation is not None:
             copied.continuation = self.field.continuation.of_first(self._used[0])
@@ -124,18 +126,22 @@ class BasisSlot:
 
 
 OVERSHOOT = 0.25
-"""Bound on a course between the offsets that it follows and beyond the first and last: this share of their range outside of it. Least squares alone put a
-course far outside where offsets jump."""
+"""Bound on a fitted trajectory outside its offsets, as a share of their range.
+
+Least squares alone overshoots where offsets jump.
+"""
 
 
 class BasisField(BumpTensors):
-    """B bumps per Gaussian, 13 channels each: position 3, rotation 4, log-scale 3, colour 3 (added to the SH DC term).
+    """Field with B bumps per Gaussian and 13 channels: position, rotation, log-scale, colour.
 
-    Parameters: `centers` [N, B] and `log_widths` [N, B] in bump spacings, `weights` [N, B, 13], zero at first. The columns
-    cover the window plus one spacing at each end. A bump more than 4 widths away contributes nothing and gets no gradient.
+    Colour is added to the constant SH coefficient. Parameters are `centers` [N, B] and `log_widths`
+    [N, B] in bump spacings, and `weights` [N, B, 13], initially zero. The columns cover the window
+    plus one spacing at each end. A bump more than 4 widths away contributes nothing and gets no
+    gradient.
 
-    Training has two ways: `forward` is differentiable for any optimiser; `deltas`, `displaced` and `adam_step` do the same with
-    the gradient and a lazy Adam step fused, which touches only the bumps active at that time.
+    Two ways of training exist. `forward` is differentiable for any optimiser. `deltas`, `displaced`
+    and `adam_step` fuse the gradient with a lazy Adam step that touches only active bumps.
     """
 
     kind = "basis"
@@ -159,7 +165,7 @@ class BasisField(BumpTensors):
         return deltas if added is None else deltas + added[:, :BASIS_CHANNELS]
 
     def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
-        """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
+        """Return the Gaussians with `deltas` [N, 13] added; differentiable in both."""
         if gaussians.count != deltas.shape[0]:
             raise InvalidInput(
                 f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; call"
@@ -168,14 +174,19 @@ class BasisField(BumpTensors):
         return displaced(gaussians, deltas)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`; outside the window the state of its nearest end."""
+        """Deform Gaussians to `time_s`, clamped to the window."""
         return self.displaced(gaussians, self.deltas(time_s))
 
     def adam_step(self, time_s: float, gradient: Tensor, rates: BasisRates) -> None:
-        """Lazy Adam of the bumps active at `time_s`, given dL/d(deltas) `gradient` [N, 13]; the others are left alone.
+        """Take a lazy Adam step of the bumps active at `time_s`; other bumps are unchanged.
 
-        The moments live in the field, follow `select`, `append` and `extend`, and are not part of a bundle. On CUDA the host does
-        not wait.
+        The moments are stored in the field, follow `select`, `append` and `extend`, and are not
+        part of a bundle. On CUDA the host does not synchronise.
+
+        Args:
+            time_s: time in seconds.
+            gradient: dL/d(deltas) [N, 13].
+            rates: learning rates.
         """
         each = (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths)
         self.adam_step_at(self.tau(time_s), gradient, each)
@@ -208,7 +219,7 @@ class BasisField(BumpTensors):
         )
 
     def smooth_in_time(self, amount: float) -> None:
-        """See `DeformationField.smooth_in_time`: the weights of neighbouring bumps."""
+        """Smooth the weights of neighbouring bumps; see `DeformationField.smooth_in_time`."""
         if self.columns.is_ring:
             raise InvalidInput(
                 "a field that forgets its past has no columns in the order of time; smooth one that keeps them all"
@@ -216,17 +227,17 @@ class BasisField(BumpTensors):
         towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
 
     def share_motion(self, neighbours: Tensor, amount: float) -> None:
-        """See `DeformationField.share_motion`: the positions' weights of each bump."""
+        """Smooth each bump's position weights; see `DeformationField.share_motion`."""
         towards_others_(self.weights.data[: self.count, : self.bumps, POSITION], neighbours, amount)
 
     @property
     def parameter_count(self) -> int:
-        """See `DeformationField.parameter_count`: of the Gaussians and bumps in use."""
+        """Number of parameters of the Gaussians and bumps in use."""
         return self.count * self.bumps * (2 + BASIS_CHANNELS)
 
     @property
     def has_frame_deltas(self) -> bool:
-        """Always."""
+        """True for all basis fields."""
         return True
 
     def frame_time(self, time_s: float) -> float:
@@ -251,11 +262,11 @@ class BasisField(BumpTensors):
         return at if self.continuation is None else self.continuation.captured(at)
 
     def scale_positions(self, factor: Tensor) -> None:
-        """See `DeformationField.scale_positions`; Adam's moments follow."""
+        """Scale position weights and their Adam moments; see `DeformationField.scale_positions`."""
         self._scale(POSITION, factor)
 
     def scale_rotations(self, factor: Tensor) -> bool:
-        """See `DeformationField.scale_rotations`; Adam's moments follow."""
+        """Scale rotation weights and their Adam moments; see `DeformationField.scale_rotations`."""
         self._scale(ROTATION, factor)
         return True
 
@@ -274,7 +285,10 @@ class BasisField(BumpTensors):
         self.continuation = continuation
 
     def move_to(self, time_s: float, deltas: Tensor) -> bool:
-        """See `DeformationField.move_to`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
+        """Change weights in proportion to the bump heights; see `DeformationField.move_to`.
+
+        This is the minimum-norm change that yields the wanted deltas.
+        """
         self.move_to_at(self.tau(time_s), deltas)
         return True
 
@@ -289,7 +303,10 @@ class BasisField(BumpTensors):
         self._ops.basis_field_move_to_(*bumps, tau, deltas)
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
-        """See `DeformationField.follow`: least squares over the weights of bumps as they are laid out, bounded by `OVERSHOOT`. False for a ring."""
+        """Fit weights of the initial bumps by least squares; see `DeformationField.follow`.
+
+        The result is bounded by `OVERSHOOT`. Returns False for a ring.
+        """
         if self._columns.is_ring:
             return False
         solution = least_squares_weights([self.tau(time_s) for time_s in times_s], self.bumps)
@@ -326,7 +343,7 @@ class BasisField(BumpTensors):
         return ops_for(self.weights, compiled, plain_torch)
 
     def _parameters_of(self, count: int) -> tuple[Tensor, ...]:
-        """Centres, log-widths and weights of the first `count` Gaussians."""
+        """Return centres, log-widths and weights of the first `count` Gaussians."""
         whole = self._whole_parameters()
         return whole if count == self.weights.shape[0] else tuple(parameter[:count] for parameter in whole)
 
@@ -354,7 +371,7 @@ class BasisLearningRates(FieldRates):
 
 
 def basis_rates(rates: Mapping[str, float]) -> BasisRates:
-    """Scaled `BasisLearningRates` in the units of the parameters."""
+    """Convert scaled `BasisLearningRates` to the units of the parameters."""
     return BasisRates(
         position=rates["means_px"],
         rotation=rates["quats"],

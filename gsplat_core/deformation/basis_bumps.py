@@ -1,4 +1,4 @@
-"""Tensors of a `BasisField`: bumps as columns in a ring that follows a stream, Gaussians as rows, and Adam's state for them."""
+"""Tensors of a `BasisField`: Gaussians as rows, bumps as columns of a ring, and Adam's state."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class BasisRates:
 
 @dataclass
 class Moments:
-    """First and second moments of (centers, log_widths, weights), and updates per bump."""
+    """First and second moments of (centers, log_widths, weights), and update counts per bump."""
 
     first: list[Tensor]
     second: list[Tensor]
@@ -41,7 +41,7 @@ class Moments:
 
     @staticmethod
     def zeros(parameters: Sequence[Tensor]) -> Moments:
-        """The state before the first step on these parameters [N, B, ...]."""
+        """Return the initial state for these parameters [N, B, ...]."""
         first, second = ([torch.zeros_like(p) for p in parameters] for _ in range(2))
         return Moments(first, second, torch.zeros_like(parameters[0], dtype=torch.int32))
 
@@ -55,14 +55,14 @@ class Moments:
 
 
 INERT_CENTER = 1e9
-"""Centre of a column that is no bump yet, in bump spacings: too far from any time to contribute or to be trained."""
+"""Centre of an unused column, in bump spacings; far enough to be inactive at any time."""
 INERT = (INERT_CENTER, 0.0, 0.0)
-"""Centre, log-width and weights of such a column."""
+"""Centre, log-width and weights of an unused column."""
 CAPACITY_STEP = 16
-"""The capacity for bumps is a multiple of this."""
+"""Granularity of the capacity for bumps."""
 HEADROOM = 1.25
 COLUMNS_AHEAD = 1
-"""Columns that the window keeps ahead of the newest frame online."""
+"""Number of columns kept ahead of the newest frame in a live session."""
 
 
 @dataclass(frozen=True)
@@ -76,17 +76,17 @@ class Columns:
     """Time at which the oldest column was created; times are counted in spacings from it."""
     spacing_s: float
     count: int
-    """Columns in use."""
+    """Number of columns in use."""
     places: int
-    """Columns of the tensors."""
+    """Number of columns of the tensors."""
     oldest: int = 0
-    """The place of column 0."""
+    """Place of column 0."""
     is_ring: bool = False
     """True if new columns replace the oldest ones once all places are in use."""
 
     @property
     def spare(self) -> int:
-        """Places that hold no column yet."""
+        """Number of unused places."""
         return self.places - self.count
 
     def moved_on(self, added: int) -> tuple[Columns, int]:
@@ -100,11 +100,13 @@ class Columns:
 
     @property
     def newest_place(self) -> int:
-        """The place of the newest column."""
+        """Place of the newest column."""
         return (self.oldest + self.count - 1) % self.places
 
     def newest_places(self, count: int) -> Iterator[tuple[slice, range]]:
-        """The places of the newest `count` columns in one or two pieces, each with the numbers of its columns."""
+        """Yield the places of the newest `count` columns in one or two slices, with
+        column numbers.
+        """
         number = self.count - count
         while number < self.count:
             place = (self.oldest + number) % self.places
@@ -113,13 +115,13 @@ class Columns:
             number += length
 
     def in_order(self, tensor: Tensor) -> Tensor:
-        """The columns in use of [N, places, ...], the oldest first."""
+        """Return the columns in use of [N, places, ...], oldest first."""
         if self.oldest == 0:
             return tensor[:, : self.count]
         return torch.cat([tensor[:, self.oldest :], tensor[:, : self.oldest]], dim=1)
 
     def laid_out(self, like: Tensor) -> Tensor:
-        """The centres [places] of columns that were not trained, of the type and on the device of `like`."""
+        """Return initial centres [places] with dtype and device of `like`."""
         columns = torch.arange(self.count, dtype=like.dtype, device=like.device)
         if self.spare:
             columns = torch.cat([columns, like.new_full((self.spare,), INERT_CENTER)])
@@ -127,7 +129,7 @@ class Columns:
 
 
 def bump_capacity(bumps: int) -> int:
-    """The columns to allocate for a field with so many bumps that is going to have more."""
+    """Return the number of columns to allocate for a field expected to grow beyond `bumps`."""
     return math.ceil(max(bumps * HEADROOM, 1) / CAPACITY_STEP) * CAPACITY_STEP
 
 
@@ -141,7 +143,7 @@ def ring_places(history_s: float, spacing_s: float) -> int:
 
 
 def with_columns(tensor: Tensor, added: int, value: float = 0.0) -> Tensor:
-    """[N, B, ...] with `added` more columns of one value."""
+    """Append `added` constant columns to [N, B, ...]."""
     return torch.cat([tensor, tensor.new_full((tensor.shape[0], added, *tensor.shape[2:]), value)], dim=1)
 
 
@@ -160,15 +162,18 @@ BUMPS_PER_SPACING = math.sqrt(math.pi)
 
 
 class BumpTensors(DeformationField):
-    """Centres and log-widths [N, B], weights [N, B, 13], and their moments once they are trained.
+    """Centres and log-widths [N, B], weights [N, B, 13], and their moments once trained.
 
-    Each Gaussian is a row and each bump a column. Both may have spare ones that are inert, for Gaussians (`reserve`) and times to come.
+    Rows are Gaussians and columns are bumps. Both may include inert spares, for reserved Gaussians
+    (`reserve`) and for later times.
     """
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
     ) -> None:
-        """`bumps` columns spread over the window, or as many as it takes at a distance of `spacing_s`."""
+        """Create columns over the window: `bumps` of them, or as many as a distance of `spacing_s`
+        needs.
+        """
         super().__init__(time_window_s)
         start, end = self._time_window_s
         if spacing_s is not None:
@@ -182,7 +187,7 @@ class BumpTensors(DeformationField):
         self._history_s: float | None = None
         self._fading_s = math.inf
         self._spare_rows = 0
-        """Inert rows at the end, which `append` turns into Gaussians without moving a tensor."""
+        """Number of inert rows at the end, which `append` uses without moving a tensor."""
         self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
         self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
         self.weights = torch.nn.Parameter(torch.zeros(count, bumps, BASIS_CHANNELS))
@@ -200,7 +205,7 @@ class BumpTensors(DeformationField):
 
     @property
     def spacing_s(self) -> float:
-        """Seconds between neighbouring bumps as they are laid out."""
+        """Initial distance between neighbouring bumps in seconds."""
         return self._columns.spacing_s
 
     @property
@@ -209,7 +214,7 @@ class BumpTensors(DeformationField):
         return self._columns
 
     def tau(self, time_s: float) -> float:
-        """Time in bump spacings from the first column, clamped to the window."""
+        """Convert a time, clamped to the window, to bump spacings since the first column."""
         return (self.clamp_time(time_s) - self._columns.origin_s) / self._columns.spacing_s
 
     def deltas(self, time_s: float) -> Tensor:
@@ -240,7 +245,7 @@ class BumpTensors(DeformationField):
         self._history_s, self._fading_s = history_s, fading_s
 
     def restart(self, time_s: float, count: int) -> bool:
-        """See `DeformationField.restart`; there have to be rows for so many Gaussians."""
+        """Reset the field in place, see `DeformationField.restart`; requires enough rows."""
         spare_rows = self.weights.shape[0] - count
         if spare_rows < 0:
             return False
@@ -254,12 +259,13 @@ class BumpTensors(DeformationField):
         return True
 
     def extend(self, time_window_s: tuple[float, float], *, hold_at_s: float | None = None) -> None:
-        """Move the window on: new bumps at the head, and bumps that ended before the new start dropped.
+        """Advance the window: append bumps at the head and drop expired ones at the tail.
 
-        The start and the end may only grow. New bumps start still (zero weights), or so that they continue the deformation at
-        `hold_at_s`: tissue that a tool hides then stays as it was last seen, instead of falling back to its canonical state.
-        Past the window the field holds its last state. A bump is dropped when its laid-out place is more than 4 spacings before
-        the new start; after `keep_last` the oldest ones are written over, and the window starts where the rest of them reaches.
+        Start and end may only increase. New bumps have zero weights, or continue the deformation at
+        `hold_at_s`. Tissue hidden by a tool then keeps its last observed state instead of returning
+        to its canonical one. After the window the field holds its last state. A bump is dropped if
+        its initial centre is more than 4 spacings before the new start. After `keep_last`, the
+        oldest bumps are overwritten, and the window starts where the remaining ones reach.
         """
         start, end = checked_window(time_window_s)
         if start < self._time_window_s[0] or end < self._time_window_s[1]:
@@ -274,7 +280,9 @@ class BumpTensors(DeformationField):
         self._time_window_s = (start, end)
 
     def cover(self, time_s: float, newest_s: float) -> None:
-        """Keep `COLUMNS_AHEAD` columns ahead of `time_s`, and one beyond; new ones continue the deformation at `newest_s`."""
+        """Keep `COLUMNS_AHEAD` columns plus one ahead of `time_s`; new ones continue from
+        `newest_s`.
+        """
         start, end = self._time_window_s
         ahead_s = COLUMNS_AHEAD * self.spacing_s
         if time_s + ahead_s > end:
@@ -290,7 +298,9 @@ class BumpTensors(DeformationField):
         self._spare_rows = 0
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
-        """Add still bumps for new Gaussians, or copies of the bumps of `parents`; their Adam state starts afresh."""
+        """Append zero bumps for new Gaussians, or copies of the bumps of `parents`, with new Adam
+        state.
+        """
         count, used = count_of(added), self.count
         if parents is not None and parents.shape != (count,):
             raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
@@ -317,13 +327,13 @@ class BumpTensors(DeformationField):
         return True
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """See `DeformationField.close_gaps`; the tensors stay where they are."""
+        """Apply row moves, see `DeformationField.close_gaps`; tensors keep their addresses."""
         for tensor, inert in self._tensors_and_fill():
             moves.apply(tensor, inert)
         self._spare_rows += moves.before - moves.count
 
     def config(self) -> dict[str, Any]:
-        """Kind, window and the layout of the columns."""
+        """Return kind, window and column layout."""
         return {
             "kind": self.kind,
             "time_window_s": list(self._time_window_s),
@@ -335,7 +345,7 @@ class BumpTensors(DeformationField):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> Self:
-        """An untrained field with the columns that `config` describes."""
+        """Create an untrained field with the column layout of `config`."""
         start, end = config["time_window_s"]
         field = cls(gaussians.count, (start, end), bumps=config["bumps"])
         field._columns = replace(
@@ -344,7 +354,9 @@ class BumpTensors(DeformationField):
         return field
 
     def detached_copy(self) -> Self:
-        """See `DeformationField.detached_copy`: the Gaussians and bumps in use, those in the order of their times, and no ring."""
+        """Return a copy of the Gaussians and bumps in use, in chronological order and
+        without ring.
+        """
         return self._copy_of(self.count)
 
     def _copy_of(self, rows: int) -> Self:
@@ -416,7 +428,7 @@ class BumpTensors(DeformationField):
         return self._moments
 
     def _whole_parameters(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Centres, log-widths and weights with their spare rows and columns."""
+        """Return centres, log-widths and weights including spare rows and columns."""
         return self.centers, self.log_widths, self.weights
 
     def _tensors_and_fill(self) -> Iterator[tuple[Tensor, float]]:
@@ -426,7 +438,7 @@ class BumpTensors(DeformationField):
             yield from ((moment, 0.0) for moment in (*self._moments.first, *self._moments.second, self._moments.steps))
 
     def _set_parameters(self, centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
-        """New parameters of other sizes; an optimiser that holds the old ones must be given the new ones."""
+        """Replace the parameters; optimisers that hold the old ones become invalid."""
         requires_grad = self.weights.requires_grad
         for name, values in (("centers", centers), ("log_widths", log_widths), ("weights", weights)):
             setattr(self, name, torch.nn.Parameter(values.contiguous(), requires_grad))

@@ -54,7 +54,7 @@ class Continuation(torch.nn.Module):
         self.horizon_s = 0.0
         """Duration of the extrapolation in seconds; afterwards the deltas stay constant."""
         self._written = 0
-        """Rows that may differ from zero."""
+        """Number of rows that may be non-zero."""
 
     def write(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """Extrapolate with `velocity` from `from_s` on.
@@ -82,11 +82,13 @@ class Continuation(torch.nn.Module):
         self.from_s, self.horizon_s = from_s, horizon_s
 
     def set_clock(self, tau: Callable[[float], float], seconds_per_tau: float) -> None:
-        """Store the moments in the field's own time, `tau(time_s)`, for captured graphs."""
+        """Store start and horizon in the field's normalised time `tau(time_s)`, for captured
+        graphs.
+        """
         store_scalars_(self.clock, [tau(self.from_s), self.horizon_s / seconds_per_tau, seconds_per_tau])
 
     def stop(self) -> None:
-        """Add nothing from now on."""
+        """Disable the extrapolation."""
         self.velocity[: self._written].zero_()
         self._written, self.from_s, self.horizon_s = 0, math.inf, 0.0
         store_scalars_(self.clock, [torch.finfo(torch.float32).max, 0.0, 0.0])
@@ -116,7 +118,7 @@ class Continuation(torch.nn.Module):
         return at
 
     def of_first(self, count: int) -> Continuation:
-        """A copy for the first `count` Gaussians."""
+        """Return a copy for the first `count` Gaussians."""
         copied = Continuation(count, self.velocity.device)
         if math.isfinite(self.from_s):
             copied.write(self.velocity[:count], self.from_s, self.horizon_s)
@@ -148,7 +150,7 @@ def displaced(gaussians: Gaussians, deltas: Tensor) -> Gaussians:
 
 
 WINDOW_S = ListOf(NumberIn(-1e10, 1e10), 2, 2)
-"""Range of the ends of a field's time window, in seconds: times since 1970 are in it."""
+"""Range of the bounds of a field's time window in seconds; includes Unix timestamps."""
 
 
 class DeformationField(torch.nn.Module):
@@ -164,9 +166,9 @@ class DeformationField(torch.nn.Module):
     """
 
     kind: ClassVar[str] = ""
-    """The name in the registry, in reports and in a bundle's manifest."""
+    """Name in the registry, in reports and in a bundle's manifest."""
     slot_type: ClassVar[type[Any] | None] = None
-    """The `FieldSlot` for `slot`, made from a field and a number of rows. None: every snapshot of such a field gets memory of its own."""
+    """`FieldSlot` class for `slot`; None if every snapshot of the field needs separate memory."""
 
     continues: ClassVar[bool] = False
     """True if the field applies its `continuation`."""
@@ -210,7 +212,7 @@ class DeformationField(torch.nn.Module):
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in all tensors that a `detached_copy` has."""
+        """Number of parameters in a `detached_copy`."""
         return sum(tensor.numel() for tensor in self.state_dict().values())
 
     @property
@@ -230,7 +232,7 @@ class DeformationField(torch.nn.Module):
         return min(max(float(time_s), start), end)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`, in the same raw parametrisation; differentiable in the field and the Gaussians."""
+        """Deform Gaussians to `time_s`; differentiable in the field and the Gaussians."""
         raise NotImplementedError
 
     def deltas(self, time_s: float) -> Tensor:
@@ -263,7 +265,11 @@ class DeformationField(torch.nn.Module):
         return False
 
     def frame_time(self, time_s: float) -> float:
-        """`time_s` as `frame_deltas` counts it. Raises InvalidInput as that does."""
+        """Convert `time_s` to the argument of `frame_deltas`.
+
+        Raises:
+            InvalidInput: unless the kind of field overrides this method.
+        """
         raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph; use cached")
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
@@ -289,20 +295,22 @@ class DeformationField(torch.nn.Module):
         return {"kind": self.kind, "time_window_s": list(self._time_window_s)}
 
     def detached_copy(self) -> Self:
-        """A copy for publishing: own memory, no gradients, no state of training."""
+        """Return a copy for publishing: separate memory, no gradients, no training state."""
         copied = copy.deepcopy(self, {id(state): None for state in self._training_state()})
         return copied.requires_grad_(False)
 
     def slot(self, rows: int) -> FieldSlot | None:
-        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses; see `slot_type`."""
+        """Return a reusable copy for `rows` Gaussians at fixed addresses; see `slot_type`."""
         made: FieldSlot | None = None if self.slot_type is None else self.slot_type(self, rows)
         return made
 
     def check_state(self) -> None:
-        """InvalidInput when loaded tensors, finite and of the right shapes, still make no field."""
+        """Raise InvalidInput if loaded finite tensors of the right shapes do not form a valid
+        field.
+        """
 
     def _training_state(self) -> Sequence[object]:
-        """Attributes that belong to training and become None in a `detached_copy`."""
+        """Attributes of the training state, set to None in a `detached_copy`."""
         return ()
 
     def extend(self, time_window_s: tuple[float, float]) -> None:
@@ -310,17 +318,26 @@ class DeformationField(torch.nn.Module):
         self._time_window_s = checked_window(time_window_s)
 
     def cover(self, time_s: float, newest_s: float) -> None:
-        """Extend the window so that it has `time_s` in it, online, where the end is not known.
+        """Extend the window to include `time_s`, for live sessions without a known end.
 
-        Here it becomes twice as long as it has to be, so that it is extended seldom. `newest_s` is the time of the newest frame so far.
+        This implementation doubles the required length, so that extensions are rare.
+
+        Args:
+            time_s: time to include, in seconds.
+            newest_s: time of the newest frame so far, in seconds.
         """
         start, end = self._time_window_s
         if time_s > end:
             self.extend((start, start + 2 * (time_s - start)))
 
     def move_to(self, time_s: float, deltas: Tensor) -> bool:
-        """Let the field add `deltas` (as `deltas(time_s)` gives them) at `time_s`, and change other times as little as it can. False, with
-        nothing changed, for a field that cannot do that: here."""
+        """Change the field so that its deltas at `time_s` are `deltas`, with little change at other
+        times.
+
+        Returns:
+            False, with nothing changed, if the kind of field does not support this, as in this base
+                class.
+        """
         return False
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
@@ -397,9 +414,13 @@ class DeformationField(torch.nn.Module):
         """
 
     def share_motion(self, neighbours: Tensor, amount: float) -> None:
-        """Move the motion of each Gaussian `amount` (0..1) of the way to the mean of its `neighbours` [N, K], at all times.
+        """Smooth the motion of each Gaussian with its `neighbours` [N, K] at all times.
 
-        In place, outside of any optimiser. Here no Gaussian has a motion of its own.
+        Runs in place and outside of any optimiser. A no-op for fields without per-Gaussian motion.
+
+        Args:
+            neighbours: int64 [N, K].
+            amount: weight 0..1 of the neighbours' mean.
         """
 
     def reserve(self, rows: int) -> bool:
@@ -411,16 +432,25 @@ class DeformationField(torch.nn.Module):
         return self.count is None
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Let Gaussians leave: the rows in use stay the first ones."""
+        """Remove per-Gaussian state by applying row moves."""
         self.select(moves.order)
 
     def restart(self, time_s: float, count: int) -> bool:
-        """Become the untrained field of `count` Gaussians and a stream that starts at `time_s`, in place; False where that cannot be."""
+        """Reset in place to an untrained field of `count` Gaussians for a stream starting at
+        `time_s`.
+
+        Returns:
+            False if the field does not support this.
+        """
         return False
 
 
 def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:
-    """The window as two finite floats in order; InvalidInput otherwise. Start and end may coincide (one frame)."""
+    """Return the window as two ordered finite floats; they may be equal (one frame).
+
+    Raises:
+        InvalidInput: for other windows.
+    """
     start, end = (float(t) for t in time_window_s)
     if not (math.isfinite(start) and math.isfinite(end) and start <= end):
         raise InvalidInput(f"time_window_s must be two finite times in order, got {time_window_s}")
@@ -455,21 +485,25 @@ class FieldSlot(Protocol):
 
     @property
     def field(self) -> DeformationField:
-        """The copy, for as many Gaussians as the slot has rows; only its times and the values of its tensors change."""
+        """Copy with as many Gaussians as the slot has rows; only times and tensor values change."""
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in all tensors of the field as it was written last."""
+        """Number of parameters of the field last written."""
 
     def overwrite(self, source: DeformationField) -> bool:
-        """Take over the state of `source`, queued on the current stream; False, with nothing changed, where it does not fit."""
+        """Enqueue a copy of `source` on the current stream.
+
+        Returns:
+            False, with nothing changed, if `source` does not fit.
+        """
 
     def exact_copy(self) -> DeformationField:
-        """The field as it was written last, of its own size and in memory of its own."""
+        """Return the field last written, at its own size and in separate memory."""
 
 
 def copy_each(to: list[Tensor], values: list[Tensor]) -> None:
-    """Copy every tensor into the one at its place: one call, and as few launches as torch can make of it."""
+    """Copy each tensor to its counterpart with as few launches as possible."""
     torch._foreach_copy_(to, values, non_blocking=True)
 
 
@@ -490,7 +524,7 @@ class WholeFieldSlot:
         return True
 
     def exact_copy(self) -> DeformationField:
-        """Another copy."""
+        """Return a separate copy."""
         return self.field.detached_copy()
 
 
@@ -508,7 +542,7 @@ class NewestState(DeformationField):
         self.continuation = continuation
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`."""
+        """Return the newest state plus the extrapolation at `time_s`."""
         assert self.continuation is not None
         added = self.continuation.added(self.clamp_time(time_s), gaussians.count)
         if added is None:
@@ -531,11 +565,11 @@ class FieldRates:
         check_rates(vars(self))
 
     def scaled(self, mm_per_px: float, scale: float = 1.0) -> dict[str, float]:
-        """Every rate by name, times `scale`; those in pixels become rates in the scene's unit of length."""
+        """Return the rates by name times `scale`; pixel rates are converted to scene units."""
         return {name: (rate * mm_per_px if name.endswith("_px") else rate) * scale for name, rate in vars(self).items()}
 
     def rate_of(self, parameter: str) -> str:
-        """The name of the rate with which autograd training updates this parameter, one of `Module.named_parameters()`."""
+        """Return the name of the rate for a parameter from `Module.named_parameters()`."""
         raise NotImplementedError(f"{type(self).__name__} does not say which rate {parameter} has")
 
 
@@ -564,13 +598,16 @@ class NewField:
     """Request of the reconstruction for a new field."""
 
     gaussians: Gaussians
-    """The canonical Gaussians, on the device that will train."""
+    """Canonical Gaussians on the training device."""
     start_s: float
-    """The first frame's time."""
+    """Time of the first frame in seconds."""
     end_s: float | None
-    """The last frame's time; None online, where it is not known and `DeformationField.cover` follows the frames."""
+    """Time of the last frame in seconds.
+
+    None in a live session, where `DeformationField.cover` extends the field.
+    """
     spacing_s: float
-    """The shortest time, in seconds, within which motion has to change its course."""
+    """Shortest time in seconds within which motion must be able to change its course."""
     history_s: float | None = None
     """Length of the past, in seconds, that stays deformable in a live session; None for
     all of it.
@@ -586,7 +623,7 @@ class FieldTraining(Protocol):
     """Training of a field: `deform`, then `update` with the gradient at the deformed Gaussians."""
 
     def deform(self, gaussians: Gaussians, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`, outside of any autograd graph."""
+        """Return the Gaussians at `time_s` without autograd."""
 
     def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
         """Take one optimiser step of the field.
@@ -644,7 +681,7 @@ class CapturedTraining(Protocol):
         """
 
     def add_colours(self, change: Tensor, time: Tensor) -> None:
-        """See `DeformationField.add_colours`: at the time in the device scalar `time`."""
+        """Change colours at the device scalar `time`; see `DeformationField.add_colours`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -657,12 +694,14 @@ class FieldKind(Generic[Field]):
     field: type[Field]
     """Class of the field. `field.kind` is the name in the registry, in reports and in manifests."""
     new: Callable[[NewField], Field] | None = None
-    """Makes an untrained field, which is the identity, for a reconstruction; None: `field.for_gaussians` without an architecture.
-    torch's random numbers are seeded when it is called."""
+    """Factory of an untrained identity field; None selects `field.for_gaussians` with defaults.
+
+    The caller seeds torch's random numbers before the call.
+    """
     config: Mapping[str, ValueRange] = dataclasses.field(default_factory=dict)
     """Permitted range of each `DeformationField.config` value other than kind and time window."""
     rates: FieldRates = dataclasses.field(default_factory=OneRate)
-    """The default learning rates; others must be of the same type."""
+    """Default learning rates; user settings must have the same type."""
     training: Callable[[Field], FieldTraining] | None = None
     """Factory of the trainer; None trains by autograd through `forward`."""
     captured_training: Callable[[Field], CapturedTraining | None] | None = None
@@ -670,20 +709,21 @@ class FieldKind(Generic[Field]):
 
     @property
     def name(self) -> str:
-        """The name in reports and manifests."""
+        """Name in reports and manifests."""
         return self.field.kind
 
     def checked_config(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The values of a configuration that may come from anyone; others than this kind knows are dropped.
+        """Validate the values of an untrusted configuration, dropping unknown ones.
 
-        Raises InvalidInput for one that is missing or not in its range.
+        Raises:
+            InvalidInput: if a value is missing or out of range.
         """
         start, end = WINDOW_S.checked("time_window_s", values.get("time_window_s"))
         config = {name: wanted.checked(name, values.get(name)) for name, wanted in self.config.items()}
         return {"kind": self.name, "time_window_s": checked_window((start, end)), **config}
 
     def made_for(self, wanted: NewField) -> Field:
-        """An untrained field for a reconstruction."""
+        """Create an untrained field for a reconstruction."""
         if self.new is not None:
             return self.new(wanted)
         return self.field.for_gaussians(wanted.gaussians, wanted.time_window_s)

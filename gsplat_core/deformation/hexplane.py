@@ -1,7 +1,8 @@
-"""HexPlane with an MLP: six feature planes over space and time, and a small network that turns features into motion.
+"""HexPlane deformation field: six feature planes over space and time, decoded by an MLP.
 
-Planes after HexPlane (Cao and Johnson 2023, eq. 3), used for Gaussians as in 4D Gaussian Splatting (Wu et al. 2024, section 4.2) and in G-SHARP: product
-over the six planes, concatenation over the levels, a trunk, and heads for position, log-scale, rotation and opacity.
+Planes follow HexPlane (Cao and Johnson 2023, eq. 3), used for Gaussians as in 4D Gaussian Splatting
+(Wu et al. 2024, section 4.2) and in G-SHARP. Features are the product over the six planes,
+concatenated over the levels. A trunk and heads predict position, log-scale, rotation and opacity.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from gsplat_core.value_ranges import IntegerIn, ListOf
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
 SPACE_PLANES, TIME_PLANES = PLANE_NAMES[:3], PLANE_NAMES[3:]
 BOX_MARGIN = 0.05
-"""Share of the box's longest side added on every side, so that Gaussians can move a little and stay inside."""
+"""Margin on every side as a share of the box's longest side, so that Gaussians can move inside."""
 
 
 def box_around(means: Tensor) -> Tensor:
@@ -67,7 +68,7 @@ def box_around(means: Tensor) -> Tensor:
 
 
 def _along_a_curve(coordinates: Tensor) -> Tensor:
-    """int32 [N]: the points in the order of a Morton curve, so that those side by side read the same memory."""
+    """Return the order of points along a Morton curve, int32 [N], for coherent memory access."""
     code = torch.zeros(coordinates.shape[0], dtype=torch.int64, device=coordinates.device)
     cells = ((coordinates[:, :3].nan_to_num() + 1) * 511.5).clamp(0, 1023).long()
     for bit in range(10):
@@ -77,12 +78,14 @@ def _along_a_curve(coordinates: Tensor) -> Tensor:
 
 
 class HexPlaneField(DeformationField):
-    """Six planes per level, `channels` features each; a trunk of `depth` layers of `width`; one linear head of 11 channels.
+    """HexPlane field with six planes per level, a trunk MLP and one linear head of 11 channels.
 
-    `resolution` is the grid of (x, y, z, t) at level 1; a level m multiplies x, y and z by m, as in 4D Gaussian Splatting.
-    Planes are stored channels-last [V, U, C]. Space planes start uniform in 0.1..0.5, time planes at 1, and the head at
-    zero, so an untrained field is the identity. `box` [2, 3] is the corner-to-corner range of the canonical positions; it is
-    set from the Gaussians when the field is made. Positions outside it are clamped to its surface.
+    `resolution` is the grid of (x, y, z, t) at level 1. Level m multiplies x, y and z by m, as in
+    4D Gaussian Splatting. Each plane has `channels` features, stored channels-last [V, U, C]. The
+    trunk has `depth` layers of `width`. Space planes start uniformly in 0.1..0.5, time planes at 1,
+    and the head at zero, so an untrained field is the identity. `box` [2, 3] bounds the canonical
+    positions. It is computed from the Gaussians when the field is created. Positions outside are
+    clamped to it.
     """
 
     kind = "hexplane"
@@ -126,7 +129,7 @@ class HexPlaneField(DeformationField):
         return cls(gaussians, time_window_s, **architecture)
 
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
-        """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
+        """Normalise positions and time to [N, 4] in [-1, 1], clamped to the box and window."""
         low, high = self.box.to(means.dtype)
         space = (2 * (means - low) / (high - low) - 1).clamp(-1, 1)
         return torch.cat([space, torch.full_like(space[:, :1], self.frame_time(time_s))], dim=1)
@@ -147,11 +150,13 @@ class HexPlaneField(DeformationField):
         return 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
 
     def features(self, means: Tensor, time_s: float) -> Tensor:
-        """[N, levels * channels]: product over the planes, levels side by side."""
+        """Return the features [N, levels * channels]: products over the planes, levels
+        concatenated.
+        """
         return torch.cat(self._features(self.coordinates(means, time_s)), dim=1)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`; outside the window the state of its nearest end."""
+        """Deform Gaussians to `time_s`, clamped to the window."""
         coordinates = self.coordinates(gaussians.means, time_s)
         # The torch implementation keeps the intermediates that autograd needs.
         ops = plain_torch if torch.is_grad_enabled() else self._ops
@@ -160,8 +165,11 @@ class HexPlaneField(DeformationField):
         )
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
-        """Factorised inference: the product of the space planes is kept per Gaussian, and at a new time the time planes
-        are interpolated into lines once, then sampled and multiplied. Exact up to rounding."""
+        """Return a factorised inference function; exact up to rounding.
+
+        The product of the space planes is kept per Gaussian. For each new time, the time planes are
+        interpolated to lines, sampled and multiplied.
+        """
         gaussians = gaussians.detach()
         if self.box.device.type == "cuda" and self._ops is compiled:
             deltas = self.frame_deltas(gaussians)
@@ -245,21 +253,21 @@ class HexPlaneField(DeformationField):
         self._time_window_s = (start, end)
 
     def smooth_in_time(self, amount: float) -> None:
-        """See `DeformationField.smooth_in_time`: the rows of the time planes."""
+        """Smooth the rows of the time planes; see `DeformationField.smooth_in_time`."""
         for plane in self._named(TIME_PLANES):
             towards_neighbours_(plane.data.transpose(0, 1), amount)
 
     def plane_tensors(self) -> list[Tensor]:
-        """The planes' memory, outside of autograd: xy, xz, yz, xt, yt, zt of every level."""
+        """Return the planes without autograd: xy, xz, yz, xt, yt, zt of every level."""
         return [plane.data for plane in self._named(PLANE_NAMES)]
 
     def network_tensors(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Weights and biases of the trunk and the head, layer by layer, outside of autograd."""
+        """Return weights and biases of trunk and head layer by layer, without autograd."""
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
 
     def config(self) -> dict[str, Any]:
-        """Kind, window and architecture; the box is stored with the tensors."""
+        """Return kind, window and architecture; the box is stored with the tensors."""
         return {
             "kind": self.kind,
             "time_window_s": list(self.time_window_s),
@@ -271,7 +279,7 @@ class HexPlaneField(DeformationField):
         }
 
     def check_state(self) -> None:
-        """InvalidInput when the box is not one: its lower corner must be below its upper one."""
+        """Raise InvalidInput unless the lower corner of the box is below the upper one."""
         if not bool((self.box[1] > self.box[0]).all()):
             raise InvalidInput(
                 f"the field's box must have its lower corner before its upper one, got {self.box.tolist()}"
@@ -293,11 +301,11 @@ class HexPlaneField(DeformationField):
         return [plane for level in self._levels(names) for plane in level]
 
     def _levels(self, names: Sequence[str]) -> list[list[Tensor]]:
-        """The planes of these names, level by level."""
+        """Return the planes of these names, grouped by level."""
         return [[cast(torch.nn.ParameterDict, planes)[name] for name in names] for planes in self.planes]
 
     def _lines(self, planes: Sequence[Tensor], time_s: float) -> list[Tensor]:
-        """The time planes of one level interpolated at `time_s`: three lines [U, C]."""
+        """Interpolate the time planes of one level at `time_s` to three lines [U, C]."""
         rows = self.resolution[3]
         t = torch.tensor(
             self.frame_time(time_s), dtype=self.box.dtype
@@ -310,7 +318,7 @@ class HexPlaneField(DeformationField):
         return [self._ops.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)]
 
     def _network(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Weights and biases of the trunk and the head, layer by layer."""
+        """Weights and biases of trunk and head, layer by layer."""
         layers = [cast(torch.nn.Linear, layer) for layer in (*self.trunk, self.head)]
         return [layer.weight for layer in layers], [layer.bias for layer in layers]
 
@@ -327,20 +335,24 @@ class HexPlaneField(DeformationField):
 
 
 class HexPlaneTraining:
-    """Deltas, gradients and Adam of one field: `deltas`, then `update` with their gradient, and again.
+    """Trainer of a HexPlane field with fused gradients and Adam.
 
-    Both only queue work on the current stream and read time, rates and step from device memory, so a CUDA graph can hold a step and be
-    replayed with others. Parameters and moments change in place. The same inputs give the same bits.
+    Each step calls `deltas`, then `update` with their gradient. Both enqueue work on the current
+    stream and read time, rates and step from device memory, so a CUDA graph can capture a step and
+    replay it with other values. Parameters and moments change in place. Equal inputs give
+    bit-identical results.
 
     Args:
-        field: float32 on a CUDA device. Its tensors are taken now: where they are replaced by others, another `HexPlaneTraining` is due.
+        field: float32 field on a CUDA device. Its tensors are captured here; if they are replaced,
+            create a new trainer.
 
     Raises:
-        InvalidInput: the field is elsewhere, or its sizes are not those that the kernels take; train it with autograd then.
+        InvalidInput: if the field is on another device or the kernels do not support its sizes.
+            Train with autograd then.
     """
 
     rates = 2
-    """Learning rates that `update` takes: of the planes, of the network."""
+    """Number of learning rates of `update`: planes and network."""
     reads_positions = True
     """The deltas depend on the Gaussians' positions; `update` adds that part of their gradient."""
 
@@ -389,7 +401,10 @@ class HexPlaneTraining:
         return self._state.deltas
 
     def gradient(self, v_raw: Tensor) -> FieldGradient:
-        """The field's gradient for dL/d(deltas) `v_raw` [N, 16] of the last `deltas`; adds the part of the positions to it in place."""
+        """Return the field's gradient for dL/d(deltas) `v_raw` [N, 16] of the last `deltas` call.
+
+        The gradient through the positions is added to `v_raw` in place.
+        """
         if self._state is None:
             raise InvalidInput("there are no deltas to go back from; call deltas first")
         layers = self._weights, self._biases
@@ -415,13 +430,13 @@ class HexPlaneTraining:
         self._state = None
 
     def add_colours(self, change: Tensor, time: Tensor) -> None:
-        """A HexPlane takes no colours at one time: raises InvalidInput."""
+        """Raise InvalidInput, because a HexPlane does not support colour changes at one time."""
         raise InvalidInput("the colours of a hexplane field cannot be set at one time; train them")
 
 
 @dataclass(frozen=True)
 class HexPlaneLearningRates(FieldRates):
-    """Rates of the feature planes and of the network."""
+    """Learning rates of the feature planes and of the network."""
 
     planes: float = 2e-2
     network: float = 5e-3
@@ -431,7 +446,7 @@ class HexPlaneLearningRates(FieldRates):
 
 
 ROWS_PER_SPACING = 1
-"""Time rows of the planes, where the recording's end is known, for each of `NewField.spacing_s`: between rows they are linear."""
+"""Time rows per `NewField.spacing_s` for recordings with a known end; interpolated linearly."""
 MOST_ROWS = 1 << 10
 
 

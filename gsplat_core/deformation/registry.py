@@ -1,4 +1,4 @@
-"""The kinds of deformation field, by name. Another one is a module with a `FieldKind`, and a line here."""
+"""Registry of deformation fields. A new kind is a module with a `FieldKind` and an entry here."""
 
 from __future__ import annotations
 
@@ -36,20 +36,25 @@ def kind_of(name: object) -> FieldKind[Any]:
 def new_field(
     kind: str, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any
 ) -> DeformationField:
-    """An untrained field (the identity) of the default architecture for these Gaussians, or of another one.
+    """Create an untrained identity field for these Gaussians.
 
     Args:
-        kind: a name in `FIELDS`; another one raises InvalidSetting.
-        architecture: values of `DeformationField.config` that replace the default ones (`bumps=9`).
+        kind: name in `FIELDS`.
+        architecture: values of `DeformationField.config` that replace the defaults (`bumps=9`).
+
+    Raises:
+        InvalidSetting: if the kind is unknown.
     """
     made: DeformationField = FIELDS[kind].field.for_gaussians(gaussians, time_window_s, **architecture)
     return made
 
 
 def field_from_config(config: Mapping[str, Any], gaussians: Gaussians) -> DeformationField:
-    """An untrained field of the configuration that `DeformationField.config` returned.
+    """Create an untrained field from the result of `DeformationField.config`.
 
-    Raises InvalidSetting for an unknown kind, InvalidInput for a value that is not in its range.
+    Raises:
+        InvalidSetting: if the kind is unknown.
+        InvalidInput: if a value is out of range.
     """
     kind = kind_of(config.get("kind"))
     rebuilt: DeformationField = kind.field.from_config(kind.checked_config(config), gaussians)

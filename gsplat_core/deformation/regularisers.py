@@ -11,7 +11,7 @@ from gsplat_core.ops.basis_field.plain_torch import basis_field
 from gsplat_core.threads import one_thread
 
 ROWS_AT_ONCE = 1 << 14
-"""Bounds the memory for differences."""
+"""Number of rows processed at once, to bound memory."""
 BEND = 0.05
 """Weight of the penalty on bending between bumps, relative to the squared error at one time.
 
@@ -20,9 +20,10 @@ Suppresses the noise of per-frame measurements.
 
 
 def towards_neighbours_(values: Tensor, amount: float) -> None:
-    """Move each of `values` [N, T, ...] `amount` of the way to the mean of its two neighbours along T, in place; both ends stay.
+    """Diffuse `values` [N, T, ...] along T in place: move each towards its neighbours' mean.
 
-    For amounts up to 1: explicit diffusion, one step of descent on the squared differences of neighbours.
+    Both ends are fixed. For amounts up to 1 this is one explicit diffusion step, a descent step on
+    the squared differences of neighbours.
     """
     if values.shape[1] < 3:
         return
@@ -31,7 +32,10 @@ def towards_neighbours_(values: Tensor, amount: float) -> None:
 
 
 def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
-    """Move each of `values` [N, ...] `amount` of the way to the mean of the `others` [N, K] of its row, in place, all at once."""
+    """Move each of `values` [N, ...] towards the mean of its `others` [N, K], in place.
+
+    All rows are updated simultaneously.
+    """
     if others.shape[1] == 0:
         return
     before = values.contiguous()
@@ -43,8 +47,11 @@ def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
 
 @one_thread()
 def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:
-    """The matrix [B, T], float64, that makes weights of bumps in a row, of width 1 at 0, 1, ..., of values at `taus`: the nearest course that does not bend
-    too much."""
+    """Return the matrix [B, T], float64, that maps values at `taus` to bump weights.
+
+    The bumps have width 1 and centres 0, 1, .... The fit is least squares with a penalty on
+    bending.
+    """
     row = torch.arange(bumps, dtype=torch.float64)[None], torch.zeros(1, bumps, dtype=torch.float64)
     each = torch.eye(bumps, dtype=torch.float64)[None]
     heights = torch.stack([basis_field(*row, each, tau)[0] for tau in taus]) if taus else each.new_zeros(0, bumps)

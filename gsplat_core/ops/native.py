@@ -20,7 +20,8 @@ INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 def load_native() -> None:
     """Register the compiled ops under `torch.ops.gsplat_core`.
 
-    Raises NativeLibraryMissing when the library was not built, or was built for another torch or machine.
+    Raises:
+        NativeLibraryMissing: if the library was not built, or for another torch version or machine.
     """
     if not LIBRARY_PATH.exists():
         raise NativeLibraryMissing(
@@ -56,12 +57,12 @@ def load_cuda() -> str | None:
 
 
 def instruction_set() -> str:
-    """The vector instruction set that the compiled core uses on this machine."""
+    """Return the vector instruction set used by the compiled core on this machine."""
     return INSTRUCTION_SETS[torch.ops.gsplat_core.active_isa()]
 
 
 def cuda_build() -> str:
-    """Compiler and compute capabilities of the CUDA kernels that were loaded: `nvcc 13.0 for 8.0, 9.0`."""
+    """Return compiler and compute capabilities of the CUDA kernels: `nvcc 13.0 for 8.0, 9.0`."""
     build = ctypes.CDLL(str(CUDA_LIBRARY_PATH)).gsplat_core_cuda_build
     build.restype = ctypes.c_char_p
     version, _, architectures = build().decode().partition(";")
@@ -69,7 +70,7 @@ def cuda_build() -> str:
 
 
 def cuda_refusal(device: int = 0) -> str | None:
-    """Why the CUDA kernels that were loaded cannot run on a GPU, as CUDA puts it; None when they can. Starts CUDA there."""
+    """Return CUDA's reason why the kernels cannot run on a GPU, or None. Initialises CUDA."""
     refusal = ctypes.CDLL(str(CUDA_LIBRARY_PATH)).gsplat_core_cuda_refusal
     refusal.restype = ctypes.c_char_p
     with torch.cuda.device(device):

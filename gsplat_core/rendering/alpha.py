@@ -1,4 +1,4 @@
-"""Alpha blending front to back (Kerbl et al. 2023, section 4) as a `Renderer`: on the CPU and on NVIDIA GPUs."""
+"""Alpha-blending `Renderer` for CPU and NVIDIA GPUs (Kerbl et al. 2023, section 4)."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class AlphaRenderer:
 
 @dataclass(frozen=True)
 class _FrameInFlight:
-    """A launched frame. It holds the model, so that a slot is not overwritten while the frame may have to be rendered again."""
+    """Launched frame; keeps the model alive so that its slot is not reused before completion."""
 
     _model: Model | Snapshot
     _launched: LaunchedFrame

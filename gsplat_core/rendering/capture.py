@@ -1,4 +1,4 @@
-"""A sequence of kernel launches, captured once as a CUDA graph and replayed as one launch."""
+"""Capture of a sequence of kernel launches as a CUDA graph, replayed as one launch."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import torch
 Result = TypeVar("Result")
 
 _CAPTURING = threading.Lock()
-"""Held while a graph is captured: threads may launch and allocate meanwhile, but two captures never overlap."""
+"""Lock held during a capture. Other threads may launch and allocate, but captures never overlap."""
 
 
 class GraphMemory:
-    """A memory pool for the captured graphs of one owner.
+    """Memory pool for the captured graphs of one owner.
 
-    When a graph is captured to replace another one that is no longer used, it takes over the same memory.
+    A graph that replaces an unused one takes over its memory.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -27,7 +27,7 @@ class GraphMemory:
 
     @property
     def pool(self) -> Any:
-        """torch's handle of the pool."""
+        """Return torch's handle of the pool."""
         return self._keeper.pool()
 
 
@@ -51,7 +51,7 @@ class CapturedSequence(Generic[Result]):
         self.results = _capture(self._graph, sequence, device, memory.pool)
 
     def replay(self) -> Result:
-        """Launch the graph on the current stream; returns at once."""
+        """Launch the graph on the current stream without waiting."""
         self._graph.replay()
         return self.results
 

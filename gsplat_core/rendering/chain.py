@@ -33,11 +33,11 @@ class StepOperations:
 
 
 class Geometry(NamedTuple):
-    """Gaussians without their colours, and the cameras; shapes as in `rasterization`."""
+    """Gaussians without colours, and cameras; shapes as in `rasterization`."""
 
     means: Tensor
     covars: Tensor | None
-    """Upper triangles [..., N, 6], or None with the next two given."""
+    """Upper triangles [..., N, 6]; None if the next two are given."""
     quats: Tensor | None
     scales: Tensor | None
     opacities: Tensor
@@ -52,13 +52,13 @@ class RenderedSplats(NamedTuple):
     """
 
     image: Tensor
-    """[..., C, H, W, channels]: colours, then the sum of weight and z where depth is rendered."""
+    """[..., C, H, W, channels]: colours, then the sum of weight times z if depth is rendered."""
     alphas: Tensor
     rows: DenseProjection | PackedProjection
     channels: Tensor
     """Blended values, [rows, channels]."""
     opacities: Tensor
-    """[rows], with the compensation for antialiasing."""
+    """Opacities [rows] including the antialiasing compensation."""
     tiles_per_gauss: Tensor
     flatten_ids: Tensor
     isect_offsets: Tensor
@@ -67,7 +67,7 @@ class RenderedSplats(NamedTuple):
 
 
 Coloring = Callable[[DenseProjection], tuple[Tensor, DenseProjection]]
-"""Colours [..., C, N, D] of projected Gaussians, and the projection without those that are culled for their colour."""
+"""Function that returns colours [..., C, N, D] and the projection without Gaussians it culls."""
 
 
 def render_splats(
@@ -77,7 +77,10 @@ def render_splats(
     backgrounds: Tensor | None,
     settings: RenderSettings,
 ) -> RenderedSplats:
-    """Project, colour, list by tile and blend; without `coloring` the depth is rendered alone. Shapes have been checked."""
+    """Project, colour, bin into tiles and blend; shapes must have been checked.
+
+    Without `coloring` only depth is rendered.
+    """
     means, covars, quats, scales, opacities, viewmats, Ks = geometry
     max_alpha, compensation_floor = CONSTANTS[settings.constants]
     batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
@@ -124,7 +127,9 @@ def render_splats(
 
 
 def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, tiles_of_image: int) -> Tensor:
-    """gsplat's key of every entry of the tiles' lists, int64: image | tile | the 32 bits of the depth as float32."""
+    """Return gsplat's int64 key of each tile-list entry: image | tile | 32 bits of
+    float32 depth.
+    """
     starts, length = isect_offsets.reshape(-1), flatten_ids.shape[0]
     counts = torch.diff(starts, append=starts.new_full((1,), length))
     tiles = torch.arange(len(starts), device=starts.device)

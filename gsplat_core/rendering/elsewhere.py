@@ -50,7 +50,7 @@ class Look:
 
 
 class SeenFromElsewhere:
-    """Colours of one model for cameras that are not where the scope was."""
+    """Predictor of a model's colours for cameras away from the scope."""
 
     def __init__(self, model: Model, path: ScopePath) -> None:
         self._model, self._path = model, path
@@ -79,7 +79,7 @@ class SeenFromElsewhere:
 
     @property
     def skill(self) -> float:
-        """See `Sheen`."""
+        """Explained share of colour variance; see `Sheen`."""
         return self._sheen.skill
 
     def at(self, camera: Camera, time_s: float) -> Gaussians:
@@ -124,7 +124,7 @@ def _host(tensor: torch.Tensor) -> NDArray[np.float64]:
 
 
 def _projected(camera: Camera, points: Array) -> tuple[Array, Array]:
-    """Pixels [N, 2] and depth [N] of points [N, 3]; pixels mean nothing where the depth is not positive."""
+    """Project points [N, 3] to pixels [N, 2] and depth [N]; pixels are valid for positive depth."""
     local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     z = local[:, 2]
     pixels = local[:, :2] / np.where(z > 0, z, 1.0)[:, None] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]

@@ -1,4 +1,7 @@
-"""Whole frames on an NVIDIA GPU as one CUDA graph, without a wait of the host: deform, project, list by tile, sort and blend."""
+"""Rendering of whole frames on an NVIDIA GPU as one CUDA graph without host synchronisation.
+
+The graph deforms, projects, bins, sorts and blends.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,10 @@ from gsplat_core.scene.gaussians import Gaussians
 
 
 class FrameControls:
-    """The inputs that change from frame to frame, in one piece of device memory that a captured graph reads: pose, intrinsics, the field's
-    time, and for a training step its learning rates."""
+    """Per-frame inputs of a captured graph in one device buffer.
+
+    These are pose, intrinsics, the field's time and, for training, the learning rates.
+    """
 
     def __init__(self, device: torch.device, rates: int = 0) -> None:
         self._values = torch.zeros(26 + rates, device=device)
@@ -33,22 +38,23 @@ class FrameControls:
         self.rates = self._values[26:]
 
     def set(self, camera: Camera, time: float, rates: Sequence[float] = ()) -> None:
-        """Queue the new values: one launch that carries them as arguments, so that no host memory must stay unchanged."""
+        """Enqueue new values as arguments of one launch, so no host memory must stay unchanged."""
         values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time, *rates]
         store_scalars_(self._values, values)
 
 
 @dataclass(frozen=True)
 class LaunchedFrame:
-    """A frame that was launched. `result` gives its picture; where its tile lists overflowed, it is rendered again with longer ones."""
+    """Launched frame; `result` renders it again with more capacity if its tile lists overflowed."""
 
     _renderer: FrameRenderer
     _number: int
 
     def result(self) -> RenderOutput:
-        """Waits for the frame. The tensors are the renderer's own and are overwritten by its next `render`.
+        """Wait for the frame and return its outputs, which the next `render` overwrites.
 
-        Raises InvalidInput when another frame was rendered since.
+        Raises:
+            InvalidInput: if another frame has been rendered since.
         """
         return self._renderer._finish(self._number)
 
@@ -76,12 +82,15 @@ class FrameRenderer:
         precision: Precision = "fp32",
         recompute: bool = False,
     ) -> None:
-        """`camera` gives size and camera model of every frame, and the pose of those rendered without one.
+        """Create a renderer and capture its graph.
 
-        With `precision` "fp16" the harmonics are kept, the field deforms and splats are blended in half precision: a near-exact picture
-        (`benchmarks/notes/renderer.md` has its PSNR to the exact one) in less time.
+        With precision "fp16", SH coefficients, field and blending use half precision. The picture
+        is nearly exact (PSNR in `benchmarks/notes/renderer.md`) and faster. `camera` determines
+        size and camera model of every frame, and the pose of those rendered without a camera.
 
-        Raises InvalidInput when the Gaussians are not float32 on a CUDA device, or the precision is another one.
+        Raises:
+            InvalidInput: if the Gaussians are not float32 on a CUDA device, or the precision is
+                unknown.
         """
         if precision not in get_args(Precision):
             raise InvalidInput(f"unknown precision {precision!r}; choose {' or '.join(get_args(Precision))}")
@@ -110,7 +119,7 @@ class FrameRenderer:
         self._captured_capacity = self.capacity
 
     def render(self, camera: Camera | None = None, time_s: float = 0.0) -> LaunchedFrame:
-        """Queue the picture of `camera` at `time_s` on the current stream."""
+        """Enqueue the picture of `camera` at `time_s` on the current stream."""
         camera = camera or self._camera
         check_camera(self._camera, camera)
         self._number += 1

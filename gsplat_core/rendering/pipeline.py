@@ -1,4 +1,4 @@
-"""`rasterization` with gsplat's arguments and results, for any implementation of the operations it is built from."""
+"""`rasterization` with gsplat's arguments and results, for any implementation of its operations."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ Meta = dict[str, Any]
 
 @dataclass(frozen=True)
 class Operations(StepOperations):
-    """`rasterization` built from one implementation of the steps."""
+    """`rasterization` on top of one implementation of the pipeline's operations."""
 
     in_one_call: Callable[[Arguments, RenderSettings], Rasterized | None] | None = None
-    """Renders in one native call, or returns None for arguments that it does not take."""
+    """Renders in one native call; returns None for unsupported arguments."""
 
     def rasterization(
         self,

@@ -34,7 +34,7 @@ step_by_step = Operations(
     rasterize_to_pixels=rasterize_to_pixels,
     zero_gradients_stay_zero=True,
 )
-"""The chain of compiled operations, on any device they run on."""
+"""Chain of compiled operations, on any supported device."""
 _operations = replace(step_by_step, in_one_call=rasterize_in_one_call)
 _PARAMETERS = inspect.signature(_operations.rasterization).parameters
 _POSITIONAL = [name for name, each in _PARAMETERS.items() if each.kind is each.POSITIONAL_OR_KEYWORD]
@@ -74,9 +74,9 @@ def _check_names(positional: int, named: Collection[str]) -> None:
 
 
 INSTANCES_PER_GAUSSIAN = 8
-"""Capacity of the frame path's tile lists, per Gaussian. A frame with more instances is rendered again with a larger one."""
+"""Initial capacity of the tile lists per Gaussian; larger frames are rendered again."""
 SMALLEST_SCENE = 1 << 14
-"""The capacity is at least that of so many Gaussians, because a handful of large ones touches every tile."""
+"""Minimum number of Gaussians for the capacity, because few large ones may touch every tile."""
 
 
 class RenderOutput(NamedTuple):
@@ -87,15 +87,20 @@ class RenderOutput(NamedTuple):
     alpha: Tensor
     """Opacity [H, W]."""
     depth: Tensor
-    """Expected z [H, W] in the scene's unit: the mean over the splats, weighted by their contribution; 0 where alpha is 0."""
+    """Expected z [H, W] in the scene's unit, weighted by contribution; 0 where alpha is 0."""
 
 
 def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, depth: bool = True) -> RenderOutput:
-    """Render the Gaussians from one camera, in front of `background` [3] (black when None).
+    """Render the Gaussians from one camera (Kerbl et al. 2023).
 
-    `depth=False` saves the depth channel, and `RenderOutput.depth` is then 0 (unknown) everywhere.
+    Float32 Gaussians on CUDA without gradients use the fused frame path (`render_frame`), which
+    needs fewer launches.
 
-    Float32 Gaussians on CUDA of which no gradient is wanted take the frame path (`render_frame`), which needs fewer launches.
+    Args:
+        gaussians: scene.
+        camera: camera of the picture.
+        background: colour [3]; None for black.
+        depth: False skips the depth channel; `RenderOutput.depth` is then 0 (unknown).
     """
     if background is not None:
         require_shape("background", background, (3,), "[3]")

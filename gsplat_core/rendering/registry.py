@@ -1,4 +1,4 @@
-"""Renderers by name."""
+"""Registry of renderers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from gsplat_core.rendering.renderer import Precision, Renderer, RendererKind, ch
 from gsplat_core.scene.cameras import Camera
 
 RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.rendering.alpha:AlphaRenderer"})
-"""Alpha blending front to back (Kerbl et al. 2023). To add another: CONTRIBUTING.md, "A renderer"."""
+"""Renderers by name; "alpha" is alpha blending (Kerbl et al. 2023).
+
+CONTRIBUTING.md, "A renderer", describes how to add one.
+"""
 
 
 def check_renderer(name: str, device: torch.device | str = "cpu", precision: str = "fp32") -> None:
@@ -30,9 +33,10 @@ def new_renderer(
     precision: Precision = "fp32",
     background: Tensor | None = None,
 ) -> Renderer:
-    """The renderer called `name` for pictures of the camera's size and projection.
+    """Create a renderer by name for the camera's size and projection.
 
-    Raises InvalidSetting for an unknown name and for a device or precision that the renderer does not have.
+    Raises:
+        InvalidSetting: for an unknown name, or an unsupported device or precision.
     """
     check_renderer(name, device, precision)
     check_background(background)

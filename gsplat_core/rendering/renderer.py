@@ -26,9 +26,12 @@ class Capabilities:
     """Features of a renderer, available before it is created."""
 
     outputs: tuple[str, ...]
-    """Names of the outputs, `image` among them. Those of `RenderOutput` have its shapes and units; a renderer documents its others."""
+    """Names of the outputs, including `image`.
+
+    Those of `RenderOutput` have its shapes and units. A renderer documents its other outputs.
+    """
     precisions: Mapping[str, tuple[Precision, ...]]
-    """The devices (`cpu`, `cuda`) on which it runs, each with its precisions, the exact one first."""
+    """Supported device types (`cpu`, `cuda`) with their precisions, the most exact one first."""
     differentiable: bool
     """True if the outputs have gradients with respect to the model's tensors."""
     deterministic: bool
@@ -38,7 +41,7 @@ class Capabilities:
 
     @property
     def devices(self) -> tuple[str, ...]:
-        """The types of device on which it runs."""
+        """Supported device types."""
         return tuple(self.precisions)
 
 
@@ -55,13 +58,15 @@ class PendingFrame(Protocol):
         """
 
     def result(self) -> RenderOutput:
-        """The three standard outputs; one that was not asked for is 0 everywhere (unknown)."""
+        """Return the three standard outputs; outputs that were not requested are 0 (unknown)."""
 
 
 class Renderer(Protocol):
-    """Renders published models from cameras of one size and projection on one device.
+    """Interface of renderers for published models, with one camera size and projection per
+    instance.
 
-    Made by `new_renderer`. `prepare` once for every published model, then `render` as often as wanted. One thread at a time may use it.
+    Create with `new_renderer`. Call `prepare` for every published model, then `render` any number
+    of times. Not thread-safe.
     """
 
     capabilities: ClassVar[Capabilities]
@@ -85,10 +90,16 @@ class Renderer(Protocol):
         """
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
-        """Queue the picture of the prepared model at `time_s`, clamped to the model's time window, on the current stream.
+        """Enqueue the picture of the prepared model on the current stream.
 
-        Raises InvalidSetting for an output that the renderer does not have, InvalidInput for a camera of another size or projection and
-        when no model was prepared.
+        Args:
+            camera: camera with the size and projection given at construction.
+            time_s: time in seconds, clamped to the model's window.
+            outputs: names of the requested outputs.
+
+        Raises:
+            InvalidSetting: if the renderer does not have an output.
+            InvalidInput: for a camera of another size or projection, or without a prepared model.
         """
 
 
@@ -97,17 +108,17 @@ class RendererKind(Protocol):
 
     @property
     def capabilities(self) -> Capabilities:
-        """Known before a renderer is made."""
+        """Features, available before a renderer is created."""
 
     def __call__(
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
     ) -> Renderer:
-        """A renderer; the arguments have been checked against `capabilities`."""
+        """Create a renderer; the caller has checked the arguments against `capabilities`."""
 
 
 @dataclass(frozen=True)
 class FinishedFrame:
-    """A `PendingFrame` of a renderer that has nothing to wait for."""
+    """`PendingFrame` that is complete on creation."""
 
     _outputs: Mapping[str, Tensor]
 
@@ -128,7 +139,11 @@ def standard_outputs(outputs: Mapping[str, Tensor]) -> RenderOutput:
 
 
 def checked_outputs(name: str, asked: Iterable[str], capabilities: Capabilities) -> tuple[str, ...]:
-    """The asked outputs and `image`, in the renderer's order. Raises InvalidSetting for one that renderer `name` does not have."""
+    """Return `image` and the requested outputs in the renderer's order.
+
+    Raises:
+        InvalidSetting: if the renderer does not have an output.
+    """
     wanted = {"image", *asked}
     for output in sorted(wanted - set(capabilities.outputs)):
         raise InvalidSetting(f"renderer {name!r} has no output {output!r}; it has {', '.join(capabilities.outputs)}")
@@ -136,7 +151,7 @@ def checked_outputs(name: str, asked: Iterable[str], capabilities: Capabilities)
 
 
 def check_choice(name: str, capabilities: Capabilities, device: torch.device, precision: str) -> None:
-    """Raises InvalidSetting where renderer `name` does not run on the device or not in the precision."""
+    """Raise InvalidSetting if the renderer does not support the device or precision."""
     if precision not in get_args(Precision):
         raise InvalidSetting(f"unknown precision {precision!r}; choose {' or '.join(get_args(Precision))}")
     if device.type not in capabilities.precisions:
@@ -151,7 +166,7 @@ def check_choice(name: str, capabilities: Capabilities, device: torch.device, pr
 
 
 def check_camera(wanted: Camera, camera: Camera) -> None:
-    """Raises InvalidInput where `camera` has another size or projection than the one the renderer was made for."""
+    """Raise InvalidInput if `camera` has another size or projection than the renderer."""
     made_for, given = ((c.width_px, c.height_px, c.model) for c in (wanted, camera))
     if given != made_for:
         raise InvalidInput(
@@ -161,6 +176,6 @@ def check_camera(wanted: Camera, camera: Camera) -> None:
 
 
 def check_background(background: Tensor | None) -> None:
-    """Raises InvalidInput where the background is not one colour."""
+    """Raise InvalidInput unless the background is one colour."""
     if background is not None:
         require_shape("background", background, (3,), "[3]")

@@ -1,4 +1,4 @@
-"""The arguments of `rasterization`: its tensors, its options, and which of gsplat's are refused."""
+"""Arguments of `rasterization`: tensors, options, and unsupported options of gsplat."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GsplatVersion = Literal["1.6", "1.5.3"]
 _RENDER_MODES, _RASTERIZE_MODES = get_args(RenderMode), get_args(RasterizeMode)
 
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
-"""Default range of z that is rendered, in the scene's unit."""
+"""Default range of rendered z in the scene's unit."""
 EPS2D = 0.3
 """Default blur, pixels² added to the diagonal of a splat's covariance."""
 MOST_SIDE_PX = 1 << 16
@@ -29,17 +29,19 @@ class Constants(NamedTuple):
     """Constants that differ between gsplat versions."""
 
     max_alpha: float
-    """The most opaque that a splat can be at a pixel."""
+    """Upper limit of a splat's alpha at a pixel."""
     compensation_floor: float
-    """The least that antialiasing scales an opacity by; there it has no gradient. gsplat 1.5.3 has one at 0, but Gaussians with
-    less than 1/255 are culled before."""
+    """Lower limit of the antialiasing compensation, without gradient where active.
+
+    gsplat 1.5.3 has a gradient at 0, but there Gaussians below 1/255 are culled before.
+    """
 
 
 CONSTANTS: dict[GsplatVersion, Constants] = {"1.6": Constants(0.99, 0.005), "1.5.3": Constants(0.999, 0.0)}
 
 
 class Arguments(NamedTuple):
-    """The tensors that `rasterization` was given, unchecked."""
+    """Unchecked tensors passed to `rasterization`."""
 
     means: Tensor
     quats: Tensor | None
@@ -118,7 +120,7 @@ class RenderSettings:
 
     @property
     def tile_grid(self) -> tuple[int, int]:
-        """Tiles across and down."""
+        """Number of tiles per row and per column."""
         return -(-self.width // self.tile_size), -(-self.height // self.tile_size)
 
     @property
@@ -128,7 +130,9 @@ class RenderSettings:
 
 
 def check_tensors(arguments: Arguments) -> None:
-    """Raise InvalidInput for an argument of `rasterization` that is missing or is no floating-point tensor, and for a shape that ends wrongly."""
+    """Raise InvalidInput for a missing, non-floating or wrongly shaped argument of
+    `rasterization`.
+    """
     by_covars = arguments.covars is not None
     for name, value in arguments._asdict().items():
         if value is None:
@@ -156,9 +160,9 @@ def _shown(value: object) -> str:
 
 
 def refuse_unsupported(**arguments: Any) -> None:
-    """Raise NotImplementedError for the first argument that asks for something: it is neither None nor False.
+    """Raise NotImplementedError for the first argument that is neither None nor False.
 
-    A rolling shutter named GLOBAL is gsplat's way of saying none.
+    A rolling shutter named GLOBAL means none in gsplat.
     """
     for name, value in arguments.items():
         if value is None or value is False or getattr(value, "name", None) == "GLOBAL":

@@ -15,24 +15,31 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 
 LOBES = ((1.0, 0.06), (1.5, 0.15))
-"""Variances, and over how much of the direction (a sine) colours stay alike: of glints, and of the broad sheen."""
+"""Prior variances and length scales (sine of the angle) of glints and of the broad sheen."""
 SLOW, SLOW_S = 0.5, 0.6
 """Variance and correlation time in seconds of the slow component: shadows and drifting points."""
 NOISE = 0.3
 UNKNOWN = 1e4
-"""The variance of noise where a point was not seen."""
+"""Noise variance at times at which a point was not visible."""
 CONSTANT = 10.0
 """Prior variance of a point's mean colour around the mean of the observations."""
 ROWS_AT_ONCE = 4096
-"""Bounds the memory for covariances."""
+"""Number of points processed at once, to bound memory."""
 
 
 class Sheen:
-    """Learned from N points at T times."""
+    """Colour model learned from N points at T times."""
 
     def __init__(self, halves: Array, colours: Array, seen: NDArray[np.bool_], times_s: Array, weights: Array) -> None:
-        """halves [N, T, 2] and colours [N, T, 3] at `times_s` [T]; only where `seen` [N, T] they count. weights [N]: of the points, in the
-        skill."""
+        """Fit the model.
+
+        Args:
+            halves: half-way directions [N, T, 2].
+            colours: observed colours [N, T, 3].
+            seen: validity of the observations, bool [N, T].
+            times_s: times [T] in seconds.
+            weights: weight [N] of each point in the skill.
+        """
         self._halves = halves.astype(np.float32)
         weight = seen[..., None] / np.maximum(seen.sum(axis=1), 1)[:, None, None]
         off = (colours - (weight * colours).sum(axis=1, keepdims=True)) * seen[..., None]
@@ -64,7 +71,7 @@ class Sheen:
         return np.asarray(np.einsum("nt,ntc->nc", alike, self._strengths))
 
     def _covariance(self, halves: Array, seen: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """[n, T, T]."""
+        """Return the covariance of each point's observations [n, T, T]."""
         noise = np.where(seen, NOISE, UNKNOWN)[:, None] * np.eye(seen.shape[1])
         return np.asarray(_alike(halves[:, :, None] - halves[:, None]) + self._slow + noise, np.float64)
 
@@ -76,7 +83,14 @@ def _alike(apart: Array) -> Array:
 
 
 def half_directions(tangents: Array, points: Array, light: Array, eye: Array) -> Array:
-    """The direction half-way between those to the light [3] and to the eye [3], from points [N, 3], along their tangents [N, 2, 3]: [N, 2]."""
+    """Return the half-way directions between light and eye in the points' tangents, [N, 2].
+
+    Args:
+        tangents: unit tangents [N, 2, 3].
+        points: positions [N, 3].
+        light: position of the light [3].
+        eye: position of the eye [3].
+    """
     half = _unit(_unit(light - points) + _unit(eye - points))
     return np.asarray(np.einsum("nij,nj->ni", tangents, half))
 

@@ -1,4 +1,4 @@
-"""`rasterization()` in one native call per pass, for the inputs that it takes on CUDA."""
+"""`rasterization()` in one native call per pass, for supported inputs on CUDA."""
 
 from __future__ import annotations
 

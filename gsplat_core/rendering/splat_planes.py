@@ -1,7 +1,8 @@
-"""Each splat as a small piece of surface: which way it faces, and how far away it is along the ray through a pixel.
+"""Splats as planar surface elements with a normal and a depth along each ray.
 
-The depth of a Gaussian is not that of its centre. Along the ray through a pixel its density is highest at the conditional mean of z there,
-which is affine in the pixel to first order (Zhang et al. 2024, "RaDe-GS", section 3): z(u) = z_centre + slope · (u - u_centre).
+The density of a Gaussian along a ray is highest at the conditional mean of z, not at its centre's
+z. To first order this is affine in the pixel (Zhang et al. 2024, "RaDe-GS", section 3): z(u) =
+z_centre + slope · (u - u_centre).
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
 LEAST_VARIANCE = 0.01
-"""Added to a splat's extent in the picture, in pixels², before depth is continued along it: a needle that points at the camera has no plane. The
-blur of the picture (`EPS2D`) is no part of the surface: with it, tilted ones came out several times as far off."""
+"""Variance in pixels² added to a splat's extent before its depth is extrapolated.
+
+A needle pointing at the camera has no defined plane. The picture's blur (`EPS2D`) is not used here,
+because it biases the depth of tilted surfaces.
+"""
 
 
 class SplatPlanes(NamedTuple):
@@ -33,28 +37,30 @@ class SplatPlanes(NamedTuple):
     opacities: Tensor
     """[N]."""
     slopes: Tensor
-    """[N, 2]: by how much z changes along a splat for each pixel to the right and down."""
+    """Change of z along a splat per pixel to the right and down, [N, 2]."""
     variances: Tensor
     """Variance [N] of z along the ray, due to the thickness of the Gaussian."""
     normals: Tensor
-    """[N, 3] in the camera's axes, of unit length, towards the camera: the Gaussian's shortest axis."""
+    """Unit normals [N, 3] in camera axes, towards the camera: the Gaussian's shortest axis."""
 
     def depths_at_origin(self) -> Tensor:
-        """[N]: z of each splat's plane at pixel coordinates (0, 0), so that z(u) = this + slopes · u."""
+        """z [N] of each splat's plane at pixel coordinates (0, 0), so that z(u) = this + slopes ·
+        u.
+        """
         return self.rows.depths - (self.slopes * self.rows.means2d).sum(-1)
 
 
 class TileLists(NamedTuple):
-    """The splats of every tile in depth order."""
+    """Splats of every tile in depth order."""
 
     ids: Tensor
     """int32 [M]."""
     starts: Tensor
-    """int32 [tile_height, tile_width]: where each tile's list begins."""
+    """Start of each tile's list, int32 [tile_height, tile_width]."""
 
 
 def splat_planes(gaussians: Gaussians, camera: Camera) -> SplatPlanes:
-    """The Gaussians as pieces of surface, as `camera` sees them."""
+    """Convert Gaussians to surface elements seen by `camera`."""
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     scales, opacities = gaussians.scales, gaussians.opacities
     projected = fully_fused_projection(
@@ -77,7 +83,10 @@ def splat_planes(gaussians: Gaussians, camera: Camera) -> SplatPlanes:
 
 
 def _conditional(covariance: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
-    """Slopes [N, 2] and variance [N] of z where the pixel is given, of Gaussians with such covariances [N, 3, 3] in the camera's axes."""
+    """Return slopes [N, 2] and variance [N] of z conditional on the pixel.
+
+    The inputs are covariances [N, 3, 3] in camera axes and projection Jacobians.
+    """
     pixels = jacobian @ covariance @ jacobian.transpose(1, 2)
     with_z = (jacobian @ covariance[:, :, 2:])[..., 0]
     xx, xy, yy = pixels[:, 0, 0] + LEAST_VARIANCE, pixels[:, 0, 1], pixels[:, 1, 1] + LEAST_VARIANCE
@@ -88,7 +97,9 @@ def _conditional(covariance: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _jacobian(local: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
-    """Derivative [N, 2, 3] of pixel coordinates by the place in the camera, at the splats' centres."""
+    """Return the derivative [N, 2, 3] of pixel by camera-space coordinates at the
+    splats' centres.
+    """
     fx, fy = intrinsics[0, 0].expand(len(local)), intrinsics[1, 1].expand(len(local))
     x, y, z = local.unbind(-1)
     zero = torch.zeros_like(x)
@@ -101,7 +112,7 @@ def _jacobian(local: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
 
 
 def _facing(quats: Tensor, scales: Tensor, rotation: Tensor, local: Tensor, camera: Camera) -> Tensor:
-    """The shortest axes in the camera's axes [N, 3], towards the camera."""
+    """Return the shortest principal axes in camera axes [N, 3], towards the camera."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     axes = torch.stack(
         [

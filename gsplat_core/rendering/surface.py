@@ -1,4 +1,4 @@
-"""The surface that a camera sees: how far it is along each ray, which way it faces, and how sure that is."""
+"""Surface seen by a camera: depth along each ray, normal, and confidence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
 COVERED = 0.1
-"""Opacity from which on a pixel shows something; below it nothing was observed."""
+"""Minimum opacity of an observed pixel."""
 HALVED_AFTER_S = 5.0
 """Time in seconds after which the confidence in unseen tissue is 1/2; it is 1/3 after
 twice that.
@@ -31,19 +31,19 @@ class Surface(NamedTuple):
     alpha: Tensor
     """Opacity [H, W]."""
     ray_depth: Tensor
-    """Expected z [H, W] where the ray meets the splats, weighted by their contribution; 0 where nothing was observed."""
+    """Expected z [H, W] at the rays' intersections with the splats; 0 where unobserved."""
     normals: Tensor
-    """[H, W, 3], of unit length and towards the camera: the splats' shortest axes, blended; 0 where nothing was observed."""
+    """Unit normals [H, W, 3] towards the camera: blended shortest axes; 0 where unobserved."""
     median_depth: Tensor
-    """z [H, W] of the splat with which half of the light is blocked; 0 where never half of it is."""
+    """z [H, W] of the splat at which transmittance falls below 1/2; 0 if it never does."""
     spread: Tensor
-    """Standard deviation of z along the ray [H, W]: the error that the model itself shows. It does not know by how much all of it is off."""
+    """Standard deviation of z along the ray [H, W]. Does not include a systematic error."""
     confidence: Tensor
     """Confidence [H, W], 0 to 1: opacity, reduced where tissue has not been seen (`certainty`)."""
 
     @property
     def observed(self) -> Tensor:
-        """bool [H, W]: whether anything was ever seen there."""
+        """Mask [H, W] of pixels with an observed surface."""
         return self.alpha >= COVERED
 
 
@@ -87,7 +87,9 @@ def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None 
 
 
 def _blended(planes: SplatPlanes, lists: TileLists, camera: Camera, certain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Sums over the splats [H, W, 6 or 7]: depth at the picture's corner, slopes, normals, certainty; and the opacity [H, W]."""
+    """Blend per-splat values [H, W, 6 or 7] (depth plane, normal, certainty) and the opacity [H,
+    W].
+    """
     columns = [planes.depths_at_origin()[:, None], planes.slopes, planes.normals]
     if certain is not None:
         columns.append(certain.to(planes.opacities.dtype)[:, None])

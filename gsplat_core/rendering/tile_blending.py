@@ -18,35 +18,35 @@ from gsplat_core.rendering.splat_planes import SplatPlanes, TileLists
 from gsplat_core.scene.cameras import Camera
 
 TRANSMITTANCE_STOP = 1e-4
-"""A splat that would leave less ends the ray."""
+"""Minimum transmittance; blending ends before the splat that would go below it."""
 
 
 class AlongRays(NamedTuple):
     """Depth statistics of each pixel's ray [H, W]; 0 where no splat is hit."""
 
     median: Tensor
-    """z of the splat with which half of the light is blocked; 0 where never half of it is."""
+    """z of the splat at which transmittance falls below 1/2; 0 if it never does."""
     spread: Tensor
-    """Standard deviation of z along the ray: between the splats, and within each one's thickness."""
+    """Standard deviation of z along the ray, across splats and within their thickness."""
 
 
 class TileOfRays(NamedTuple):
-    """The rays of one tile's P pixels, and the L splats of its list in their order."""
+    """P rays of one tile, and the L splats of its list in order."""
 
     rows: slice
     columns: slice
     splats: Tensor
-    """Numbers [L]."""
+    """Splat indices [L]."""
     weights: Tensor
-    """[P, L]: the share that each splat has of each pixel."""
+    """Blending weight of each splat in each pixel, [P, L]."""
     through: Tensor
     """Transmittance [P, L] behind each splat."""
     depths: Tensor
-    """[P, L]: z of each splat where the ray meets it."""
+    """z of each splat at its intersection with the ray, [P, L]."""
 
 
 def along_rays(planes: SplatPlanes, lists: TileLists, camera: Camera) -> AlongRays:
-    """Median depth and spread of every pixel."""
+    """Compute median depth and spread of every pixel."""
     made = planes.opacities.new_zeros(2, camera.height_px, camera.width_px)
     for tile in tiles_of_rays(planes, lists, camera):
         shape = (tile.rows.stop - tile.rows.start, tile.columns.stop - tile.columns.start)
@@ -64,7 +64,7 @@ def along_rays(planes: SplatPlanes, lists: TileLists, camera: Camera) -> AlongRa
 
 
 def tiles_of_rays(planes: SplatPlanes, lists: TileLists, camera: Camera) -> Iterator[TileOfRays]:
-    """The tiles that have splats. The blended part of each list is the picture's: same limits, same order."""
+    """Yield the non-empty tiles, with the same limits and order of blending as the picture."""
     columns = torch.cat([planes.rows.means2d, planes.rows.conics, planes.opacities[:, None], planes.slopes], 1)
     columns = torch.cat([columns, planes.depths_at_origin()[:, None]], 1)
     starts = [*lists.starts.flatten().tolist(), len(lists.ids)]

@@ -23,21 +23,21 @@ from gsplat_core.ops.frame.frame import (
 )
 
 CAPACITY_STEP = 1 << 16
-"""The capacity of one buffer for all lists is a multiple of this many instances."""
+"""Granularity in instances of the capacity of a shared buffer."""
 TILE_STEP = 32
-"""The capacity of each tile's own buffer is a multiple of this many instances."""
+"""Granularity in instances of the capacity of each tile's buffer."""
 HEADROOM = 1.25
 """Capacity relative to a frame's need, so that a moving scene seldom exceeds it."""
 
 
 def capacity_for(needed: int) -> int:
-    """The capacity to allocate for all lists together after a frame that needed `needed` instances."""
+    """Return the shared capacity to allocate after a frame that needed `needed` instances."""
     return max(1, math.ceil(needed * HEADROOM / CAPACITY_STEP)) * CAPACITY_STEP
 
 
 @dataclass(frozen=True)
 class TileListCapacity:
-    """The capacity of one buffer for all tile lists, or of a segment for each tile."""
+    """Capacity of a buffer shared by all tile lists, or of each tile's own segment."""
 
     capacity: int
     per_tile: bool
@@ -65,7 +65,7 @@ class TileListCapacity:
 
     @staticmethod
     def initial(gaussians: int, width_px: int, height_px: int) -> TileListCapacity:
-        """Before any frame was seen: for four tiles a Gaussian, and tiles with twice the mean."""
+        """Return the initial capacity: four tiles per Gaussian, and twice the mean in a tile."""
         tiles = math.ceil(width_px / TILE_SIZE) * math.ceil(height_px / TILE_SIZE)
         return TileListCapacity.for_frame(4 * gaussians, math.ceil(8 * gaussians / tiles))
 
@@ -81,9 +81,10 @@ class FrameNeeds(NamedTuple):
 
 
 class FrameStatusCopy:
-    """The status of the last frame on its way to the host.
+    """Asynchronous copy of the last frame's status to the host.
 
-    Queue the copy with `queue` (also inside a CUDA graph), call `launched` after the launch that contains it, then `wait`.
+    Enqueue the copy with `queue` (also inside a CUDA graph), call `launched` after the launch that
+    contains it, then `wait`.
     """
 
     def __init__(self) -> None:
@@ -95,15 +96,15 @@ class FrameStatusCopy:
         self._arrived.synchronize()
 
     def queue(self, status: Tensor) -> None:
-        """Queue the copy of a frame's `status` on the current stream."""
+        """Enqueue the copy of a frame's `status` on the current stream."""
         self._values.copy_(status, non_blocking=True)
 
     def launched(self, device: torch.device) -> None:
-        """`wait` shall wait for everything that is queued on the current stream of `device` by now."""
+        """Record the point on the current stream of `device` that `wait` waits for."""
         self._arrived.record(torch.cuda.current_stream(device))
 
     def wait(self) -> FrameNeeds:
-        """Wait until the copy has arrived, and return it."""
+        """Wait for the copy and return it."""
         self._arrived.synchronize()
         values = self._values.tolist()
         return FrameNeeds(values[STATUS_NEEDED], values[STATUS_LONGEST], values[STATUS_OVERFLOW])

@@ -1,4 +1,4 @@
-"""The colours that cameras see, and the Gaussians that are culled for theirs."""
+"""View-dependent colours, with culling of Gaussians with non-finite colours."""
 
 from __future__ import annotations
 

@@ -31,14 +31,16 @@ def _matrix(value: ArrayLike, size: int, name: str) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """An immutable camera in OpenCV axes (x right, y down, z forward).
+    """Immutable camera in OpenCV axes (x right, y down, z forward).
 
-    A pixel (column i, row j) has its centre at (i + 0.5, j + 0.5). The models map a camera-space point (x, y, z) to:
-    pinhole (fx x/z + cx, fy y/z + cy); fisheye (equidistant) (fx θ x/r + cx, fy θ y/r + cy) with r = |(x, y)| and
-    θ = atan2(r, z); ortho (fx x + cx, fy y + cy), where fx and fy are pixels per unit of length.
+    The centre of pixel (column i, row j) is (i + 0.5, j + 0.5). The models map a camera-space point
+    (x, y, z) as follows. pinhole: (fx x/z + cx, fy y/z + cy). fisheye (equidistant): (fx θ x/r +
+    cx, fy θ y/r + cy) with r = |(x, y)| and θ = atan2(r, z). ortho: (fx x + cx, fy y + cy), where
+    fx and fy are pixels per unit of length.
 
-    Raises InvalidInput for a wrong shape, a value that is not finite, a focal length or size that is not positive,
-    a pose whose last row is not (0, 0, 0, 1), or an unknown model.
+    Raises:
+        InvalidInput: for a wrong shape, a non-finite value, a focal length or size that is not
+            positive, a pose with a last row other than (0, 0, 0, 1), or an unknown model.
     """
 
     K: NDArray[np.float64]
@@ -105,7 +107,7 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """The camera's centre in the world [3]."""
+        """Camera centre in the world [3]."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return np.asarray(-np.linalg.solve(rotation, translation))
 
@@ -127,10 +129,16 @@ class Camera:
         return replace(self, world_to_camera=np.asarray(world_to_camera, dtype=np.float64))
 
     def right_eye(self, baseline: float) -> Camera:
-        """The right eye's camera of a rectified pair of which this is the left one: same intrinsics, and a pose that leads from this camera's
-        coordinates to its own (`Frame.right_camera`).
+        """Return the right eye's camera of a rectified pair in which this is the left camera.
 
-        baseline: distance between the eyes in the scene's unit. Raises InvalidInput unless it is positive.
+        The intrinsics are equal. The pose maps left-camera coordinates to its own
+        (`Frame.right_camera`).
+
+        Args:
+            baseline: distance between the eyes in the scene's unit.
+
+        Raises:
+            InvalidInput: if `baseline` is not positive.
         """
         if not 0 < baseline < float("inf"):
             raise InvalidInput(f"camera: the distance between the eyes must be positive, got {baseline}")

@@ -21,7 +21,9 @@ class FrameStatus(Enum):
     REPLAY = "replay"
     STALE = "stale"
     DAMAGED = "damaged"
-    """Some of it may be the decoder's guess: it is shown, and neither trained on nor scored."""
+    """Parts may be the decoder's guess. The frame is displayed, but neither trained on
+    nor scored.
+    """
 
 
 class DepthOrigin(Enum):
@@ -30,9 +32,9 @@ class DepthOrigin(Enum):
     MEASURED = "measured"
     """Depth sensor, or depth supplied with the recording."""
     STEREO = "stereo"
-    """Matched between the two eyes: metric where the baseline is."""
+    """Stereo matching between the two eyes; metric if the baseline is known."""
     PARALLAX = "parallax"
-    """Matched between times at which the scope was elsewhere: in the unit of its poses."""
+    """Matching across times with different scope poses, in the unit of the poses."""
     LIGHT = "light"
     """Estimated from brightness under the scope's own light: relative, never metric."""
     LEARNED = "learned"
@@ -44,7 +46,7 @@ class Frame:
     """One frame; operators replace it by copies with further fields and never modify it."""
 
     seq: int
-    """Number in the stream, from 0; it increases from frame to frame, and numbers may be missing where frames were lost."""
+    """Sequence number in the stream, from 0. Increases strictly; lost frames leave gaps."""
     pts_ns: int
     """Presentation time in nanoseconds of the recording's clock."""
     image: NDArray[np.uint8]
@@ -58,7 +60,7 @@ class Frame:
     depth: NDArray[np.float32] | None = None
     """z in millimetres [H, W]; 0 = unknown."""
     depth_confidence: NDArray[np.float32] | None = None
-    """[H, W], 0 to 1: how far each pixel's depth is to be believed. None: all of it that is known."""
+    """Confidence of each pixel's depth [H, W], 0 to 1; None for full confidence."""
     depth_origin: DepthOrigin | None = None
     """Origin of `depth`; None without depth."""
     mask: NDArray[np.uint8] | None = None
@@ -71,7 +73,10 @@ class Frame:
     arrived_ns: int | None = None
     """Arrival time of a live frame in nanoseconds of `time.monotonic_ns`; None if not live."""
     loss_mask: NDArray[np.uint8] | None = None
-    """[H, W]; 0 = left out of the loss though it may be tissue: outside of the field of view, a recorder's strip. None: nothing is left out."""
+    """uint8 [H, W]; 0 excludes a pixel from the loss although it may be tissue.
+
+    Used outside the field of view and for a recorder's overlay. None excludes nothing.
+    """
     rehearsal_mask: NDArray[np.uint8] | None = None
     """uint8 [H, W]; 0 excludes a pixel from the rehearsal loss but not from display.
 
@@ -80,7 +85,9 @@ class Frame:
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
     withheld: str | None = None
-    """Why the frame is kept from training, in a word or two ("blur", "out of body"); None: it may be trained on."""
+    """Reason for withholding the frame from training ("blur", "out of body"); None to
+    train on it.
+    """
     new_scene: str | None = None
     """Reason for a scene change at this frame ("cut", "resized"); None if the scene continues."""
     scene: int = 0
@@ -142,5 +149,5 @@ class Frame:
         return int(self.image.shape[1])
 
     def with_fields(self, **fields: Any) -> Frame:
-        """A copy with more fields known."""
+        """Return a copy with some fields replaced."""
         return replace(self, **fields)

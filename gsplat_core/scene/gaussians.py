@@ -1,4 +1,4 @@
-"""The scene: a set of 3D Gaussians in the raw parametrisation that is optimised."""
+"""Set of 3D Gaussians in the raw parametrisation that is optimised."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ SH_C0 = 0.28209479177387814
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians (Kerbl et al. 2023, section 4), all tensors of one dtype on one device.
+    """N Gaussians (Kerbl et al. 2023, section 4); all tensors have one dtype and device.
 
-    Raises InvalidInput when a shape, the dtypes or the devices do not fit together.
+    Raises:
+        InvalidInput: if shapes, dtypes or devices are inconsistent.
     """
 
     means: Tensor
@@ -28,7 +29,7 @@ class Gaussians:
     quats: Tensor
     """Rotations [N, 4] as wxyz; need not be of unit length."""
     log_scales: Tensor
-    """Natural logarithm of the standard deviations along the own axes [N, 3]."""
+    """Natural logarithms of the standard deviations along the principal axes [N, 3]."""
     logit_opacities: Tensor
     """Logit of the opacities [N]."""
     sh: Tensor
@@ -106,7 +107,7 @@ class Gaussians:
 
     @property
     def left_tensors(self) -> tuple[Tensor, ...]:
-        """The five tensors that a picture is rendered from, in the order of the fields."""
+        """Tensors from which a picture is rendered: all five except `right_sh`, in field order."""
         return self.means, self.quats, self.log_scales, self.logit_opacities, self.sh
 
     def seen_by_right(self) -> Gaussians:
@@ -120,7 +121,7 @@ class Gaussians:
         return replace(self, right_sh=torch.zeros_like(self.sh) if wanted else None)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """The Gaussians with `function` applied to each of the tensors."""
+        """Return the Gaussians with `function` applied to each tensor."""
         return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> Gaussians:
@@ -128,21 +129,21 @@ class Gaussians:
         return self.map(Tensor.detach)
 
     def clone(self) -> Gaussians:
-        """A copy with its own memory (still in the autograd graph; `detach().clone()` leaves it)."""
+        """Return a copy in separate memory, still attached to the autograd graph."""
         return self.map(Tensor.clone)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        """The Gaussians on another device or in another floating-point dtype."""
+        """Return the Gaussians on another device or in another floating dtype."""
         return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def requires_grad_(self, requires_grad: bool = True) -> Gaussians:
-        """Mark the tensors as leaves to differentiate; returns self."""
+        """Enable gradients of the tensors; returns self."""
         for tensor in self.tensors().values():
             tensor.requires_grad_(requires_grad)
         return self
 
     def select(self, index: Tensor | slice) -> Gaussians:
-        """The Gaussians that a mask [N], a tensor of indices or a slice picks, in that order."""
+        """Select Gaussians by mask [N], index tensor or slice."""
         return self.map(lambda tensor: tensor[index])
 
     def append(self, other: Gaussians) -> Gaussians:

@@ -32,4 +32,4 @@ BASIS_CHANNELS = width_of(*BASIS_GROUPS)
 HEAD_GROUPS = (POSITION, LOG_SCALE, ROTATION, OPACITY)
 """Output order of the HexPlane field's network, with log-scales before rotation as in G-SHARP."""
 HEAD_COLUMNS = tuple(column for group in HEAD_GROUPS for column in range(group.start, group.stop))
-"""The raw column of every output of that network."""
+"""Raw column of each output of that network."""

@@ -11,7 +11,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 
 MOST_DEG = 75.0
-"""Farther round, surfaces are seen edge on."""
+"""Maximum rotation in degrees; beyond it, surfaces are seen edge-on."""
 LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
 
 
@@ -26,7 +26,7 @@ class Orbit:
     azimuth_deg: float = 0.0
     """Rotation to the right around the point at the centre of the picture, in degrees."""
     elevation_deg: float = 0.0
-    """Upwards, likewise."""
+    """Upward rotation around the same point, in degrees."""
     zoom: float = 1.0
     """Factor by which the camera is closer to that point."""
 
@@ -38,9 +38,13 @@ class Orbit:
             raise InvalidSetting(f"zoom is {self.zoom:g}; it must be from {LEAST_ZOOM:g} to {MOST_ZOOM:g}")
 
     def camera(self, start: Camera, distance: float) -> Camera:
-        """The virtual camera that looks at the point `distance` in front of `start`, in the unit of the scene.
+        """Return the virtual camera orbiting the point `distance` in front of `start`, in scene
+        units.
 
-        Without rotation and zoom it is `start`. Raises InvalidInput for a distance that is not positive.
+        Without rotation and zoom this is `start`.
+
+        Raises:
+            InvalidInput: if the distance is not positive.
         """
         if not 0 < distance < math.inf:
             raise InvalidInput(f"the distance of the orbit is {distance}; it must be positive")

@@ -13,7 +13,7 @@ Points = NDArray[np.float64]
 
 
 def pixel_rays(camera: Camera) -> Points:
-    """(x/z, y/z, 1) of the rays through the pixels' centres [H, W, 3]."""
+    """Return the rays (x/z, y/z, 1) through the pixel centres [H, W, 3]."""
     column = (np.arange(camera.width_px) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     row = (np.arange(camera.height_px) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     x, y = np.meshgrid(column, row)
@@ -26,12 +26,12 @@ def points_of(camera: Camera, depth: NDArray[Any]) -> Points:
 
 
 def inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pose [4, 4] that leads back."""
+    """Return the inverse of a rigid pose [4, 4]."""
     return np.asarray(np.linalg.inv(pose), np.float64)
 
 
 def moved(pose: NDArray[np.float64], points: Points) -> Points:
-    """Points [..., 3] in the coordinates that `pose` [4, 4] leads to."""
+    """Transform points [..., 3] by a rigid pose [4, 4]."""
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
@@ -43,7 +43,9 @@ def pixels_of(camera: Camera, points: Points) -> Points:
 
 
 def at_pixels(plane: NDArray[Any], pixels: Points) -> NDArray[Any]:
-    """The values of the pixels [...] that positions [..., 2] are in; 0 outside of the picture."""
+    """Sample a plane at the pixels [...] containing the positions [..., 2]; 0 outside
+    the picture.
+    """
     height, width = plane.shape[:2]
     inside = np.isfinite(pixels).all(axis=-1)
     column, row = (np.floor(np.where(inside, pixels[..., k], -1)).astype(np.int64) for k in (0, 1))

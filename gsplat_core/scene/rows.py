@@ -26,9 +26,9 @@ class RowMoves:
     """
 
     to: Tensor
-    """Rows that others move into, int64 [M]."""
+    """Destination rows, int64 [M]."""
     source: Tensor
-    """Rows that move there [M]. None of them is in `to`."""
+    """Source rows, int64 [M]; disjoint from `to`."""
     count: int
     """Number of rows in use after the removal."""
     before: int
@@ -36,7 +36,11 @@ class RowMoves:
 
     @staticmethod
     def without(removed: Tensor) -> RowMoves:
-        """Close the gaps of the rows marked in `removed`, bool [N] over all rows in use. Waits for the device."""
+        """Return the moves that close the gaps of removed rows; synchronises with the device.
+
+        Args:
+            removed: bool [N] over all rows in use.
+        """
         stays = ~removed
         count = int(torch.count_nonzero(stays))
         to = torch.nonzero(removed[:count]).flatten()
@@ -53,13 +57,13 @@ class RowMoves:
         return order
 
     def apply(self, tensor: Tensor, inert: float) -> None:
-        """Move the rows of one tensor in place; the rows that are not in use any more are filled with `inert`."""
+        """Move the rows of a tensor in place and fill unused rows with `inert`."""
         tensor[self.to] = tensor[self.source]
         tensor[self.count : self.before] = inert
 
 
 def inert_gaussians(like: Gaussians, rows: int) -> Gaussians:
-    """Gaussians that no renderer shows, with the harmonics, type and device of `like`."""
+    """Create invisible Gaussians with the SH degree, dtype and device of `like`."""
     inert = like.map(lambda tensor: tensor.new_zeros(rows, *tensor.shape[1:]))
     inert.quats[:, 0] = 1
     inert.logit_opacities.fill_(-math.inf)
@@ -67,7 +71,7 @@ def inert_gaussians(like: Gaussians, rows: int) -> Gaussians:
 
 
 class GaussianRows:
-    """The Gaussians of a scene in tensors of fixed size."""
+    """Gaussians of a scene in tensors of fixed size."""
 
     def __init__(self, gaussians: Gaussians, capacity: int) -> None:
         if gaussians.count > capacity:
@@ -75,7 +79,7 @@ class GaussianRows:
         self.all = inert_gaussians(gaussians, capacity)
         """All rows, as read and changed by captured graphs."""
         self.used = self.all
-        """The rows in use, in the same memory."""
+        """Views of the rows in use."""
         self.replace(gaussians)
 
     @property
@@ -84,21 +88,21 @@ class GaussianRows:
         return self.all.count
 
     def replace(self, gaussians: Gaussians) -> None:
-        """Let other Gaussians take the place of all."""
+        """Replace all Gaussians."""
         self._use(gaussians.count)
         for tensor, values in self._beside(gaussians):
             tensor.copy_(values)
         self._make_inert(gaussians.count)
 
     def append(self, added: Gaussians) -> None:
-        """Write Gaussians into the rows behind those in use."""
+        """Write Gaussians into the rows after those in use."""
         first = self.used.count
         self._use(first + added.count)
         for tensor, values in self._beside(added):
             tensor[first:] = values
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Let Gaussians leave."""
+        """Remove Gaussians by applying row moves."""
         for tensor in self.all.tensors().values():
             moves.apply(tensor, 0.0)
         self._make_inert(moves.count)

@@ -18,11 +18,15 @@ MOST_TIMES = 24
 
 @dataclass(frozen=True, eq=False)
 class ScopePath:
-    """Poses of the left eye at some times. Raises InvalidInput for times that do not increase, and for another number of poses."""
+    """Poses of the left eye at some times.
+
+    Raises:
+        InvalidInput: if times do not increase, or the number of poses differs.
+    """
 
     times_s: tuple[float, ...]
     world_to_camera: NDArray[np.float64]
-    """[T, 4, 4]; [1, 4, 4] where the scope stood still."""
+    """World-to-camera [T, 4, 4]; [1, 4, 4] for a static scope."""
 
     def __post_init__(self) -> None:
         poses = np.array(self.world_to_camera, np.float64)
@@ -40,7 +44,9 @@ class ScopePath:
 
     @classmethod
     def of(cls, times_s: Sequence[float], poses: Sequence[NDArray[np.float64]]) -> ScopePath:
-        """Some of these, which are in order; of frames of the same time the last one."""
+        """Subsample a sequence of poses; of several frames with the same time the last
+        one is used.
+        """
         last = dict(zip(times_s, poses, strict=True))
         times = list(last)
         kept = [times[k] for k in np.unique(np.linspace(0, len(times) - 1, MOST_TIMES).round().astype(int))]
@@ -49,7 +55,7 @@ class ScopePath:
         return cls(tuple(kept), chosen[:1] if still else chosen)
 
     def pose(self, number: int) -> NDArray[np.float64]:
-        """World-to-camera [4, 4] at the time of that number."""
+        """Return the world-to-camera pose [4, 4] at the time with index `number`."""
         return np.asarray(self.world_to_camera[number % len(self.world_to_camera)])
 
     def centre_at(self, time_s: float) -> NDArray[np.float64]:

@@ -27,14 +27,14 @@ from gsplat_core.scene.model import Model, clamp_time
 from gsplat_core.scene.rows import inert_gaussians
 
 ROW_STEP = 1024
-"""The capacity for Gaussians is a multiple of this."""
+"""Granularity of the capacity for Gaussians."""
 ROW_HEADROOM = 1.25
 MOST_SLOTS = 9
-"""Snapshots of one publisher that may be held at a time. A replay needs three, seldom four."""
+"""Maximum number of simultaneously held snapshots per publisher. Replay needs three or four."""
 
 
 class SnapshotSlot:
-    """Memory for one snapshot. Made and written by `SnapshotSlots`; read inside `Snapshot.reading`."""
+    """Memory for one snapshot, written by `SnapshotSlots` and read inside `Snapshot.reading`."""
 
     def __init__(self, number: int, device: torch.device, rows: int = 0) -> None:
         """Create an empty slot with capacity for at least `rows` Gaussians."""
@@ -46,7 +46,7 @@ class SnapshotSlot:
         self._field: FieldSlot | None = None
         self._count = 0
         self._in_use: list[Tensor] = []
-        """The first `_count` rows of every tensor."""
+        """Views of the first `_count` rows of every tensor."""
         self._holder: weakref.ref[Snapshot] | None = None
         self._order = _DeviceOrder(device)
 
@@ -58,7 +58,7 @@ class SnapshotSlot:
 
     @property
     def field(self) -> DeformationField | None:
-        """The field for all rows."""
+        """Field for all rows."""
         return None if self._field is None else self._field.field
 
     @property
@@ -129,17 +129,17 @@ class Snapshot:
         depth_source: DepthSource | None = None,
     ) -> None:
         self.version = version
-        """Counts up with every snapshot, from 1."""
+        """Version number; increases with every snapshot, from 1."""
         self.camera = camera
         """The camera of the recording's first frame."""
         self.time_window_s = time_window_s
-        """First and last time that the model has seen; other times show the nearest of these."""
+        """First and last observed time in seconds; other times are clamped."""
         self.training_digest = training_digest
         self._unseen_s = unseen_s
         self.depth_source = depth_source
         """Source of the training depth."""
         self.parameter_count = slot.parameter_count
-        """Numbers in all tensors, without the slot's spare capacity."""
+        """Number of parameters, without the slot's spare capacity."""
         self.slot = slot
         self.gaussian_count = slot._count
         self._lock = threading.Lock()
@@ -167,7 +167,7 @@ class Snapshot:
         return clamp_time(time_s, continued_window(self.time_window_s, self.slot.field))
 
     def at(self, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`, clamped to the window, in memory of their own."""
+        """Return the Gaussians at `time_s`, clamped to the window, in separate memory."""
         with self.reading() as slot, torch.no_grad():
             gaussians = slot.gaussians
             if slot.field is not None:
@@ -187,7 +187,7 @@ class Snapshot:
             return seen
 
     def as_model(self) -> Model:
-        """An immutable copy in memory of its own, made when it is first asked for."""
+        """Immutable copy in separate memory, created on first access."""
         with self._lock:
             if self._model is None:
                 with self.reading() as slot, torch.no_grad():
@@ -200,7 +200,7 @@ class Snapshot:
 
 
 class SnapshotSlots:
-    """The slots of one publisher. One thread publishes; any threads hold snapshots."""
+    """Slots of one publisher. One thread publishes; any thread may hold snapshots."""
 
     def __init__(self, device: torch.device | str, most: int = MOST_SLOTS, rows: int = 0) -> None:
         """Create slots on demand.
@@ -218,7 +218,7 @@ class SnapshotSlots:
 
     @property
     def count(self) -> int:
-        """Slots that were needed so far."""
+        """Number of slots allocated so far."""
         return len(self._slots)
 
     @staticmethod
@@ -281,7 +281,7 @@ class _DeviceOrder:
         self._device = device
         self._written: torch.cuda.Event | None = None
         self._read: dict[int, torch.cuda.Event] = {}
-        """The end of the last reading on each stream."""
+        """Completion event of the last read on each stream."""
 
     def before_writing(self) -> None:
         read, self._read = self._read, {}

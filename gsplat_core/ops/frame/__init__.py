@@ -1,1 +1,1 @@
-"""The fused frame path: raw Gaussians to a picture, and its gradient back to them, on CUDA."""
+"""Fused frame path on CUDA: raw Gaussians to a picture, and the backward pass."""

@@ -36,11 +36,14 @@ __all__ = [
 ]
 
 TILE_SIZE = 16
-"""Side of the frame path's tiles in pixels; other sizes are for the plain ops."""
+"""Side of the frame path's tiles in pixels."""
 MAX_SEGMENT = 1024
 """Largest capacity of a tile's own segment, in instances."""
 STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)
-"""Entries of `Frame.status`: instances of the frame, instances of the tile that has most, 1 if some were left out."""
+"""Entries of `Frame.status`.
+
+They are the frame's instances, the largest number in a tile, and 1 if instances were dropped.
+"""
 
 
 class FrameMode(IntEnum):
@@ -55,15 +58,20 @@ class FrameMode(IntEnum):
     weight times z.
     """
     SEGMENTS = 2
-    """A picture. Every tile has a segment of its own for `capacity` instances, at most MAX_SEGMENT: two launches fewer, for 8 bytes per
-    instance."""
+    """Picture with a segment of `capacity` instances (at most MAX_SEGMENT) for every tile.
+
+    Saves two launches and takes 8 bytes per instance.
+    """
 
 
 class Frame(NamedTuple):
     """Rendered frame and the values needed by its backward pass."""
 
     image: Tensor
-    """[H, W, 4]: red, green, blue in front of the background, and depth: the weighted mean of z, or its weighted sum when training."""
+    """[H, W, 4]: red, green, blue over the background, and depth.
+
+    Depth is the weighted mean of z, or the weighted sum when training.
+    """
     alphas: Tensor
     """[H, W]."""
     last: Tensor
@@ -71,18 +79,21 @@ class Frame(NamedTuple):
     training.
     """
     records: Tensor
-    """[N, 12]: the projected splats as the kernels keep them; rows of culled Gaussians are not written. A colour of exactly 0
-    was clamped. Columns: x, y, and log2 of alpha's polynomial (xx, xy, yy, 1), infinity, red, green, blue, z, 0."""
+    """Projected splats [N, 12] in the kernels' format; rows of culled Gaussians are undefined.
+
+    A colour of exactly 0 was clamped. Columns: x, y, coefficients of log2 alpha (xx, xy, yy, 1),
+    infinity, red, green, blue, z, 0.
+    """
     tile_offsets: Tensor
-    """int32 [tiles + 1]: where each tile's instances start in `sorted`. Empty with segments."""
+    """Start of each tile's instances in `sorted`, int32 [tiles + 1]. Empty with segments."""
     sorted: Tensor
     """int32 [capacity]: instances by tile and depth. Empty unless training; may contain -1 if the lists overflowed."""
     splat_starts: Tensor
-    """int32 [N + 1]: the first instance of each splat. Empty unless training."""
+    """First instance of each splat, int32 [N + 1]. Empty unless training."""
     instance_splats: Tensor
-    """int32 [capacity]: the splat of every instance. Empty unless training."""
+    """Splat of each instance, int32 [capacity]. Empty unless training."""
     status: Tensor
-    """int32 [4], see `STATUS_NEEDED`. Reading it makes the host wait."""
+    """int32 [4], see `STATUS_NEEDED`. Reading it synchronises with the host."""
 
 
 def render_frame(
@@ -138,12 +149,16 @@ def render_frame(
 
 
 def accumulate_status_(status: Tensor, totals: Tensor, step: Tensor) -> Tensor:
-    """Fold a frame's status into that of a series of frames, on the device; float32 [1]: 0 if the frame overflowed, else 1.
+    """Merge a frame's status into the totals of a series of frames, on the device.
 
     Args:
         status: int32 [4] of a `Frame`, on CUDA.
-        totals: int32 [4]; becomes the maximum of every entry, but in STATUS_OVERFLOW the number of frames that overflowed.
+        totals: int32 [4]; receives the maximum of every entry, but in STATUS_OVERFLOW the number of
+            overflowed frames.
         step: int64 [1]; incremented unless the frame overflowed.
+
+    Returns:
+        float32 [1]: 0 if the frame overflowed, otherwise 1.
     """
     for name, tensor, dtype, size in (
         ("status", status, torch.int32, 4),

@@ -16,11 +16,11 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 from gsplat_core.scene.layout import RAW_COLUMNS
 
 GAUSSIAN_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-"""The Gaussians' tensors in the order in which the ops take them, their moments and their learning rates."""
+"""Names of the Gaussians' tensors in the order used by ops, moments and learning rates."""
 
 
 class View(NamedTuple):
-    """A camera for the frame path. Its tensors are read on the device at every launch, also of a captured graph."""
+    """Camera for the frame path; its tensors are read on the device at every launch and replay."""
 
     viewmat: Tensor
     """[4, 4] world to camera, OpenCV axes."""
@@ -38,12 +38,12 @@ class View(NamedTuple):
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor | None]:
-        """viewmat, K and background, in the order in which the ops take them."""
+        """viewmat, K and background in the argument order of the ops."""
         return self.viewmat, self.K, self.background
 
     @property
     def model_index(self) -> int:
-        """The camera model as the ops take it."""
+        """Index of the camera model as used by the ops."""
         return CAMERA_MODELS.index(self.camera_model)
 
 
@@ -56,9 +56,9 @@ def check_inputs(
     half_sh: bool = False,
     **more: Tensor | None,
 ) -> None:
-    """Raise InvalidInput unless shapes, types and device are those that `op` takes; `half_sh` lets sh be float16.
+    """Raise InvalidInput unless shapes, dtypes and device are supported by `op`.
 
-    `more` are other tensors, which must be float32 on the same device.
+    `half_sh` permits float16 `sh`. Tensors in `more` must be float32 on the same device.
     """
     if len(gaussians) != len(GAUSSIAN_TENSORS):
         raise InvalidInput(f"gaussians must be {', '.join(GAUSSIAN_TENSORS)}, got {len(gaussians)} tensors")

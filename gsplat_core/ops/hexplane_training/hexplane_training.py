@@ -1,12 +1,13 @@
-"""Training of the HexPlane field on CUDA without autograd: forward, backward, and Adam over the planes.
+"""Training of the HexPlane field (Cao & Johnson 2023) on CUDA without autograd.
 
-    state = hexplane_train(means, box, time, planes, weights, biases)           # state.deltas into the frame
-    gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
-    hexplane_planes_adam_(planes, first, second, time, gradient, adam)
+    state = hexplane_train(means, box, time, planes, weights, biases)  # state.deltas to the frame
+        gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
+        hexplane_planes_adam_(planes, first, second, time, gradient, adam)
 
-Nothing waits for the host and every call can be captured in a CUDA graph; time, rate and step are read from device memory. The same
-inputs give the same bits: no sum is made by atomic additions. The gradient of the planes stays factored, one gradient row per Gaussian,
-level and plane, until the pass that updates the planes adds up each node's rows; `hexplane_planes_gradient` gives it as tensors.
+The host does not synchronise and a CUDA graph can capture every call; time, rate and step are read
+from device memory. Results are bit-reproducible, because no sum uses atomics. The gradient of the
+planes is kept factored, with one row per Gaussian, level and plane. The pass that updates the
+planes sums the rows of each node. `hexplane_planes_gradient` converts it to tensors.
 """
 
 from __future__ import annotations
@@ -33,20 +34,20 @@ class TrainingState(NamedTuple):
     skipped.
     """
     lines: Tensor
-    """The time planes interpolated at the time, [U, C] each, concatenated."""
+    """Time planes interpolated at the time, [U, C] each, concatenated."""
     features: Tensor
     """[N, levels * C]."""
     hidden: Tensor
-    """[depth, N, padded width]: the outputs of each layer of the trunk, padded with zeros."""
+    """Outputs of the trunk's layers, zero-padded, [depth, N, padded width]."""
     order: Tensor
     """int32 [3, 3 * levels * N]: items (plane after plane, Gaussian after Gaussian) sorted by the cell of the plane; the index of each
     item among the sorted ones; and the cells of the sorted items, with their highest bit set if they have 8 items or more (dense)."""
     starts: Tensor
-    """int32 [cells + 1]: where each cell's items start."""
+    """Start of each cell's items, int32 [cells + 1]."""
 
 
 class FieldGradient(NamedTuple):
-    """The gradient of a field, that of its planes factored."""
+    """Gradient of a field, factored for its planes."""
 
     network: Tensor
     """Weight and bias of every layer, concatenated."""
@@ -54,13 +55,18 @@ class FieldGradient(NamedTuple):
     """[2, 3 * levels * N, C]: gradients of the samples of the space planes (xy, xz, yz of every level) and of the lines of their major
     axes (y, x, z), sorted by the cell of the plane."""
     fractions: Tensor
-    """[3 * levels * N, 2]: of the way to the next node along the major and the minor axis, in the same order."""
+    """Interpolation fractions along the major and minor axis, [3 * levels * N, 2], in the same
+    order.
+    """
     dense_sums: Tensor
-    """[3 * levels * N / 32, 5, 4, C]: of each run of 32 sorted rows, sums of the dense cells' rows for the four corners of the cell."""
+    """Sums of dense cells' rows for the four cell corners, by runs of 32 sorted rows.
+
+    [3 * levels * N / 32, 5, 4, C].
+    """
     v_lines: Tensor
-    """The gradient of the lines."""
+    """Gradient of the interpolated time lines."""
     starts: Tensor
-    """int32 [cells + 1]: where each cell's rows start."""
+    """Start of each cell's rows, int32 [cells + 1]."""
 
     @property
     def of_planes(self) -> list[Tensor]:
@@ -69,14 +75,14 @@ class FieldGradient(NamedTuple):
 
 
 class AdamOnDevice(NamedTuple):
-    """Adam's settings of one step, read from device memory (Kingma and Ba 2015, algorithm 1)."""
+    """Adam settings of one step (Kingma and Ba 2015, algorithm 1), read from device memory."""
 
     rate: Tensor
     """float32 [1], the learning rate."""
     step: Tensor
     """int64 [1], counted from 1."""
     status: Tensor | None = None
-    """int32 [4] of a frame; if its lists overflowed nothing is changed."""
+    """int32 [4] of a frame; if its lists overflowed, nothing is changed."""
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 
@@ -156,7 +162,7 @@ def hexplane_train_backward(
 
 
 def hexplane_planes_gradient(time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]) -> list[Tensor]:
-    """The gradient of every plane as a tensor of its size."""
+    """Return the gradient of every plane as a tensor of its size."""
     return torch.ops.gsplat_core.hexplane_planes_gradient(time, gradient.of_planes, list(planes))
 
 

@@ -17,11 +17,14 @@ alpha cut-off.
 """
 ALPHA_CUTOFF = 1.0 / 255.0
 COMPENSATION_FLOOR = 0.005
-"""Smallest antialiasing compensation (Yu et al. 2024, Mip-Splatting, as published in its code), unless another is given."""
+"""Default lower limit of the antialiasing compensation (Yu et al. 2024, Mip-Splatting code)."""
 MAX_RADIUS_PX = 1e9
-"""Radii are clamped to this, to fit an int32."""
+"""Upper limit of radii in pixels, so that they fit an int32."""
 FOV_MARGIN = 0.3
-"""The pinhole Jacobian is taken at a point at most (1 + 0.3) half fields of view off the axis (Kerbl et al. 2023)."""
+"""Margin beyond the field of view at which the pinhole Jacobian is clamped.
+
+The point is at most (1 + 0.3) half fields of view off the axis (Kerbl et al. 2023).
+"""
 
 
 class DenseProjection(NamedTuple):
@@ -32,11 +35,11 @@ class DenseProjection(NamedTuple):
     means2d: Tensor
     """[..., C, N, 2] in pixels."""
     depths: Tensor
-    """[..., C, N]: z in the camera."""
+    """Camera-space z [..., C, N]."""
     conics: Tensor
     """[..., C, N, 3]: inverse of the blurred 2D covariance as (xx, xy, yy)."""
     compensations: Tensor | None
-    """[..., C, N]: factor on the opacity for antialiasing, or None."""
+    """Antialiasing factor on the opacity [..., C, N], or None."""
 
 
 class PackedProjection(NamedTuple):

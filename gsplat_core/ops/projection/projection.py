@@ -106,7 +106,11 @@ def _flat(
     viewmats: Tensor,
     Ks: Tensor,
 ) -> tuple[Tensor | None, ...]:
-    """The tensors with one batch dimension, as the op takes them; raises InvalidInput unless all are float32."""
+    """Flatten the batch dimensions for the op.
+
+    Raises:
+        InvalidInput: unless all tensors are float32.
+    """
     require_float32(
         "fully_fused_projection", means=means, covars=covars, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks,
         opacities=opacities,

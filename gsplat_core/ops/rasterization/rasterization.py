@@ -30,7 +30,7 @@ _INPUTS_BACKWARD = torch.ops.gsplat_core.rasterize_inputs_backward.default
 
 
 class Options(NamedTuple):
-    """The op's list of integers."""
+    """Integer options in the op's argument order."""
 
     width: int
     height: int
@@ -39,16 +39,20 @@ class Options(NamedTuple):
     degree: int
     """0 to 4, or PLAIN_COLORS."""
     channels: int
-    """Colours in the picture, 0 to 3."""
+    """Number of colour channels, 0 to 3."""
     depth_mode: int
     antialiased: int
-    """1 or 0, like the next two."""
+    """1 or 0, as the next two."""
     packed: int
     absgrad: int
 
 
 class Ranges(NamedTuple):
-    """The op's list of numbers: blur in pixels², planes in the scene's unit, smallest radius in pixels."""
+    """Numeric options in the op's argument order.
+
+    They are the blur in pixels², clipping planes in the scene's unit, and smallest radius in
+    pixels.
+    """
 
     eps2d: float
     near_plane: float
@@ -66,20 +70,22 @@ class View(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Tensors, float32 on one CUDA device; batch dimensions as in `rasterization()`."""
+    """Tensor arguments, float32 on one CUDA device; batch dimensions as in `rasterization()`."""
 
     means: Tensor
     covars: Tensor | None
-    """Upper triangles [..., N, 6], or None with the next two given."""
+    """Upper triangles [..., N, 6]; None if the next two are given."""
     quats: Tensor | None
     scales: Tensor | None
     opacities: Tensor
     colors: Tensor | None
-    """[..., (C,) N, K, 3] or [..., (C,) N, D]; None where no colour is rendered."""
+    """[..., (C,) N, K, 3] or [..., (C,) N, D]; None without colour."""
     viewmats: Tensor
     Ks: Tensor
     centers: Tensor | None
-    """[..., C, 3]: the cameras' centres, where their gradient is wanted; else they are computed from the matrices."""
+    """Camera centres [..., C, 3] if their gradient is needed; otherwise computed from
+    the matrices.
+    """
     backgrounds: Tensor | None
     """[..., C, channels]."""
 
@@ -88,23 +94,23 @@ class Saved(NamedTuple):
     """Values of the forward pass saved for the backward pass."""
 
     records: Tensor
-    """[images * N, 12]: the splats as the kernels keep them."""
+    """Splats in the kernels' format, [images * N, 12]."""
     conics: Tensor
     isect_offsets: Tensor
     splat_ids: Tensor
-    """int32 [M]: the tiles' lists; a splat is image * N + Gaussian."""
+    """Tile lists, int32 [M]; a splat's id is image * N + Gaussian."""
     sorted: Tensor
-    """int32 [M]: for every entry of the lists which pair of splat and tile it is, counted in the order of the splats."""
+    """int32 [M]: index of each list entry among the (splat, tile) pairs in splat order."""
     splat_starts: Tensor
-    """int32 [images * N + 1]: where the pairs of each splat start."""
+    """Start of each splat's pairs, int32 [images * N + 1]."""
     row_of: Tensor | None
-    """int32 [images * N]: the packed row of a splat or -1; None unless packed."""
+    """Packed row of each splat or -1, int32 [images * N]; None unless packed."""
     backgrounds: Tensor | None
     alphas: Tensor
     expected: Tensor
-    """[..., C, H, W]: expected depth, where it is in the picture."""
+    """Expected depth [..., C, H, W] if it is part of the picture."""
     last: Tensor
-    """int32 [..., C, H, W]: the last entry of the lists that a pixel blended, or -1."""
+    """Last list entry blended by each pixel or -1, int32 [..., C, H, W]."""
 
 
 class Rasterized(NamedTuple):
@@ -139,14 +145,19 @@ class _Call:
         self.outputs: list[Tensor] = []
 
     def left_for_gradients(self) -> list[Tensor]:
-        """records, splat_starts, sorted, last and expected; packed also row_of, the radii of all splats and splat_ids."""
+        """Tensors saved for the backward pass, in the op's argument order.
+
+        These are records, splat_starts, sorted, last and expected. If packed, also row_of, the
+        radii of all splats and splat_ids.
+        """
         return self.outputs[14 if self.view.options.packed else 11 :]
 
 
 def rasterize(inputs: Inputs, view: View, differentiable: bool) -> Rasterized:
-    """Render; the caller has checked shapes, types and devices.
+    """Render; the caller has checked shapes, dtypes and devices.
 
-    The host waits once, for the length of the tiles' lists. The same inputs give the same bits, forward and backward.
+    The host synchronises once, for the length of the tile lists. Equal inputs give bit-identical
+    results, forward and backward.
     """
     if not differentiable:
         return _named(_FORWARD(inputs, *view, False), view)

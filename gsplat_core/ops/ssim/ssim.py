@@ -12,17 +12,20 @@ MAX_CHANNELS = 32
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity of each pixel and channel: 11x11 Gaussian of sigma 1.5, zero padding, range 1. Differentiable in both.
+    """Compute the structural similarity of each pixel and channel (Wang et al. 2004, eq. 13).
+
+    11x11 Gaussian window of sigma 1.5, zero padding, value range 1. Differentiable in both images.
 
     Args:
-        image: [H, W, C] float32 in 0..1, at most 32 channels.
-        target: [H, W, C] float32.
+        image: float32 [H, W, C] in 0..1, at most 32 channels.
+        target: float32 [H, W, C].
 
     Returns:
         [H, W, C] in -1..1.
 
     Raises:
-        InvalidInput: shapes differ, or a type is not float32; `gsplat_core.reference.ssim` takes any floating type.
+        InvalidInput: if shapes differ or a dtype is not float32; `gsplat_core.reference.ssim`
+            accepts any floating dtype.
     """
     if image.shape != target.shape or image.ndim != 3 or not 1 <= image.shape[2] <= MAX_CHANNELS:
         raise InvalidInput(
