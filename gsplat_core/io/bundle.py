@@ -1,7 +1,8 @@
-"""Model bundles: a folder with `model.safetensors` (every tensor) and `manifest.json` (everything else).
+"""Model bundles: a folder with `model.safetensors` (tensors) and `manifest.json` (the rest).
 
-The tensor file is written in pieces that share the tensors' memory, since `safetensors.torch.save` copies all of it twice. Loading checks names, shapes,
-sizes and finiteness before a model is built, and follows no link out of the folder.
+The tensor file is written in pieces that share the tensors' memory, because
+`safetensors.torch.save` copies all of it twice. Loading validates names, shapes, sizes and
+finiteness before a model is built, and follows no link out of the folder.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ ALIGNMENT = 8
 
 
 def safetensors_pieces(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memoryview]:
-    """The bytes of a file with these float32 tensors of the host, contiguous; the same as `safetensors.torch.save` gives."""
+    """Yield a safetensors file of contiguous float32 CPU tensors, as `safetensors.torch.save`
+    would.
+    """
     names = sorted(tensors)
     entries, start = {}, 0
     for name in names:
@@ -56,11 +59,19 @@ MAX_HEADER_BYTES = 1 << 20
 
 
 def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor], Tensor] = Tensor.cpu) -> None:
-    """Write `model` into `folder` (made when missing), replacing the bundle there in one step. It is written in pieces, between which other threads
-    run. to_host: how a tensor of a GPU comes into host memory.
+    """Write `model` to `folder`, created if missing, atomically replacing a previous bundle.
 
-    Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the model is beyond the ranges of `docs/design/bundle.md` or the
-    files cannot be written (a full disk, a missing right); the bundle that was there before is then still whole.
+    The file is written in pieces, so other threads can run in between.
+
+    Args:
+        model: model to save.
+        folder: bundle folder.
+        to_host: function that copies a GPU tensor to host memory.
+
+    Raises:
+        BundleCorrupt: if a tensor contains NaN or infinity.
+        BundleError: if the model exceeds the ranges of `docs/design/bundle.md`, or the files cannot
+            be written. A previous bundle then stays intact.
     """
     folder = Path(folder)
     tensors = {name: to_host(tensor.detach()).contiguous() for name, tensor in model.tensors().items()}
@@ -129,7 +140,7 @@ def load_bundle(folder: str | Path) -> Model:
 
 
 def _manifest_for(folder: Path, size: int) -> Manifest:
-    """The manifest, or the next one when only that fits the tensors (see the module's text)."""
+    """Return the manifest, or the pending next one if only that fits the tensors."""
     if not (folder / MANIFEST).exists() and (folder / NEXT_MANIFEST).exists():
         return _read_manifest(folder, NEXT_MANIFEST)
     manifest = _read_manifest(folder, MANIFEST)
@@ -176,7 +187,7 @@ def _skeleton(path: Path, manifest: Manifest) -> tuple[Gaussians, DeformationFie
 
 
 def _expected_tensors(path: Path, manifest: Manifest) -> dict[str, Tensor]:
-    """The tensors that a manifest describes, on the meta device."""
+    """Return the tensors described by a manifest, on the meta device."""
     gaussians, field = _skeleton(path, manifest)
     expected = {f"gaussians.{name}": tensor for name, tensor in gaussians.tensors().items()}
     if field is not None:
@@ -214,9 +225,10 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
 
 
 def _check_size(path: Path, expected: dict[str, Tensor], start: bytes, size: int) -> None:
-    """Before anything is read: the file is as long as the tensors that the manifest describes, and a header of allowed length.
+    """Check the file size against the manifest and the header length, before reading anything.
 
-    A safetensors file is eight bytes with the header's length, the header as JSON, and the tensors without gaps.
+    A safetensors file consists of eight bytes with the header's length, the JSON header, and the
+    tensors without gaps.
     """
     if len(start) < 8:
         raise BundleCorrupt(f"{path} has only {size} bytes; copy the bundle again")

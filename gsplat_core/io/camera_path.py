@@ -1,12 +1,13 @@
-"""A path of a camera through time, read from JSON: poses at some times, and between them a turn at even speed and a straight line.
+"""Camera path read from JSON: key poses with geodesic rotation and linear translation between.
 
-    {"cameras": [
-      {"time_s": 0.0, "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
-      {"time_s": 1.5, "camera_to_world": [[...], [...], [...], [0, 0, 0, 1]]}
-    ]}
+{"cameras": [
+  {"time_s": 0.0, "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+  {"time_s": 1.5, "camera_to_world": [[...], [...], [...], [0, 0, 0, 1]]}
+]}
 
-Axes are the camera's (x right, y down, z forward), lengths the scene's, times the model's. `intrinsics` {"fx", "fy", "cx", "cy"}, in pixels of the
-model's camera, may be given with every camera or with none. A straight line does not overshoot, as a smoother curve would: into tissue.
+Axes are the camera's (x right, y down, z forward), lengths the scene's, times the model's in
+seconds. `intrinsics` {"fx", "fy", "cx", "cy"}, in pixels of the model's camera, may be given for
+all cameras or for none. Linear motion does not overshoot into tissue, as smoother curves would.
 """
 
 from __future__ import annotations
@@ -43,11 +44,15 @@ class Waypoint:
     camera_to_world: NDArray[np.float64]
     """[4, 4]."""
     intrinsics: tuple[float, ...] | None = None
-    """fx, fy, cx and cy; None: those of the camera that goes along the path."""
+    """fx, fy, cx and cy; None for those of the camera that follows the path."""
 
 
 class CameraPath:
-    """Poses over time. Raises InvalidInput for times that do not increase, and where only some waypoints have intrinsics."""
+    """Poses over time.
+
+    Raises:
+        InvalidInput: if times do not increase, or only some waypoints have intrinsics.
+    """
 
     def __init__(self, waypoints: list[Waypoint]) -> None:
         if not waypoints:
@@ -62,11 +67,13 @@ class CameraPath:
 
     @property
     def window_s(self) -> tuple[float, float]:
-        """First and last time."""
+        """First and last time in seconds."""
         return self._times[0], self._times[-1]
 
     def camera(self, start: Camera, time_s: float) -> Camera:
-        """`start` where the path is at a time, before and after it at its nearest end; with the path's intrinsics, where it has them."""
+        """Return `start` at the path's pose and, if given, with its intrinsics; times
+        are clamped.
+        """
         k = min(max(bisect_right(self._times, time_s) - 1, 0), len(self._times) - 1)
         before, after = self._waypoints[k], self._waypoints[min(k + 1, len(self._times) - 1)]
         span = after.time_s - before.time_s

@@ -1,6 +1,7 @@
-"""Safe file access: regular files only when reading, and writes that survive a crash or a full disk.
+"""Safe file access: bounded reading of regular files, and crash-safe atomic writes.
 
-Reading never waits for a pipe or a device and never takes more bytes than the caller allows. Writing leaves either the old content or the whole new one.
+Reading never blocks on a pipe or device and never exceeds the caller's limit. Writing leaves either
+the old or the complete new content.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ _KINDS = (
 
 
 class _Nonwaiting(io.FileIO):
-    """Unbuffered file that raises OSError where reading would wait. Some files of /proc, such as kmsg, are plain files by their mode and wait."""
+    """Unbuffered file that raises OSError instead of blocking.
+
+    Some files of /proc, such as kmsg, are regular by their mode but block.
+    """
 
     def readinto(self, buffer: Any) -> int:
         count: int | None = super().readinto(buffer)
@@ -43,7 +47,11 @@ class _Nonwaiting(io.FileIO):
 
 
 def open_regular(path: str | Path, *, follow_links: bool = True) -> io.BufferedReader:
-    """Open a regular file for reading bytes. Raises OSError for everything else, without waiting."""
+    """Open a regular file for reading bytes without blocking.
+
+    Raises:
+        OSError: if the file cannot be opened or is not regular.
+    """
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     # Without O_NONBLOCK, opening a pipe waits for its writer. The flag does not affect regular files.
     flags |= getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
@@ -65,7 +73,11 @@ def open_regular(path: str | Path, *, follow_links: bool = True) -> io.BufferedR
 
 
 def read_regular(path: str | Path, most_bytes: int, *, follow_links: bool = True) -> bytes:
-    """Return the bytes of a regular file. Raises OSError for everything else, and for a file of more than `most_bytes`."""
+    """Return the bytes of a regular file.
+
+    Raises:
+        OSError: if it is not regular, or has more than `most_bytes`.
+    """
     with open_regular(path, follow_links=follow_links) as file:
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:
@@ -83,11 +95,11 @@ _RENAME_EXCHANGE = 2
 _AT_FDCWD = -100
 _NO_HARD_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
 _unfinished: set[Path] = set()
-"""Files and folders of this process that have not got their name yet."""
+"""Temporary files and folders of this process that are not yet renamed."""
 
 
 def remove_unfinished() -> None:
-    """Remove every file and folder that this process has begun and not finished; for a program that is about to end at once."""
+    """Delete all unfinished files and folders of this process, before an immediate exit."""
     for path in list(_unfinished):
         _remove(path)
         _unfinished.discard(path)
@@ -128,8 +140,11 @@ class PartialFile:
         _unfinished.add(self.path)
 
     def finish(self) -> None:
-        """Force the file to the disk and give it its name; when that fails it is removed and the OSError passed on. Once it has its name, or was
-        discarded, nothing happens."""
+        """Sync the file to disk and rename it to the target.
+
+        After a failure the file is removed and the OSError raised. Repeated calls, or calls after
+        `discard`, have no effect.
+        """
         if self.path not in _unfinished:
             return
         try:
@@ -207,7 +222,10 @@ class PartialFolder:
 
 
 def beside(target: Path, suffix: str) -> Path:
-    """A name in the folder of `target` that cannot be guessed. It holds none of the target's name, which may already be as long as names can be."""
+    """Return an unguessable name in the folder of `target`.
+
+    It does not contain the target's name, which may already have the maximum length.
+    """
     return target.with_name(f".intrasplat-{secrets.token_hex(8)}{suffix}")
 
 
@@ -230,13 +248,13 @@ def write_durably(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
 
 
 def replace_durably(source: Path, target: Path) -> None:
-    """Rename over the target, and force the folder's entry to the disk."""
+    """Rename over the target and sync the folder entry to disk."""
     os.replace(source, target)
     sync_folder(target.parent)
 
 
 def sync_folder(folder: Path) -> None:
-    """Force a folder's entries to the disk (a system without that, such as Windows, does it by itself)."""
+    """Sync a folder's entries to disk (unnecessary on systems such as Windows)."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -247,13 +265,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def _create(path: Path) -> int:
-    """A descriptor of a file that did not exist, with the rights that the user's umask gives."""
+    """Create a new file with the permissions of the user's umask and return its descriptor."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
     return os.open(path, flags, 0o666)
 
 
 def _rename_to_new(source: Path, target: Path) -> None:
-    """Rename where nothing may be replaced. A hard link fails when its name is taken, which a rename does not."""
+    """Rename without replacing an existing file; a hard link fails if the name exists."""
     try:
         os.link(source, target, follow_symlinks=False)
     except OSError as error:
@@ -267,7 +285,7 @@ def _rename_to_new(source: Path, target: Path) -> None:
 
 
 def _exchanged(first: Path, second: Path) -> bool:
-    """Exchange two names in one step (Linux, renameat2); False where the system or the file system cannot."""
+    """Exchange two names atomically (Linux renameat2); False if unsupported."""
     try:
         renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError, TypeError):

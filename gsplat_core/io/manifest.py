@@ -44,7 +44,7 @@ TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
 DEPTH_ORIGINS = tuple(origin.value for origin in DepthOrigin)
 UNITLESS = (DepthOrigin.PARALLAX, DepthOrigin.LIGHT, DepthOrigin.LEARNED)
-"""Depth of these origins is never metric."""
+"""Depth origins that are never metric."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 
@@ -68,7 +68,7 @@ class Manifest:
     scope_path: ScopePath | None = None
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
-        """Gaussians and field of the described shapes on the meta device: no memory is taken for them."""
+        """Return Gaussians and field of the described shapes on the meta device, without memory."""
         with torch.device("meta"):
             n, k = self.count, (self.sh_degree + 1) ** 2
             gaussians = Gaussians(
@@ -78,7 +78,7 @@ class Manifest:
 
 
 def manifest_bytes(model: Model, tensors_bytes: int, tensors_sha256: str) -> bytes:
-    """The manifest of `model` as JSON text."""
+    """Return the manifest of `model` as JSON."""
     manifest = {
         "format_version": FORMAT_VERSION,
         "version": model.version,
@@ -91,9 +91,11 @@ def manifest_bytes(model: Model, tensors_bytes: int, tensors_sha256: str) -> byt
 
 
 def parse_manifest(text: bytes, name: str) -> Manifest:
-    """Check a manifest that may come from anyone.
+    """Validate an untrusted manifest.
 
-    Raises UnknownFormatVersion for a later version, BundleCorrupt for anything that this version does not write.
+    Raises:
+        UnknownFormatVersion: if a later version wrote it.
+        BundleCorrupt: if this version would not write it.
     """
     root = JsonObject.parse(text, name)
     written = root.integer("format_version", IntegerIn(0, (1 << 31) - 1))
@@ -161,7 +163,7 @@ def _camera(reader: JsonObject) -> Camera:
 
 
 def _check_rigid(pose: np.ndarray) -> None:
-    """InvalidInput unless the upper left 3x3 of a pose is a rotation."""
+    """Raise InvalidInput unless the upper left 3x3 of a pose is a rotation."""
     # Clipping keeps the products finite. Clipped values are never part of a rotation.
     rotation = np.clip(pose[:3, :3], -2, 2)
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -174,7 +176,7 @@ def _check_rigid(pose: np.ndarray) -> None:
 
 
 def _field_config(reader: JsonObject) -> dict[str, Any]:
-    """The field's configuration, every value in the range that its kind states; unknown names are dropped."""
+    """Return the validated configuration of the field, without unknown keys."""
     reader.window("time_window_s", TIME_S, LONGEST_FIELD_WINDOW_S)
     try:
         return kind_of(reader.values.get("kind")).checked_config(reader.values)

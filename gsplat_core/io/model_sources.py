@@ -1,4 +1,4 @@
-"""Models by their path: a bundle's folder, or a file of Gaussians that another program wrote (`.ply`, `.splat`), which is a scene that does not move."""
+"""Loading of models by path: a bundle folder, or a static splat file (`.ply`, `.splat`)."""
 
 from __future__ import annotations
 
@@ -21,19 +21,24 @@ from gsplat_core.scene.model import Model
 
 WIDTH_PX, HEIGHT_PX = 640, 512
 FIELD_OF_VIEW = 0.9
-"""Width over distance of the camera that looks at a scene from a file."""
+"""Image width over distance of the default camera for a splat file."""
 SHOWN_SHARE = 0.9
-"""Share of the Gaussians within the sphere that the camera shows whole."""
+"""Share of the Gaussians inside the sphere that the default camera shows completely."""
 WINDOW_S = (0.0, 4.0)
-"""Time of a scene from a file: one turn of an orbit."""
+"""Time window in seconds of a splat file: one turn of an orbit."""
 LEAST_RADIUS = 0.02
-"""Closer than the near plane of rasterisation nothing is drawn."""
+"""Smallest displayable scene radius, because of the near plane of the rasterizer."""
 MOST_COORDINATE = 1e9
 MOST_LOG_SCALE = 20.0
 
 
 def load_splat(path: Path) -> Gaussians:
-    """Return the Gaussians of a `.splat` file, which has no harmonics. Raises BundleError, BundleCorrupt for values that are not finite."""
+    """Load the Gaussians of a `.splat` file, which has no view-dependent colour.
+
+    Raises:
+        BundleError: if the file cannot be read.
+        BundleCorrupt: if values are not finite.
+    """
     with open_model_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size % ROW.itemsize:
@@ -60,11 +65,11 @@ def load_splat(path: Path) -> Gaussians:
 
 
 READERS: Mapping[str, Callable[[Path], Gaussians]] = {".ply": load_ply, ".splat": load_splat}
-"""Readers of files of Gaussians, by suffix."""
+"""Readers of splat files by suffix."""
 
 
 def is_scene_file(path: Path) -> bool:
-    """Return True for the path of a file of Gaussians, which has no camera and no time of its own."""
+    """Return True for the suffix of a splat file, which has neither camera nor time."""
     return path.suffix.lower() in READERS and not path.is_dir()
 
 

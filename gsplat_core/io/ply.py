@@ -22,7 +22,7 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
 MARK_LINE = "comment written by IntraSplat"
-"""Line of the header by which a file of this program is recognised."""
+"""Header line that identifies a file written by this program."""
 SCALAR_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -39,7 +39,11 @@ REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGRE
 
 
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:
-    """Write the Gaussians; the file appears whole or not at all. OSError when it cannot be written."""
+    """Write Gaussians to a `.ply` file atomically.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     path = Path(path)
     draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     write_durably(draft, ply_pieces(gaussians))
@@ -47,7 +51,7 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def ply_pieces(gaussians: Gaussians) -> list[bytes]:
-    """The content of such a file: header and body."""
+    """Return header and body of a `.ply` file."""
     g = {name: t.detach().cpu().to(torch.float32).numpy() for name, t in gaussians.tensors().items()}
     rest = g["sh"][:, 1:].transpose(0, 2, 1).reshape(gaussians.count, 3 * (g["sh"].shape[1] - 1))
     columns = [
@@ -63,10 +67,11 @@ def ply_pieces(gaussians: Gaussians) -> list[bytes]:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Read Gaussians of any SH degree up to 4; properties that are not used are skipped.
+    """Read Gaussians of SH degree 0 to 4; unused properties are skipped.
 
-    Raises BundleCorrupt, naming the file and the fault, when it is not such a file, is cut short or holds NaN or infinity; BundleError when
-    it is missing, is no plain file, or does not fit into memory.
+    Raises:
+        BundleCorrupt: if the file has another format, is truncated, or contains NaN or infinity.
+        BundleError: if it is missing, not a regular file, or larger than the available memory.
     """
     path = Path(path)
     with open_model_file(path) as file:

@@ -1,4 +1,4 @@
-"""Values of a grid between its cells, for numpy arrays."""
+"""Bilinear interpolation on grids, for numpy arrays."""
 
 from __future__ import annotations
 
@@ -9,8 +9,13 @@ Array = NDArray[np.floating]
 
 
 def at_positions(grid: Array, positions: Array) -> Array:
-    """The values of a grid [rows, columns, ...] at positions [N, 2] (x, y; a cell's middle is at +0.5), linear between the cells' middles: [N, ...].
-    Beyond the outermost middles those of the edge."""
+    """Interpolate a grid [rows, columns, ...] bilinearly at positions [N, 2] (x, y).
+
+    Cell centres are at +0.5. Positions beyond the outermost centres take the edge value.
+
+    Returns:
+        [N, ...].
+    """
     rows, columns = grid.shape[:2]
     at = (positions - 0.5).clip(0, (columns - 1, rows - 1))
     low = np.floor(at).astype(np.int64).clip(0, (max(columns - 2, 0), max(rows - 2, 0)))

@@ -28,6 +28,10 @@ class DepthSource:
 
     @staticmethod
     def after(source: DepthSource | None, frame: Frame) -> DepthSource | None:
-        """`source` after another frame: depth without a unit takes the unit from the whole. A scene that started on a plane never gets one."""
+        """Return the depth source after another frame; one non-metric frame makes the whole
+        non-metric.
+
+        A scene initialised on a plane never becomes metric.
+        """
         relative = frame.depth is not None and not frame.depth_is_metric
         return replace(source, metric=False) if source is not None and relative else source

@@ -1,4 +1,4 @@
-"""A published model: Gaussians, how they deform, and the camera and time they were seen with."""
+"""Published model: Gaussians, deformation field, camera and time window."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gsplat_core.value_ranges import check_seen_at
 
 
 def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
-    """`time_s` brought into the window; not a number stays so, for the field to refuse."""
+    """Clamp `time_s` to the window; NaN is preserved, for the field to reject."""
     start, end = window_s
     return min(max(time_s, start), end) if time_s == time_s else time_s
 
@@ -41,17 +41,17 @@ class Model:
     """
 
     version: int
-    """Counts up with every snapshot, from 1."""
+    """Version number; increases with every snapshot, from 1."""
     gaussians: Gaussians
-    """The canonical Gaussians."""
+    """Canonical Gaussians."""
     field: DeformationField | None
     """Deformation field; None for a static scene."""
     camera: Camera
-    """The camera of the recording's first frame."""
+    """Camera of the recording's first frame."""
     time_window_s: tuple[float, float]
-    """First and last time that the model has seen; other times show the nearest of these."""
+    """First and last observed time in seconds; other times are clamped."""
     training_digest: str | None = None
-    """SHA-256 of the recording that it was trained on, where known."""
+    """SHA-256 of the training recording, if known."""
     unseen_s: Tensor | None = None
     """Time since each Gaussian was last visible, float64 [N], in seconds of the stream.
 
@@ -86,7 +86,7 @@ class Model:
             raise InvalidInput(f"the field deforms {self.field.count} Gaussians, the model has {self.gaussians.count}")
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every tensor of the model by name: `gaussians.*`, then `field.*` in the field's order."""
+        """Return all tensors by name: `gaussians.*`, then `field.*` in the field's order."""
         named = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.tensors().items()}
         if self.field is not None:
             named |= {f"field.{name}": tensor for name, tensor in self.field.state_dict(keep_vars=True).items()}
@@ -94,7 +94,7 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in all tensors."""
+        """Total number of parameters."""
         return sum(tensor.numel() for tensor in self.tensors().values())
 
     def to(self, device: torch.device | str) -> Model:
@@ -121,11 +121,14 @@ class Model:
         return self.gaussians.count
 
     def as_model(self) -> Model:
-        """Itself; a `Snapshot` gives a copy."""
+        """Return the model itself; counterpart of `Snapshot.as_model`."""
         return self
 
     def check_time(self, time_s: float) -> None:
-        """Raise InvalidSetting for a time, in seconds, outside of the model's window, which clamping would show as another time."""
+        """Raise InvalidSetting for a time in seconds outside the model's window.
+
+        Clamping would silently show another time.
+        """
         check_seen_at(time_s, self.time_window_s)
 
     def clamp_time(self, time_s: float) -> float:
@@ -133,7 +136,7 @@ class Model:
         return clamp_time(time_s, continued_window(self.time_window_s, self.field))
 
     def at(self, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`, clamped to the window. The last answer is remembered, so asking again is free."""
+        """Return the Gaussians at `time_s`, clamped to the window; the last result is cached."""
         if self.field is None:
             return self.gaussians
         time_s = self.clamp_time(time_s)
@@ -175,12 +178,15 @@ class Model:
     def render(
         self, time_s: float, camera: Camera | None = None, background: Tensor | None = None, depth: bool = True
     ) -> RenderOutput:
-        """The scene at `time_s` from `camera` (the recording's own when None), without an autograd graph."""
+        """Render the scene at `time_s` without autograd, by default from the recording's camera."""
         with torch.no_grad():
             return render(self.at(time_s), camera or self.camera, background, depth)
 
     def surface(self, time_s: float, camera: Camera | None = None) -> Surface:
-        """Depth, normals, spread and confidence at `time_s` from `camera` (the recording's own when None); see `Surface`."""
+        """Render depth, normals, spread and confidence at `time_s`; see `Surface`.
+
+        The default camera is that of the recording.
+        """
         gaussians = self.at(time_s)
         certain = None if self.unseen_s is None else certainty(self.unseen_s)
         return render_surface(gaussians, camera or self.camera, certain)
@@ -209,7 +215,10 @@ class Model:
         }
 
     def sha256(self) -> str:
-        """Digest of the description and of every tensor's name, type, shape and bytes; the version is not part of it."""
+        """Return the digest of the description and of all tensors (name, dtype, shape, bytes).
+
+        The version is not included.
+        """
         digest = hashlib.sha256()
         for piece in self._canonical_bytes():
             digest.update(piece)

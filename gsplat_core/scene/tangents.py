@@ -15,16 +15,16 @@ from gsplat_core.scene.bilinear import at_positions
 Array = NDArray[np.float64]
 
 CELLS = 20
-"""Cells along the longer side of the picture."""
+"""Number of cells along the longer side of the picture."""
 BEYOND = 0.5
 """Margin of the grid around the picture, as a share of its longer side.
 
 Points farther outside are assigned to the grid's edge.
 """
 REACH = 1.0
-"""Standard deviation, in cells, of the weights with which other cells take part in a fit."""
+"""Standard deviation in cells of the weights of neighbouring cells in a fit."""
 LEAST_SPREAD = 1e-3
-"""Added to the variances of coordinates in a fit, in cells squared, so that a few points in one place have an answer."""
+"""Regularisation in cells² added to the coordinate variances, for degenerate point sets."""
 
 
 class Tangents:
@@ -55,7 +55,7 @@ class Tangents:
         self._inverse = np.linalg.inv(variance + LEAST_SPREAD * np.eye(2))
 
     def __call__(self, points: Array) -> Array:
-        """Unit vectors [N, 2, 3] along both coordinates where the points are at [N, 3]."""
+        """Return the unit tangents [N, 2, 3] for current positions [N, 3]."""
         size = self._size
         middle = points.mean(axis=0) if len(points) else 0.0
         x, q = points - middle, self._q
@@ -66,7 +66,7 @@ class Tangents:
         return np.asarray(along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12))
 
     def _sums(self, values: Array) -> Array:
-        """Weighted sums [rows, columns, C] of values [N, C] around each cell."""
+        """Return weighted sums [rows, columns, C] of values [N, C] around each cell."""
         size = self._size
         sums = [np.bincount(self._cell, self._weights * each, size * size).reshape(size, size) for each in values.T]
         return np.stack([self._spread @ each @ self._spread for each in sums], axis=-1)

@@ -1,1 +1,1 @@
-"""Models as files for other programs; see docs/exports.md."""
+"""Export of models to formats of other programs; see docs/exports.md."""

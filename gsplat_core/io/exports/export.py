@@ -1,4 +1,4 @@
-"""A model, at one time of its window or at several, as a file for other programs."""
+"""Export of a model to a file, at one or several times of its window."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from gsplat_core.scene.model import Model
 
 TIMES_FILE = "times.json"
 NODE_NAME = "reconstruction"
-"""Name of the object in a `.glb`. The file's own name is not in it: the same model gives the same bytes under every name."""
+"""Object name in a `.glb`. Independent of the file name, so equal models give equal bytes."""
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
-"""The earliest date that an archive holds: the same model gives the same bytes."""
+"""Earliest timestamp of a zip archive, used so that equal models give equal bytes."""
 
 
 def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool = False) -> int:
@@ -94,7 +94,7 @@ def with_unit_rotations(gaussians: Gaussians) -> Gaussians:
 
 
 def _write_sequence(model: Model, file: BinaryIO, times_s: list[float]) -> None:
-    """A zip archive, written time by time: memory for one is enough."""
+    """Write a zip archive time by time, holding only one time in memory."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         names = [f"{index:04d}.ply" for index in range(len(times_s))]
         said = {"time_window_s": list(model.time_window_s), "files": dict(zip(names, times_s, strict=True))}

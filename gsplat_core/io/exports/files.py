@@ -30,7 +30,7 @@ class Rows:
     means: Array
     """[N, 3]."""
     rotations: Array
-    """Unit quaternions wxyz [N, 4]; of length 0 before: no rotation."""
+    """Unit quaternions wxyz [N, 4]; those of zero length become the identity."""
     scales: Array
     """Standard deviations [N, 3]."""
     opacities: Array
@@ -40,7 +40,11 @@ class Rows:
 
 
 def rows_of(gaussians: Gaussians) -> Rows:
-    """Raises ExportError where a value is not finite."""
+    """Convert Gaussians to activated host arrays.
+
+    Raises:
+        ExportError: if a value is not finite.
+    """
     raw = {name: tensor.detach().cpu().float().numpy() for name, tensor in gaussians.tensors().items()}
     for name, values in raw.items():
         bad = int(np.count_nonzero(~np.isfinite(values)))
@@ -55,7 +59,7 @@ def rows_of(gaussians: Gaussians) -> Rows:
 
 
 def unit_rotations(quats: Array) -> Array:
-    """Quaternions wxyz of length 1."""
+    """Return normalised quaternions wxyz."""
     # The largest part first: squares of small numbers are 0 in float32.
     largest = np.abs(quats).max(axis=1, keepdims=True)
     none = largest[:, 0] == 0
@@ -67,7 +71,7 @@ ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4)
 
 
 def splat_bytes(rows: Rows) -> bytes:
-    """The file's content."""
+    """Return the bytes of a `.splat` file."""
     table = np.empty(len(rows.means), ROW)
     table["position"], table["scale"] = rows.means, rows.scales
     colour = np.column_stack([0.5 + SH_C0 * rows.sh[:, 0], rows.opacities])
@@ -87,7 +91,7 @@ FLOAT, UNSIGNED_SHORT = 5126, 5123
 ARRAY_BUFFER = 34962
 POINTS = 0
 TURN_X = [1.0, 0.0, 0.0, 0.0]
-"""Half a turn round x, as x, y, z, w."""
+"""Quaternion of a half turn around x, as x, y, z, w."""
 METRES_PER_UNIT = 0.001
 MOST_BYTES = 2**32 - 1
 
@@ -110,7 +114,11 @@ def glb_pieces(rows: Rows, name: str, time_s: float) -> Iterator[bytes]:
 
 
 def packed(document: dict[str, Any], arrays: list[NDArray[Any]]) -> Iterator[bytes]:
-    """A binary glTF file: the document, then the arrays one behind the other, each a multiple of four bytes. Raises ExportError for one too large."""
+    """Yield a binary glTF file: the document, then the arrays, each a multiple of four bytes.
+
+    Raises:
+        ExportError: if the file would be too large.
+    """
     head = json.dumps(document, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
     size = sum(array.nbytes for array in arrays)
@@ -148,7 +156,7 @@ def _attributes(rows: Rows) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """sRGB without its transfer curve (IEC 61966-2-1)."""
+    """Convert sRGB to linear values (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
@@ -200,7 +208,9 @@ FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 
 def mesh_ply_pieces(mesh: Mesh, unit: str, *, with_triangles: bool) -> Iterator[bytes]:
-    """The content of a binary `.ply`: positions, normals, colours in a byte each, and triangles unless it is to be a point cloud."""
+    """Yield a binary `.ply`: positions, normals, 8-bit colours, and triangles unless a
+    point cloud.
+    """
     names = [
         *(f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
         *(f"uchar {c}" for c in ("red", "green", "blue")),
@@ -221,7 +231,11 @@ def mesh_ply_pieces(mesh: Mesh, unit: str, *, with_triangles: bool) -> Iterator[
 
 
 def mesh_glb_pieces(mesh: Mesh, name: str, time_s: float, unit: str) -> Iterator[bytes]:
-    """The content of a `.glb`. Raises ExportError where it would be too large."""
+    """Yield a `.glb` file of a mesh.
+
+    Raises:
+        ExportError: if the file would be too large.
+    """
     colours = np.full((len(mesh.colours), 4), 65535, "<u2")  # the fourth is opacity
     colours[:, :3] = np.round(linear((mesh.colours / np.float32(255)).astype(np.float32)) * 65535)
     attributes = {"POSITION": mesh.vertices, "NORMAL": mesh.normals, "COLOR_0": colours}

@@ -1,4 +1,4 @@
-"""The formats that a model is exported in. No torch is needed to look at them."""
+"""Export formats of models. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFAULT_TIMES = 30
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format by its name."""
+    """Export format with its name and content."""
 
     name: str
     suffix: str
@@ -52,7 +52,11 @@ def format_named(name: str) -> ExportFormat:
 
 
 def format_of(path: Path) -> ExportFormat:
-    """The format that a file's name ends in: of several the one with Gaussians. Raises InvalidSetting."""
+    """Return the format for a file name's suffix; among several, the one with Gaussians.
+
+    Raises:
+        InvalidSetting: if no format has the suffix.
+    """
     for each in FORMATS.values():
         if path.suffix.lower() == each.suffix:
             return each

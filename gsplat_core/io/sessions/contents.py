@@ -1,4 +1,4 @@
-"""A session's recording as a recording: the frames that came in, which replay, evaluate and validate read like any others."""
+"""Session recording as an ordinary recording of its received frames, for replay and evaluation."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class SessionContents:
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
 
-    def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
-        """Frame after frame, with the numbers and times that they had in the session."""
+    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+        """Yield the frames in order, with their numbers and times in the session."""
         return islice(self._frames(findings), limit)
 
     def _frames(self, findings: Findings) -> Iterator[Frame | None]:
@@ -72,7 +72,7 @@ class SessionContents:
             yield frame
 
     def files(self) -> list[Path]:
-        """Every file that is read."""
+        """Return every file that is read."""
         return self.reader.files()
 
     def digest(self) -> str:

@@ -1,4 +1,4 @@
-"""Reading a session's recording: its lines in order, and the frames that came in."""
+"""Reader of a session's recording: its log lines in order, and the received frames."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from gsplat_core.io.sessions.segments import FIELDS, SegmentPictures, SegmentRea
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 MOST_ARRIVED = 64
-"""Frames that came in and may still be prepared for training."""
+"""Maximum number of received frames that may still be prepared for training."""
 _SEGMENT = re.compile(r"\d{6,9}")
 
 
@@ -60,7 +60,7 @@ class SessionReader:
             last = self.segments[-1].seqs[-1] if self.segments[-1].seqs else last
         playable = [segment for segment in self.segments if segment.seqs]
         self.first = playable[0].first if playable else None
-        """The line of the first frame that can be read."""
+        """Log line of the first readable frame."""
         self.fields = frozenset(FIELDS).intersection(*(segment.fields for segment in playable))
         """Optional fields that every readable frame has."""
         self.notes: list[str] = []
@@ -73,13 +73,13 @@ class SessionReader:
         return sum(len(segment.seqs) for segment in self.segments)
 
     def lines(self) -> Iterator[tuple[SegmentReader, Line]]:
-        """Every line of every segment, in order, with its segment."""
+        """Yield every line of every segment in order, with its segment."""
         for segment in self.segments:
             for line in segment.lines():
                 yield segment, line
 
     def frame_lines(self) -> Iterator[FrameLine]:
-        """The lines of the frames that can be read."""
+        """Yield the lines of the readable frames."""
         for segment in self.segments:
             yield from _of(segment)
 
@@ -95,7 +95,7 @@ class SessionReader:
                     yield line, frame_of(line, pictures)
 
     def prepared(self) -> Iterator[Frame]:
-        """The frames as training was given them, in that order; one that cannot be read is left out."""
+        """Yield the frames as passed to training, in order; unreadable ones are skipped."""
         arrived: OrderedDict[int, Frame] = OrderedDict()
         for segment in self.segments:
             there = set(segment.seqs)
@@ -145,7 +145,7 @@ class SessionReader:
                         yield late_depth_of(line, pictures) if segment.there(line) else None
 
     def digests(self) -> Iterator[ShownLine]:
-        """The new pictures that were shown, in order."""
+        """Yield the newly displayed pictures in order."""
         return (line for _, line in self.lines() if isinstance(line, ShownLine) and line.sha256 is not None)
 
     @property
@@ -159,7 +159,7 @@ class SessionReader:
         return next((line for line in self.segments[0].lines() if isinstance(line, ReconstructorMade)), None)
 
     def files(self) -> list[Path]:
-        """Every file that is read, sorted."""
+        """Return every file that is read, sorted."""
         return [self.folder / SESSION_FILE, *(path for segment in self.segments for path in segment.files())]
 
     def _take_notes(self) -> None:
@@ -183,7 +183,7 @@ class SessionReader:
 
 
 def _of(segment: SegmentReader) -> Iterator[FrameLine]:
-    """The lines of a segment's frames that can be read; numbers rise, and a line that repeats one is not ours."""
+    """Yield the lines of a segment's readable frames, ignoring lines that repeat a number."""
     wanted = iter(segment.seqs)
     due = next(wanted, None)
     for line in segment.lines():
@@ -193,7 +193,7 @@ def _of(segment: SegmentReader) -> Iterator[FrameLine]:
 
 
 def frame_of(line: FrameLine, pictures: SegmentPictures) -> Frame | None:
-    """The frame of a line, damaged where a part of it cannot be decoded; None where its image cannot be decoded at all."""
+    """Return the frame of a line, damaged if a part cannot be decoded; None without its image."""
     planes, damage = pictures.of(line)
     return _frame(line, planes, line.damage or damage)
 
@@ -214,7 +214,7 @@ def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -
 
 
 def late_depth_of(line: DepthTaken, pictures: SegmentPictures) -> dict[str, Any] | None:
-    """The fields that a frame got later; None where they cannot be decoded whole."""
+    """Return the late fields of a frame; None if they cannot be decoded completely."""
     planes, damage = pictures.of(line)
     if damage is not None or "depth" not in planes:
         return None
@@ -255,7 +255,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
 
 
 def _segment_folders(folder: Path) -> list[Path]:
-    """The folders of the segments, in order; links are none of them."""
+    """Return the segment folders in order, excluding links."""
     segments = folder / SEGMENTS_FOLDER
     if not segments.is_dir() or segments.is_symlink():
         return []

@@ -38,7 +38,7 @@ def _is_pose(rows: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterValidator(_is_pose)]
-"""[4, 4] row by row, OpenCV axes."""
+"""Matrix [4, 4] in row-major order, OpenCV axes."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
@@ -58,7 +58,7 @@ class Record(BaseModel):
 
 
 class CameraRecord(Record):
-    """Intrinsics, size and pose of a camera: see `gsplat_core.scene.cameras.Camera`."""
+    """Intrinsics, size and pose of a camera; see `gsplat_core.scene.cameras.Camera`."""
 
     model: Literal["pinhole", "ortho", "fisheye"] = "pinhole"
     width_px: Side
@@ -71,14 +71,14 @@ class CameraRecord(Record):
 
 
 class SegmentBegins(Record):
-    """The first line of each log."""
+    """First line of each log."""
 
     event: Literal["segment"] = "segment"
     number: Count
     why: Text
     """Reason for ending the previous segment: "begin", "bytes" or "seconds"."""
     utc: Text
-    """Date and time of day by the machine's clock, for people: ISO 8601."""
+    """Wall-clock date and time in ISO 8601."""
     monotonic_ns: Nanoseconds
     """The same moment on the monotonic clock of `arrived_ns` and `shown_ns`."""
 
@@ -95,7 +95,7 @@ class _FrameLine(Record):
     pose: Pose | None = None
     """World-to-camera."""
     right_camera: CameraRecord | None = None
-    """The right eye's; its pose leads from the left camera's coordinates to its own."""
+    """Camera of the right eye; its pose maps left-camera coordinates to its own."""
     depth_origin: Origin | None = None
     """None if the frame has no depth, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
@@ -121,7 +121,7 @@ class PreparedLine(_FrameLine):
 
 
 class ShownLine(Record):
-    """A picture that was shown."""
+    """Displayed picture."""
 
     event: Literal["shown"] = "shown"
     seq: Count
@@ -139,7 +139,7 @@ class ShownLine(Record):
     """Time from the arrival of the newest frame in the picture until its display."""
     state: Text | None = None
     tracks: Tracks
-    """`shown`: the picture as it was on the screen."""
+    """Track `shown` with the picture as displayed."""
 
 
 class LostLine(Record):
@@ -155,7 +155,7 @@ class LostLine(Record):
 
 
 class DeletedLine(Record):
-    """An older segment that was removed to keep the recording within its bounds."""
+    """Older segment that was deleted to keep the recording within its limits."""
 
     event: Literal["deleted"] = "deleted"
     segment: Count
@@ -163,14 +163,14 @@ class DeletedLine(Record):
 
 
 class NoteLine(Record):
-    """A sentence about the recording."""
+    """Human-readable remark."""
 
     event: Literal["note"] = "note"
     text: Text
 
 
 class SegmentEnds(Record):
-    """The last line of a log that is complete."""
+    """Last line of a complete log."""
 
     event: Literal["end"] = "end"
     why: Text
@@ -186,30 +186,30 @@ Steps = Annotated[int, Field(ge=0, le=10_000_000)]
 
 
 class ReconstructorMade(Record):
-    """A new reconstructor: at the beginning, and after an operator was restarted."""
+    """Creation of a reconstructor: at the start, or after a restart of an operator."""
 
     event: Literal["reconstructor"] = "reconstructor"
     device: Text
     seed: Count
     renderer: Text
     config: dict[str, Any]
-    """The fields of `ReconstructorConfig`."""
+    """Fields of `ReconstructorConfig`."""
     training: dict[str, Any]
-    """The fields of `LiveTraining`."""
+    """Fields of `LiveTraining`."""
     camera: CameraRecord
     stereo: bool = False
     """True if the reconstructor was created for stereo frames."""
 
 
 class SceneBegun(Record):
-    """`LiveReconstructor.begin_scene` was called."""
+    """Call of `LiveReconstructor.begin_scene`."""
 
     event: Literal["begin_scene"] = "begin_scene"
     seq: Count
 
 
 class Observed(Record):
-    """`LiveReconstructor.observe` and then `publish` were called."""
+    """Calls of `LiveReconstructor.observe` and then `publish`."""
 
     event: Literal["observe"] = "observe"
     seq: Count
@@ -218,7 +218,7 @@ class Observed(Record):
 
 
 class DepthTaken(Record):
-    """`LiveReconstructor.take_depth` was called with a frame that was observed before, and with depth that was found since."""
+    """Call of `LiveReconstructor.take_depth` with an already observed frame and its late depth."""
 
     event: Literal["take_depth"] = "take_depth"
     seq: Count
@@ -230,14 +230,14 @@ class DepthTaken(Record):
 
 
 class Grown(Record):
-    """`LiveReconstructor.grow` was called with the frame that was observed last."""
+    """Call of `LiveReconstructor.grow` with the last observed frame."""
 
     event: Literal["grow"] = "grow"
     seq: Count
 
 
 class Rehearsed(Record):
-    """`LiveReconstructor.rehearse` was called."""
+    """Call of `LiveReconstructor.rehearse`."""
 
     event: Literal["rehearse"] = "rehearse"
     steps: Steps
@@ -256,7 +256,7 @@ _UNKNOWN_EVENT = "union_tag_invalid"
 
 
 class LogWriter:
-    """Appends lines to a new file. Raises OSError."""
+    """Writer that appends lines to a new file; methods raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -276,7 +276,7 @@ class LogWriter:
         os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
-        """Closing twice is allowed."""
+        """Close the file; repeated calls have no effect."""
         self._file.close()
 
 
@@ -309,7 +309,7 @@ MAX_BYTES = 1 << 20
 
 
 class SessionInfo(Record):
-    """The whole of `session.json`."""
+    """Content of `session.json`."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 
@@ -320,21 +320,21 @@ class SessionInfo(Record):
     utc: Text
     """Start of the recording in ISO 8601."""
     fps: float = Field(gt=0, le=10_000)
-    """Nominal frames per second."""
+    """Nominal frame rate in Hz."""
     camera: CameraRecord
-    """The camera of the first frame."""
+    """Camera of the first frame."""
     fields: tuple[Literal["mask", "depth", "right_image", "pose"], ...] = ()
     """Optional fields that every frame of the source has."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """The settings of the run, for people and programs that know them."""
+    """Settings of the run, as free-form data."""
     keeps_bytes: Count | None = None
-    """Segments beyond so many bytes are deleted, the oldest first; absent: none."""
+    """Size limit in bytes beyond which the oldest segments are deleted; None for no limit."""
     keeps_s: float | None = Field(default=None, ge=0)
-    """Segments that ended longer ago are deleted; absent: none."""
+    """Age limit in seconds beyond which segments are deleted; None for no limit."""
 
 
 def camera_record(camera: Camera) -> CameraRecord:
-    """A camera as it is written."""
+    """Convert a camera to its record."""
     return CameraRecord(
         model=camera.model,
         width_px=camera.width_px,
@@ -348,7 +348,11 @@ def camera_record(camera: Camera) -> CameraRecord:
 
 
 def camera_of(record: CameraRecord) -> Camera:
-    """The camera that was written. Raises InvalidInput for one that cannot be."""
+    """Convert a record to a camera.
+
+    Raises:
+        InvalidInput: if the values are invalid.
+    """
     K = np.array([[record.fx, 0, record.cx], [0, record.fy, record.cy], [0, 0, 1]])
     pose = np.array(record.world_to_camera).reshape(4, 4)
     return Camera(K, record.width_px, record.height_px, pose, record.model)

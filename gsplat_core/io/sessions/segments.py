@@ -1,6 +1,6 @@
-"""Segments of a session's recording: a folder with a log and a video file for each track and size.
+"""Segments of a session's recording: a folder with a log and a video file per track and size.
 
-A segment that was cut by a crash is read as far as its files are complete.
+A segment truncated by a crash is readable as far as its files are complete.
 """
 
 from __future__ import annotations
@@ -38,19 +38,22 @@ Stage = Literal["", "prepared_", "late_"]
 passed to training later.
 """
 MOST_FILES = 64
-"""Tracks and sizes; a segment that needs more of them ends."""
+"""Maximum number of track files; a segment that needs more is ended."""
 
 
 def track_file(stage: str, track: str, height_px: int, width_px: int) -> str:
-    """The name of a track's file."""
+    """Return the file name of a track."""
     return f"{stage}{track}_{width_px}x{height_px}.mkv"
 
 
 class SegmentWriter:
-    """Writes one segment. The pictures of a line are written before the line. Raises OSError and av.FFmpegError."""
+    """Writer of one segment; pictures are written before the line that names them.
+
+    Methods raise OSError and av.FFmpegError.
+    """
 
     def __init__(self, folder: Path, begins: SegmentBegins, *, fps: float, shown: Coding) -> None:
-        """folder: made here. shown: how shown pictures are coded."""
+        """Create the segment's folder and log; `shown` is the coding of displayed pictures."""
         folder.mkdir()
         self.folder = folder
         self.number, self.begun_ns = begins.number, begins.monotonic_ns
@@ -86,12 +89,12 @@ class SegmentWriter:
         return self._tracks[name].write(picture, (pts_ns - self._start_ns) // 1_000_000)
 
     def line(self, line: Record) -> None:
-        """Add a line to the log."""
+        """Append a line to the log."""
         self._log.write(line)
         self.frames += isinstance(line, FrameLine)
 
     def sync(self) -> None:
-        """Force everything to the disk, the pictures before the lines that name them."""
+        """Sync everything to disk, pictures before the lines that name them."""
         for track in self._tracks.values():
             track.sync()
         self._log.sync()
@@ -123,27 +126,27 @@ class SegmentWriter:
 
 
 PictureLine = FrameLine | PreparedLine | ShownLine | DepthTaken
-"""Lines that pictures belong to."""
+"""Log lines with pictures."""
 FIELDS = ("right_image", "mask", "depth", "pose")
 MOST_OPEN = 128
-"""Files of one segment; a log that names more is not ours."""
+"""Maximum number of files of a segment; a log that names more is invalid."""
 
 
 class SegmentReader:
-    """A segment's lines, and the pictures that belong to them."""
+    """Reader of a segment's lines and pictures."""
 
     def __init__(self, folder: Path, after_seq: int = -1) -> None:
-        """after_seq: the last frame of the segments before."""
+        """Open a segment; `after_seq` is the last frame number of the previous segments."""
         self.folder = folder
         self.begins: SegmentBegins | None = None
         self.ends: SegmentEnds | None = None
         """Last line of the log; None if the log is truncated or still being written."""
         self.named = 0
-        """Frames that the log names."""
+        """Number of frames named by the log."""
         self.seqs = array("q")
-        """The frames that can be read, in order."""
+        """Sequence numbers of the readable frames, in order."""
         self.first: FrameLine | None = None
-        """The line of the first of them."""
+        """Line of the first readable frame."""
         self.fields = frozenset(FIELDS)
         """Optional fields that all frames have."""
         self._indices: dict[str, TrackIndex | None] = {}
@@ -166,11 +169,11 @@ class SegmentReader:
         )
 
     def open(self) -> SegmentPictures:
-        """The pictures, for one pass over the lines."""
+        """Open the pictures for one pass over the lines."""
         return SegmentPictures(self._indices, self.folder)
 
     def files(self) -> list[Path]:
-        """The files of this segment that are read."""
+        """Return the files of this segment that are read."""
         return sorted([self.folder / LOG_FILE, *(index.path for index in self._indices.values() if index is not None)])
 
     def _look(self, after_seq: int) -> None:
@@ -218,7 +221,7 @@ class SegmentReader:
 
 
 class SegmentPictures:
-    """Decodes the pictures of a segment; use as a context manager, and ask in the order of the lines."""
+    """Decoder of a segment's pictures, as a context manager; request them in line order."""
 
     def __init__(self, indices: dict[str, TrackIndex | None], folder: Path) -> None:
         self._indices, self._folder = indices, folder

@@ -1,7 +1,7 @@
-"""Tracks of a session segment: pictures of one size in a Matroska file, each in a cluster of its own with a checksum.
+"""Tracks of a session segment: pictures of one size in a Matroska file with checksums.
 
-Pictures are coded without loss by FFV1 (RFC 9043), or for viewing by VP9. The reader first finds the pictures that are complete, then decodes the
-requested ones in order.
+Each picture has a cluster of its own. Pictures are coded losslessly with FFV1 (RFC 9043), or with
+VP9 for viewing. The reader indexes the complete pictures, then decodes requested ones in order.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _FLOAT_BYTES = 4
 
 
 def encoder_options(coding: Coding, height_px: int, width_px: int) -> dict[str, str]:
-    """The encoder's options for pictures that are coded with these sides."""
+    """Return encoder options for a coding and picture size."""
     if coding == "vp9":
         return _VP9
     # Four slices limit the damage of a flipped bit. Tiny pictures cannot be split into four.
@@ -65,14 +65,18 @@ def encoder_options(coding: Coding, height_px: int, width_px: int) -> dict[str, 
 
 
 def coded_size(coding: Coding, height_px: int, width_px: int) -> tuple[int, int]:
-    """Height and width of the pictures in the file."""
+    """Return height and width of the coded pictures."""
     if coding == "vp9":
         return height_px + height_px % 2, width_px + width_px % 2
     return (_FLOAT_BYTES * height_px if coding == "float" else height_px), width_px
 
 
 def encoded(coding: Coding, picture: NDArray[Any]) -> av.VideoFrame:
-    """A picture as the encoder takes it. Raises InvalidInput for an array that the coding is not for."""
+    """Convert a picture to the encoder's pixel format.
+
+    Raises:
+        InvalidInput: if the array does not fit the coding.
+    """
     if coding == "colour":
         _require(picture, np.uint8, 3)
         frame = av.VideoFrame(picture.shape[1], picture.shape[0], "bgr0")
@@ -130,7 +134,7 @@ def _pixels(frame: av.VideoFrame, channels: int) -> NDArray[np.uint8]:
 
 
 MOST_MS_AHEAD = 3_600_000
-"""A clock that jumps further ahead is followed so far: the log has the true times, the file's are for players."""
+"""Largest timestamp step in ms; later clock jumps are clamped. The log has the true times."""
 _MS = Fraction(1, 1000)
 _MUXER = {
     # Each packet is written as a cluster of its own with a CRC-32, so a truncated file loses only
@@ -142,7 +146,10 @@ _MUXER = {
 
 
 class TrackWriter:
-    """Codes pictures into a new file. Raises OSError and av.FFmpegError, after which only `abandon` may be called."""
+    """Encoder of pictures into a new file.
+
+    Methods raise OSError and av.FFmpegError. After an error only `abandon` may be called.
+    """
 
     def __init__(self, path: Path, coding: Coding, height_px: int, width_px: int, fps: float) -> None:
         self.path, self.coding = path, coding
@@ -187,14 +194,14 @@ class TrackWriter:
         os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
-        """Write the last picture, the index and the length, and force them to the disk."""
+        """Write the last picture, index and duration, and sync the file to disk."""
         self._mux(None)
         self._container.close()
         self.sync()
         self._file.close()
 
     def abandon(self) -> None:
-        """Let go of the file as it is."""
+        """Release the file without finishing it."""
         with suppress(OSError, av.FFmpegError):  # it could not be written before either
             self._container.close()
         self._file.close()
@@ -266,7 +273,7 @@ class TrackIndex:
 
 
 class TrackReader:
-    """Decodes pictures of one track; ask for them in the order of their times."""
+    """Decoder of a track's pictures; timestamps must be requested in increasing order."""
 
     def __init__(self, index: TrackIndex, track: str, height_px: int, width_px: int) -> None:
         self._index, self._size = index, (height_px, width_px)
@@ -301,7 +308,7 @@ class TrackReader:
             pictures.close()  # type: ignore[attr-defined]
 
     def _decode(self) -> Iterator[tuple[int, NDArray[Any] | None, str | None]]:
-        """Time, picture and damage of all pictures."""
+        """Yield timestamp, picture and damage of all pictures."""
         with (
             open_plain(self._index.path) as file,
             open_container(_Beginning(file, self._index.end), Container("matroska")) as container,  # type: ignore[arg-type]
@@ -347,7 +354,7 @@ def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> 
 
 
 class _Beginning(io.RawIOBase):
-    """The first bytes of a file, as if it ended there."""
+    """Prefix of a file, presented as if the file ended there."""
 
     def __init__(self, file: io.BufferedIOBase | Any, end: int) -> None:
         self._file, self._end, self._at = file, end, 0

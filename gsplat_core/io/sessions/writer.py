@@ -46,7 +46,7 @@ _NAMED_AFTER_ITS_TIME = re.compile(r"\d{8}T\d{6}Z(-\d+)?")
 
 @dataclass(frozen=True)
 class KeptPart:
-    """A segment that is complete, or an earlier session."""
+    """Complete segment, or an earlier session."""
 
     folder: Path
     bytes: int
@@ -81,7 +81,7 @@ class Retention:
         return sum(part.bytes for part in self._parts if part.segment is not None)
 
     def add(self, part: KeptPart) -> None:
-        """The newest part so far."""
+        """Add the newest part."""
         self._parts.append(part)
 
     def give_up(self, now_ns: int) -> Iterator[tuple[KeptPart, str | None]]:
@@ -111,14 +111,14 @@ class Retention:
 
 
 def remove_whole(folder: Path) -> None:
-    """Remove a folder. It is renamed first: a reader finds it whole or not at all, whenever the program ends."""
+    """Delete a folder after renaming it, so that readers see it complete or not at all."""
     away = folder.with_name(DELETING + folder.name)
     folder.rename(away)
     shutil.rmtree(away)
 
 
 def finish_removals(recordings: Path) -> Iterator[tuple[Path, str]]:
-    """Remove the sessions that an earlier program had begun to remove; those that cannot be, each with the reason."""
+    """Resume deletions interrupted in an earlier run; yield those that fail, with the reason."""
     for path in recordings.glob(f"{DELETING}*"):
         if path.is_dir() and not path.is_symlink():
             try:
@@ -160,11 +160,11 @@ class WriterOptions:
     """
     segment_bytes: int = 256 * 2**20
     segment_s: float = 60.0
-    """A segment ends when it has so many bytes, or is so old."""
+    """Size and age limits of a segment."""
     keep_bytes: int | None = None
-    """Remove the oldest segments when all of them take more; None: keep them."""
+    """Size limit in bytes beyond which the oldest segments are deleted; None for no limit."""
     keep_s: float | None = None
-    """Remove segments that ended longer ago; None: keep them."""
+    """Age limit in seconds beyond which segments are deleted; None for no limit."""
     with_earlier: bool = False
     """Apply both limits to all sessions in the parent folder; earlier sessions are
     deleted first.
@@ -195,12 +195,12 @@ class Shown:
     on_screen: NDArray[np.uint8] | None = None
     """Picture with its status overlay; None if displayed as rendered."""
     new: bool = True
-    """False: the picture was there before, and only its state or age has changed."""
+    """False if only status or age of the picture on the screen changed."""
     shown_ns: int | None = None
     """Display time in nanoseconds of `time.monotonic_ns`."""
     age_ns: int | None = None
     state: str | None = None
-    """`live`, `stale`, …"""
+    """Status label: `live`, `stale`, …"""
 
 
 class SessionWriter:
@@ -241,7 +241,7 @@ class SessionWriter:
         return self._kept.segment_bytes + self._segment.bytes
 
     def frame(self, frame: Frame) -> None:
-        """A frame that came in."""
+        """Record a received frame."""
         self._go_on()
         tracks = self._pictures("", _planes(frame, _PLANES), frame.pts_ns)
         self._segment.line(FrameLine(**_said(frame), tracks=tracks))
@@ -270,7 +270,7 @@ class SessionWriter:
         self._segment.line(PreparedLine(**_said(frame), tracks=tracks, same=tuple(same)))
 
     def late_depth(self, frame: Frame) -> None:
-        """The depth of a frame, which training was given after the frame itself."""
+        """Record the depth of a frame that was passed to training after the frame."""
         self._go_on()
         origin: Any = (frame.depth_origin or DepthOrigin.MEASURED).value
         tracks = self._pictures("late_", _planes(frame, _DEPTHS), frame.pts_ns)
@@ -280,7 +280,7 @@ class SessionWriter:
         )
 
     def shown(self, shown: Shown) -> None:
-        """A picture that was shown."""
+        """Record a displayed picture."""
         self._go_on()
         frame, rendered = shown.frame, np.ascontiguousarray(shown.rendered)
         tracks: dict[TrackName, int] = {}
@@ -315,7 +315,7 @@ class SessionWriter:
         self._segment.close(why)
 
     def abandon(self, why: str) -> None:
-        """Let go of all files as they are, because they cannot be written."""
+        """Release all files without finishing them, after a failed write."""
         self._segment.abandon(why)
 
     def _pictures(self, stage: Stage, planes: dict[TrackName, NDArray[Any]], pts_ns: int) -> dict[TrackName, int]:
@@ -327,7 +327,7 @@ class SessionWriter:
         }
 
     def _go_on(self) -> None:
-        """Before each line: sync, begin another segment, remove old ones, when it is time."""
+        """Sync, start the next segment and delete old ones when due; called before each line."""
         now = self.options.clock()
         if now - self._synced_ns >= self.options.sync_s * 1e9:
             self._segment.sync()
