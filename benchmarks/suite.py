@@ -1,8 +1,8 @@
 """Run the published benchmarks and write a log line for every result.
 
     python benchmarks/suite.py --device cpu                       # as in `make bench`
-    python benchmarks/suite.py --device cuda --minutes 9 --only live_cutting live_heart python
-        benchmarks/suite.py --device cuda --list
+    python benchmarks/suite.py --device cuda --minutes 9 --only live_cutting live_heart
+    python benchmarks/suite.py --device cuda --list
 
 `BENCHMARKS` defines all published benchmarks: name, command and number of runs. Each JSON line
 printed by a command becomes a line of `benchmarks/logs/DEVICE/NAME.jsonl`, with command, commit,

@@ -74,7 +74,7 @@ class HostCopy:
         tensor = tensor.detach()
         self._arrived: torch.cuda.Event | None = None
         if tensor.device.type == "cuda":
-            # Into page-locked memory, which torch keeps for later copies.
+            # Copy to page-locked memory, which torch's allocator keeps for later copies.
             self._values = tensor.contiguous().to("cpu", non_blocking=True)
             self._arrived = torch.cuda.Event()
             self._arrived.record(torch.cuda.current_stream(tensor.device))

@@ -37,7 +37,7 @@ class NumberIn:
 
     def checked(self, name: str, value: object) -> float:
         """Return the value, or raise InvalidInput if it is outside the range."""
-        # Compared before it becomes a float: an integer may be larger than any float.
+        # Compare before the conversion to float, which overflows for huge integers.
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
         assert math.isfinite(value)

@@ -12,7 +12,8 @@ import torch
 
 from tests.missing import missing
 
-# A shell starts background jobs with SIGINT ignored, and so would be the programs that tests interrupt.
+# Shells start background jobs with SIGINT ignored, which programs interrupted by tests would
+# inherit.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -50,7 +50,7 @@ class BasisSlot:
     """Reusable basis field with spare capacity for Gaussians and bumps; unused places are inert."""
 
     def __init__(self, source: BasisField, rows: int) -> None:
-        # A ring has its places from the start, and the copy has the same ones.
+        # A ring has all places from the start, and the copy needs the same number.
         places = source.columns.places if source.columns.is_ring else bump_capacity(source.bumps)
         with torch.device(source.weights.device):
             self.field = type(source)(rows, source.time_window_s, bumps=places)
@@ -422,7 +422,7 @@ class CapturedBasisTraining:
         return list(vars(basis_rates(rates)).values())
 
     def tensors(self) -> Sequence[Tensor]:
-        # Asked for at every step; a field that is extended or appended to gets other parameters.
+        # Cached, because every step calls this. Extending or appending replaces the parameters.
         if self._tensors_of is not self._field.weights:
             self._tensors, self._tensors_of = self._field.training_tensors(), self._field.weights
         return self._tensors

@@ -309,7 +309,7 @@ class HexPlaneField(DeformationField):
         rows = self.resolution[3]
         t = torch.tensor(
             self.frame_time(time_s), dtype=self.box.dtype
-        )  # on the CPU: reading it back from a GPU would wait
+        )  # kept on the CPU, because reading it from a GPU would synchronise
         at = float((t + 1) / 2 * (rows - 1))
         row = min(int(at), rows - 2)
         return [torch.lerp(plane[row], plane[row + 1], at - row) for plane in planes]

@@ -13,7 +13,8 @@ from gsplat_core.scene.gaussians import Gaussians
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {
-        "auto": "gsplat_core.deformation.basis:KIND",  # the better one in benchmarks/notes/replay.md
+        # the better field according to benchmarks/notes/replay.md
+        "auto": "gsplat_core.deformation.basis:KIND",
         "basis": "gsplat_core.deformation.basis:KIND",
         "hexplane": "gsplat_core.deformation.hexplane:KIND",
     },

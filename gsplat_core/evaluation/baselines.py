@@ -65,7 +65,7 @@ def _flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> NDArray[np.fl
         return None
     finder = getattr(_per_thread, "finder", None)
     if finder is None:
-        # It keeps buffers between two calls, so that each thread has its own.
+        # The flow finder keeps buffers between calls, so each thread has its own.
         finder = _per_thread.finder = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow: Any = finder.calc(_grey(source), _grey(target), None)  # type: ignore[call-overload]  # None: a new array, which the stubs leave out
     return np.asarray(flow, np.float32)

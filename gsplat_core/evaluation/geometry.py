@@ -1,10 +1,11 @@
 """Geometric accuracy of a finished model over a whole sequence, with trivial baselines.
 
-* depth and normals, if the recording has depth; baseline: the best flat plane * novel views, if it
-has further cameras or a right eye; baseline: the left picture * tracked points and flow, if it has
-them; baseline: no motion * trajectory, if it has poses and the model uses others; baseline: a
-static scope * parts of the deformation: shares of the pictures' change explained by motion, by
-colour, and by size and opacity
+* depth and normals, if the recording has depth; baseline: the best flat plane
+* novel views, if it has further cameras or a right eye; baseline: the left picture
+* tracked points and flow, if it has them; baseline: no motion
+* trajectory, if it has poses and the model uses others; baseline: a static scope
+* parts of the deformation: shares of the pictures' change explained by motion, by colour, and by
+  size and opacity
 
 Lengths are compared in the left camera's coordinates frame by frame, so the origin of a model does
 not matter. For a model of unknown scale, the `scaled` figures multiply all lengths by one factor

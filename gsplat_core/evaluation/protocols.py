@@ -1,9 +1,9 @@
 """Offline protocols that render a model for the frames of a recording and score the pictures.
 
-* `evaluate_heldout`: frames excluded from training, rendered from a finished model *
-`evaluate_causal`: each frame is predicted before it is trained on, from its time and pose and the
-previous frame's exposure * `evaluate_retention`: earlier frames and revisited places, rendered from
-the final model
+* `evaluate_heldout`: frames excluded from training, rendered from a finished model
+* `evaluate_causal`: each frame is predicted before it is trained on, from its time and pose and
+  the previous frame's exposure
+* `evaluate_retention`: earlier frames and revisited places, rendered from the final model
 """
 
 from __future__ import annotations

@@ -181,7 +181,8 @@ def _read_manifest(folder: Path, name: str) -> Manifest:
 def _skeleton(path: Path, manifest: Manifest) -> tuple[Gaussians, DeformationField | None]:
     try:
         return manifest.skeleton()
-    except (InvalidInput, RuntimeError) as error:  # torch: more elements than it can count
+    # torch raises for more elements than it can count
+    except (InvalidInput, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise BundleCorrupt(f"the manifest of {path} describes no valid model: {reason}") from error
 
@@ -260,7 +261,7 @@ def _check_tensors(path: Path, tensors: dict[str, Tensor], expected: dict[str, T
 
 def _check_finite(tensors: dict[str, Tensor], consequence: str) -> None:
     for name, tensor in tensors.items():
-        # A sum is finite only when all terms are, unless it overflows: then the terms are counted.
+        # A sum is finite only if all terms are, unless it overflows. Check the terms in that case.
         if not bool(torch.isfinite(tensor.sum())):
             bad = int((~torch.isfinite(tensor)).sum())
             if bad:

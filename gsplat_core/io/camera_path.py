@@ -133,10 +133,10 @@ def _turned(first: NDArray[np.float64], second: NDArray[np.float64], share: floa
     """Interpolate between two rotations [3, 3] by `share` along the geodesic
     (Rodrigues' formula).
     """
-    import cv2  # a process that reads no path needs none
+    import cv2  # imported lazily, because most processes read no path
 
     between, _ = cv2.Rodrigues(first.T @ second)
     part, _ = cv2.Rodrigues(share * between)
-    # A product of rotations that are nearly ones; a rotation all the same.
+    # Re-orthonormalise the product of rounded rotations.
     u, _, v = np.linalg.svd(first @ part)
     return np.asarray(u @ v)

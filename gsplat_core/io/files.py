@@ -165,7 +165,7 @@ class PartialFile:
         """Remove the temporary file unless it is finished."""
         if self.path not in _unfinished:
             return
-        with contextlib.suppress(OSError):  # buffered bytes of a full disk: they are given up anyway
+        with contextlib.suppress(OSError):  # buffered bytes of a full disk are discarded anyway
             self.file.close()
         self.path.unlink(missing_ok=True)
         _unfinished.discard(self.path)

@@ -24,7 +24,7 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 1 << 20
 
-# The range of every value; docs/design/bundle.md has them too.
+# Permitted range of every value, also listed in docs/design/bundle.md.
 VERSION = IntegerIn(1, (1 << 53) - 1)
 COUNT = IntegerIn(0, 50_000_000)
 SH_DEGREE = IntegerIn(0, MAX_SH_DEGREE)

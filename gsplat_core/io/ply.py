@@ -110,7 +110,8 @@ def load_ply(path: str | Path) -> Gaussians:
 def _columns(rows: NDArray[np.void], names: tuple[str, ...] | list[str], path: Path) -> NDArray[np.float32]:
     columns = np.empty((len(rows), len(names)), dtype=np.float32)
     for i, name in enumerate(names):
-        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused below
+        # a double beyond float32 becomes infinite and is rejected below
+        with np.errstate(over="ignore"):
             columns[:, i] = rows[name]
         bad = int(np.count_nonzero(~np.isfinite(columns[:, i])))
         if bad:

@@ -102,7 +102,7 @@ class _Instances:
                 used &= masks.reshape(-1)[tile]
             ids = flatten_ids.long()[used]
             counts = torch.bincount(tile[used], minlength=len(sizes)).tolist()
-        # Gathered and split once: indexing tile by tile would cost a gradient of all splats per tile.
+        # Gather and split once. Indexing per tile would cost a gradient of all splats per tile.
         self.ids = ids.split(counts)
         self.values = values[ids].split(counts)
         self.absolute: Tensor | None = None
@@ -153,7 +153,8 @@ class _Instances:
         dx, dy = (means - pixels[:, None]).unbind(-1)
         a, b, c = conics.unbind(-1)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        # Not clamp: its gradient is zero at the bound, which sigma reaches where the mean is on a pixel's centre.
+        # Not clamp, whose gradient is zero at the bound; sigma is 0 for a mean at the pixel's
+        # centre.
         falloff = torch.exp(-torch.where(sigma >= 0, sigma, 0))
         alpha = (opacities * falloff).clamp(max=self.max_alpha)
         alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0)

@@ -53,7 +53,7 @@ def render_frame(
         require_shape("deltas", deltas, (n, RAW_COLUMNS), "[N, 16]")
         require_same_kind(means=means, deltas=deltas)
         raw = raw + deltas[:, : raw.shape[1]]
-    # Picked before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
+    # Select before any arithmetic, because a masked NaN would still reach the gradient.
     usable = (raw.isfinite().all(1) & sh.isfinite().flatten(1).all(1)).nonzero()[:, 0]
     mean, quat, log_scale, dc, logit = (
         raw[usable][:, group] for group in (POSITION, ROTATION, LOG_SCALE, COLOUR, OPACITY)

@@ -50,7 +50,7 @@ def masked_l1(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
     """
     _same_shape(image, target, "image and target")
     keep = _tissue(mask, image)
-    # The difference is formed of masked images: a NaN under the tool would reach the gradient through abs.
+    # Mask both images before the difference, because abs would pass a masked NaN to the gradient.
     zero = torch.zeros_like(image)
     return _mean_where((torch.where(keep, image, zero) - torch.where(keep, target, zero)).abs(), keep)
 

@@ -34,7 +34,8 @@ def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Te
     x, y, z = p.unbind(-1)
     fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
-    # The linearisation explodes far off axis, so it is taken at the border of a slightly larger field of view.
+    # The linearisation diverges far off axis, so it is evaluated at the border of a slightly larger
+    # view.
     slope_x = torch.minimum(torch.maximum(x / z, -(cx / fx + margin_x)), (width - cx) / fx + margin_x)
     slope_y = torch.minimum(torch.maximum(y / z, -(cy / fy + margin_y)), (height - cy) / fy + margin_y)
     zero = torch.zeros_like(x)
@@ -115,7 +116,8 @@ def fully_fused_projection(
     """
     check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
     check_projection_options(width, height, sparse_grad, camera_model, compensation_floor)
-    # Unusable Gaussians are replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
+    # Replace unusable Gaussians before any arithmetic, because a masked NaN would reach the
+    # gradient.
     usable = _usable(means, covars, quats, scales, opacities)
     covariance = _covariance(usable, covars, quats, scales)
     means = torch.where(usable[..., None], means, torch.zeros_like(means))

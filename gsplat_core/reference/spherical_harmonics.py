@@ -63,7 +63,7 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
     count = (degrees_to_use + 1) ** 2
     coeffs = coeffs[..., :count, :]
     if masks is not None:
-        # Replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
+        # Replace before any arithmetic, because a masked NaN would still reach the gradient.
         dirs = torch.where(masks[..., None], dirs, torch.ones_like(dirs))
         coeffs = torch.where(masks[..., None, None], coeffs, torch.zeros_like(coeffs))
     if degrees_to_use == 0:

@@ -115,7 +115,7 @@ def checked_winners(totals: Tensor, lowest: int) -> Tensor:
     """
     height, width, count = totals.shape
     numbers = torch.arange(count, device=totals.device)
-    keys = totals * 256 + numbers  # of equal totals the lowest disparity's
+    keys = totals * 256 + numbers  # ties select the lowest disparity
     best_key = keys.amin(2)
     best, least = best_key % 256, best_key // 256
     rival = (totals * (100 - UNIQUENESS_PERCENT) < 100 * least[..., None]) & ((numbers - best[..., None]).abs() > 1)

@@ -101,7 +101,8 @@ class AlphaRenderer:
             frames = made
             self._by_slot[slot.number] = key, frames
         if self._frames is not None and self._frames.gaussians.count == frames.gaussians.count:
-            frames.capacity = self._frames.capacity  # one overflow is enough for all slots
+            # an overflow in one slot raises the capacity of all
+            frames.capacity = self._frames.capacity
         return frames
 
     def _new_frames(self, model: Model | Snapshot, *, recompute: bool) -> FrameRenderer | None:

@@ -134,7 +134,7 @@ class FrameRenderer:
         assert self._asked is not None
         self._controls.set(*self._asked)
         if self._captured is None or self._captured_capacity != self.capacity:
-            self._captured = None  # its memory serves the next capture
+            self._captured = None  # frees its memory for the next capture
             self._captured = CapturedSequence(self._sequence, self.gaussians.device, self._memory, warm_up=True)
             self._captured_capacity = self.capacity
         self._captured.replay()

@@ -177,7 +177,7 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
     batch_dims, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
     if covars is not None:
         require_shape("covars", covars, (*batch_dims, n_gaussians, 3, 3), "[..., N, 3, 3]")
-        # Not by an index of lists: on CUDA the host would wait until they are on the device.
+        # Indexing with lists would synchronise on CUDA.
         covars = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
         quats = scales = None
     coloring = None

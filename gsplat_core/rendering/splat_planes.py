@@ -107,7 +107,8 @@ def _jacobian(local: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
         return torch.stack([fx, zero, zero, zero, fy, zero], -1).unflatten(-1, (2, 3))
     if camera.model == "pinhole":
         return torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).unflatten(-1, (2, 3))
-    # Towards the edge of a fisheye's picture z is no good measure of distance; a splat's depth is that of its centre there.
+    # Near the edge of a fisheye picture z does not measure distance. Use the depth of the centre
+    # there.
     return local.new_zeros(len(local), 2, 3)
 
 

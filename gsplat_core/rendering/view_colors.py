@@ -45,7 +45,8 @@ def view_colors(
     def shown(values: Tensor) -> Tensor:
         return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
 
-    values = evaluate(visible)  # tested before they are clamped, which would turn minus infinity into black
+    # checked before clamping, which would turn minus infinity into black
+    values = evaluate(visible)
     if values.is_cuda and ops.zero_gradients_stay_zero:
         finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
         return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsplat_core.errors import InvalidInput
 
-# Imported where a tensor is made: a process that only reads frames needs no torch, and starts three times as fast without it.
+# Imported lazily: a process that only reads frames needs no torch and starts three times as fast.
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
@@ -99,7 +99,7 @@ class Camera:
         """
         import torch
 
-        # One copy for both. CUDA takes so few bytes at once, so that they need not stay where they are.
+        # One copy for both. CUDA copies so few bytes immediately, so the source may be freed.
         values = np.concatenate([self.world_to_camera.ravel(), self.K.ravel()])
         both = torch.tensor(values, dtype=dtype or torch.float32)
         both = both.to(device, non_blocking=True)
@@ -155,6 +155,6 @@ class Camera:
         return hash(self._key())
 
     def _key(self) -> tuple[bytes, bytes, int, int, str]:
-        # Adding 0.0 makes -0.0 and 0.0 the same bytes, as they are the same number.
+        # Adding 0.0 gives -0.0 and 0.0 identical bytes.
         pose = self.world_to_camera + 0.0
         return (self.K + 0.0).tobytes(), pose.tobytes(), self.width_px, self.height_px, self.model

@@ -80,7 +80,8 @@ class Gaussians:
     @property
     def opacities(self) -> Tensor:
         """Opacities [N] in 0..1."""
-        # torch.sigmoid rounds differently at the ends of each thread's share; tanh does not, and is the same function.
+        # torch.sigmoid rounds differently at the ends of each thread's share. The equivalent tanh
+        # form does not.
         return 0.5 + 0.5 * torch.tanh(0.5 * self.logit_opacities)
 
     @property

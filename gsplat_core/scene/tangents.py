@@ -46,7 +46,7 @@ class Tangents:
         self._cell, self._weights = row * size + column, weights
         steps = np.arange(size)
         self._spread = np.exp(-0.5 * ((steps[:, None] - steps) / REACH) ** 2)
-        # Coordinates count from the cell's middle of the grid, so that sums of their squares stay exact.
+        # Coordinates are relative to the grid's centre, so sums of their squares stay exact.
         self._q = q = at - size / 2
         self._total = np.maximum(self._sums(np.ones((len(q), 1))), 1e-12)
         self._mean = self._sums(q) / self._total

@@ -60,7 +60,7 @@ def rows_of(gaussians: Gaussians) -> Rows:
 
 def unit_rotations(quats: Array) -> Array:
     """Return normalised quaternions wxyz."""
-    # The largest part first: squares of small numbers are 0 in float32.
+    # Divide by the largest component first, because squares of small numbers underflow in float32.
     largest = np.abs(quats).max(axis=1, keepdims=True)
     none = largest[:, 0] == 0
     scaled = np.where(none[:, None], np.array([1, 0, 0, 0], np.float32), quats / np.where(largest == 0, 1, largest))

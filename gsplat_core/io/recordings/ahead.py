@@ -32,7 +32,8 @@ def read_ahead(items: Generator[T, None, None], name: str, ahead: int = ITEMS_AH
         yield from made.taken()
     finally:
         made.stop()
-        if thread is not threading.current_thread():  # a forgotten generator is closed wherever Python finds it
+        # the garbage collector may close the generator in any thread
+        if thread is not threading.current_thread():
             thread.join()
 
 

@@ -369,7 +369,7 @@ def _distortion(numbers: Sequence[float] | Any, name: str) -> Numbers:
         if np.any(found[8:]):
             raise _Unusable(f"{name} has {found.size} numbers; up to 8 are understood")
         found = found[:8]
-    # The next length that OpenCV knows.
+    # Next number of distortion coefficients supported by OpenCV.
     return np.pad(found, (0, next(length for length in (4, 5, 8) if length >= found.size) - found.size))
 
 

@@ -26,7 +26,7 @@ from gsplat_core.io.recordings.packets import length_bytes, packet_check
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 
 PROBED = frozenset({"hevc", "vp8"})
-_BEHIND = bytes(random.Random(1).randrange(4, 256) for _ in range(256))  # nothing that looks like a start code
+_BEHIND = bytes(random.Random(1).randrange(4, 256) for _ in range(256))  # contains no start code
 _H265_PICTURES = range(32)
 
 
@@ -129,7 +129,7 @@ def captured_log() -> Iterator[list[tuple[int, str, str]]]:
         logger.addHandler(logging.NullHandler())
         logger.propagate = False
         av.logging.set_level(av.logging.ERROR)
-    av.logging.set_skip_repeated(False)  # the same complaint about two packets counts twice
+    av.logging.set_skip_repeated(False)  # count repeated messages about two packets twice
     with av.logging.Capture() as messages:
         yield messages
 
@@ -208,7 +208,7 @@ def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecC
     context.thread_count = 1
     context.options = _OPTIONS | _STRICT.get(context.name, {})
     flags = av.codec.context.Flags
-    # A damaged picture is handed out too: something must be shown in its place.
+    # A damaged picture is returned too, because the viewer needs a picture.
     context.flags |= flags.copy_opaque | flags.output_corrupt
     return context
 

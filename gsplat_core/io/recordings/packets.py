@@ -43,7 +43,7 @@ def check_matroska(stream: BinaryIO, size: int) -> tuple[int | None, list[tuple[
         identifier, body, length = element
         if identifier == _SEGMENT:
             segment_end = None if length is None else body + length
-            at = body  # its children are walked like elements of the file
+            at = body  # continue with the children of the segment as with top-level elements
             continue
         if length is None or body + length > size:
             break

@@ -415,7 +415,7 @@ def _read(path: Path) -> tuple[bytes, tuple[int, int]]:
     if data.startswith(PNG_SIGNATURE):
         _check_png(data)
     elif b"\xff\xd9" not in data[-4096:]:
-        # Decoders fill the missing part of a cut-off file with grey and call it a success.
+        # Decoders fill the missing part of a truncated file with grey and report success.
         raise UnreadableImage(f"the file ends too early ({len(data)} bytes, without the end mark)")
     return data, size
 

@@ -138,7 +138,7 @@ def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_fram
 def _check_scaled_size(width_px: int, height_px: int, scale: float) -> None:
     if scale == 1:
         return
-    # In Python's numbers, which overflow to infinity and not to something small.
+    # Python floats overflow to infinity, never to a small value.
     width, height = width_px * scale, height_px * scale
     if width * height > MAX_PIXELS or min(width, height) < MIN_SCALED_SIDE_PX:
         least = MIN_SCALED_SIDE_PX / min(width_px, height_px)

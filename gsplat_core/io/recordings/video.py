@@ -151,7 +151,8 @@ class VideoFrames:
         """
         try:
             yield from self._frames(findings)
-        except (UnreadableFile, OSError, av.FFmpegError) as error:  # it was whole when it was opened
+        # the container was complete when it was opened
+        except (UnreadableFile, OSError, av.FFmpegError) as error:
             findings.problem(
                 self.path, f"the video cannot be read any more: {error}", "Leave it alone while it is read"
             )
@@ -162,7 +163,7 @@ class VideoFrames:
         spread = DamageSpread(self._index)
         for position, decoded in self._decoded(spread):
             if self._index.ordered and position < due:
-                continue  # given twice, or after its time
+                continue  # duplicate or late picture
             while self._index.ordered and due < position and last is not None:
                 yield Picture(last.image, spread.damage(due) or NO_PICTURE)
                 due += 1

@@ -293,7 +293,7 @@ def read_log(path: Path) -> Iterator[Line]:
         while True:
             data = file.readline(MAX_LINE_BYTES)
             if not data.endswith(b"\n"):
-                return  # the end, or a line that was cut off, or one that is too long
+                return  # end of file, or a truncated or overlong line
             try:
                 yield _LINES.validate_json(data)
             except ValidationError as error:

@@ -159,7 +159,7 @@ class SegmentReader:
         try:
             yield from read_log(self.folder / LOG_FILE)
         except (UnreadableFile, OSError):
-            return  # as a log that is cut off at its first byte
+            return  # treat as a log truncated at its first byte
 
     def there(self, line: PictureLine) -> bool:
         """Return True if all pictures of a line are complete in their files."""
@@ -199,7 +199,7 @@ class SegmentReader:
         self.ends = last if isinstance(last, SegmentEnds) else None
         for name in sorted(named)[:MOST_OPEN]:
             try:
-                # A segment that is complete was checked by the system that wrote it; of one that is not, no byte is sure.
+                # The writer verified a complete segment. In an incomplete one, no byte is reliable.
                 self._indices[name] = TrackIndex(self.folder / name, check_sums=self.ends is None)
             except (UnreadableFile, OSError):
                 self._indices[name] = None

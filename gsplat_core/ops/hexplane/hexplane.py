@@ -58,7 +58,11 @@ def hexplane_decode(
     A block of Gaussians passes all layers without leaving the cache.
 
     Args:
-        spaces: features [N, C] of each level.
+        spaces: products of the space planes [N, C] of each level.
+        coordinates: positions and time in [-1, 1], [N, 4].
+        lines: three time lines [U, C] per level; empty to use `spaces` alone.
+        weights: weight matrices [outputs, inputs] of the layers, as in `torch.nn.Linear`.
+        biases: biases of the layers.
 
     Returns:
         [N, outputs].

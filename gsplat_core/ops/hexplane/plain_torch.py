@@ -82,7 +82,11 @@ def hexplane_decode(
     """Decode features with an MLP with ReLU between its layers.
 
     Args:
-        spaces: features [N, C] of each level; levels are concatenated.
+        spaces: products of the space planes [N, C] of each level; levels are concatenated.
+        coordinates: positions and time in [-1, 1], [N, 4].
+        lines: three time lines [U, C] per level, multiplied with `spaces`; may be empty.
+        weights: weight matrices [outputs, inputs] of the layers, as in `torch.nn.Linear`.
+        biases: biases of the layers.
 
     Returns:
         [N, outputs].
@@ -127,7 +131,7 @@ def hexplane_deltas(
     Returns:
         Deltas [N, 16] in the layout of `scene.layout`.
     """
-    # Nothing here makes the host wait or copies from it, so that a CUDA graph can hold the call.
+    # No host synchronisation or copy, so that a CUDA graph can capture the call.
     lines = []
     for plane in time_planes:
         at = ((time.reshape(1) + 1) / 2 * (plane.shape[0] - 1)).clamp(0, plane.shape[0] - 1)

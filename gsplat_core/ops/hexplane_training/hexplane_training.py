@@ -1,8 +1,8 @@
 """Training of the HexPlane field (Cao & Johnson 2023) on CUDA without autograd.
 
     state = hexplane_train(means, box, time, planes, weights, biases)  # state.deltas to the frame
-        gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
-        hexplane_planes_adam_(planes, first, second, time, gradient, adam)
+    gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
+    hexplane_planes_adam_(planes, first, second, time, gradient, adam)
 
 The host does not synchronise and a CUDA graph can capture every call; time, rate and step are read
 from device memory. Results are bit-reproducible, because no sum uses atomics. The gradient of the

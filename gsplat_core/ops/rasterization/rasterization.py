@@ -189,7 +189,7 @@ class _Project(Function):
         v_means2d, v_depths, v_conics, v_opacities, v_records = v
         *inputs, radii, row_of = ctx.saved_tensors
         wanted = list(ctx.needs_input_grad[1:])
-        wanted[-1] = False  # the backgrounds' is the other node's
+        wanted[-1] = False  # the other node returns the background's gradient
         if v_opacities is not None and not v_opacities.numel():
             v_opacities = None
         gradients = [v_records, v_means2d, v_depths, v_conics, v_opacities]

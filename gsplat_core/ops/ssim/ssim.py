@@ -58,7 +58,7 @@ def _backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tup
     image, target = ctx.saved_tensors  # type: ignore[attr-defined]
     needs_image, needs_target = ctx.needs_input_grad  # type: ignore[attr-defined]
     backward = torch.ops.gsplat_core.ssim_map_backward
-    # The similarity is symmetric, so the target's gradient is the image's with the two exchanged.
+    # SSIM is symmetric, so the target's gradient is that of the image with both exchanged.
     return (
         backward(gradient, image, target) if needs_image else None,
         backward(gradient, target, image) if needs_target else None,

@@ -75,10 +75,10 @@ def synthesize(
     threads = threads_that_fit(width_px, height_px)
     target.parent.mkdir(parents=True, exist_ok=True)
     with PartialFolder(target) as partial:
-        # The flow of the last frame leads to one that is not written.
+        # The flow of the last frame points to a frame that is not written.
         scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving", extras)
         _write(FrameFiles(scene, partial.path, fps, seed, stereo, extras), frames, progress, threads)
-        check_target(target)  # something may have been put there meanwhile
+        check_target(target)  # another process may have created files meanwhile
         earlier = partial.finish()
         if earlier is not None:
             shutil.rmtree(earlier)
