@@ -94,7 +94,7 @@ class Contents:
             return self.rectification.right_camera
         return self.calibration.camera.right_eye(self.stereo_baseline_mm)
 
-    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+    def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
         """Yield frames at full size, decoded on demand; None for a frame with a problem.
 
         A background thread reads the sidecars a few frames ahead while the caller's thread decodes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -90,9 +91,11 @@ class FileRecording:
         Raises:
             RecordingInvalid: at the first frame that cannot be read.
         """
-        for frame in self._contents.frames(Findings(strict=True), self.frame_count):
-            assert frame is not None  # a strict collector has raised
-            yield resized_frame(frame, self.width_px, self.height_px)
+        # Python 3.12 closes an inner generator only when the outer one is collected, unless asked to.
+        with closing(self._contents.frames(Findings(strict=True), self.frame_count)) as frames:
+            for frame in frames:
+                assert frame is not None  # a strict collector has raised
+                yield resized_frame(frame, self.width_px, self.height_px)
 
     def __len__(self) -> int:
         return self.frame_count

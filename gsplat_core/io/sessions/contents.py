@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -48,7 +48,7 @@ class SessionContents:
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
 
-    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+    def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
         """Yield the frames in order, with their numbers and times in the session."""
         return islice(self._frames(findings), limit)
 
