@@ -50,7 +50,7 @@ class SessionContents:
 
     def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
         """Yield the frames in order, with their numbers and times in the session."""
-        return islice(self._frames(findings), limit)
+        yield from islice(self._frames(findings), limit)
 
     def _frames(self, findings: Findings) -> Iterator[Frame | None]:
         last: Frame | None = None
