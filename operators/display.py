@@ -26,6 +26,10 @@ REPEAT_NS = 200_000_000
 """Period after which a picture that is not live is emitted again with its current age, in
 nanoseconds.
 """
+LEAST_LABELLED_PX = 160
+"""Minimum height in pixels of a live picture that is labelled. The label has a minimum size to be
+legible, and would cover much of a smaller picture.
+"""
 WAITING = 4
 """Capacity of the input queue, in pictures."""
 COLOURS = {
@@ -49,7 +53,9 @@ class DisplaySettings:
     """
     frozen_after_ms: float = 1000.0
     label: bool = True
-    """Draw state and age into every picture. A picture that is not live is always labelled."""
+    """Draw state and age into every picture. Live pictures lower than `LEAST_LABELLED_PX` are not
+    labelled; a picture that is not live always is.
+    """
     mark_remembered: bool = True
     """Draw tissue that is not visible in the current frame in grey (see `RememberedTissue`)."""
 
@@ -183,9 +189,10 @@ class DisplayOp(Operator):
 
         The picture is copied only if something is drawn. The mask is None if nothing is marked.
         """
-        image, whole = rendered.image, _nobody_sees(rendered, state)
+        image, whole = rendered.image, _is_outdated(rendered, state)
         remembered = self._tissue.layer(rendered, whole) if self.settings.mark_remembered else None
-        label = self.settings.label or state is not PictureState.LIVE
+        labelled = self.settings.label and image.shape[0] >= LEAST_LABELLED_PX
+        label = labelled or state is not PictureState.LIVE
         if label or remembered is not None:
             image = image.copy()
         if remembered is not None:
@@ -216,7 +223,7 @@ def _content_ns(rendered: RenderedFrame, now_ns: int) -> int:
     return now_ns if content.arrived_ns is None else content.arrived_ns
 
 
-def _nobody_sees(rendered: RenderedFrame, state: PictureState) -> bool:
+def _is_outdated(rendered: RenderedFrame, state: PictureState) -> bool:
     """Return True if no part of the picture is currently visible to the endoscope.
 
     This holds for frozen pictures and a lost source. It also holds for a stale picture whose frame

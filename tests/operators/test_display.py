@@ -9,12 +9,13 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import FrameStatus
 from operators.display import (
     COLOURS,
+    LEAST_LABELLED_PX,
     LOOK_NS,
     DisplayOp,
     DisplaySettings,
     LiveDisplayResult,
     _age_text,
-    _nobody_sees,
+    _is_outdated,
     draw_label,
 )
 from operators.frame_clock import ClockSettings, FrameClock
@@ -44,6 +45,12 @@ def screen(fake_time):
 def arrived(rendered, frame, fake_time, seq=0, age_ms=10.0):
     """A picture of a frame that came so long ago."""
     return rendered(seq, frame=frame(seq, arrived_ns=fake_time.ns - round(age_ms * 1e6)))
+
+
+def of_height(height, rendered, frame, fake_time):
+    """An even grey picture of that height of a frame that arrived 10 ms ago."""
+    image = np.full((height, 320, 3), 7, np.uint8)
+    return rendered(0, frame=frame(0, arrived_ns=fake_time.ns - 10_000_000, image=image))
 
 
 def test_a_new_picture_is_shown_with_its_age(screen, rendered, frame, fake_time, compute_queued):
@@ -114,13 +121,25 @@ def test_a_picture_that_is_not_live_is_labelled_even_where_labels_are_off(fake_t
 
 @pytest.mark.parametrize("state", PictureState)
 def test_the_label_is_drawn_into_a_copy(screen, rendered, frame, fake_time, compute_queued, state):
-    picture = arrived(rendered, frame, fake_time)
+    picture = of_height(LEAST_LABELLED_PX, rendered, frame, fake_time)
     before = picture.image.copy()
     fake_time.pass_ms({PictureState.STALE: 500, PictureState.FROZEN: 5000}.get(state, 0))
     screen.source = SourceState.STALLED if state is PictureState.SOURCE_LOST else SourceState.LIVE
     (shown,) = compute_queued(screen.operator, rendered=[picture])
     assert shown.state is state and (shown.image != before).any()
     assert np.array_equal(picture.image, before)
+
+
+@pytest.mark.parametrize(("height", "labelled"), [(120, False), (240, True)])
+def test_a_label_would_hide_much_of_a_small_live_picture(
+    screen, rendered, frame, fake_time, compute_queued, height, labelled
+):
+    picture = of_height(height, rendered, frame, fake_time)
+    (live,) = compute_queued(screen.operator, rendered=[picture])
+    assert (live.state, bool((live.image != picture.image).any())) == (PictureState.LIVE, labelled)
+    fake_time.pass_ms(500)
+    (stale,) = compute_queued(screen.operator)
+    assert stale.state is PictureState.STALE and (stale.image != picture.image).any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5)])
@@ -150,7 +169,7 @@ def test_tissue_behind_a_tool_is_marked_and_tissue_that_is_seen_stays_as_it_is(
     assert plain.image is picture.image and plain.remembered is None
 
 
-def test_nobody_sees_a_picture_without_new_frames_or_whose_frames_show_nothing(
+def test_is_outdated_a_picture_without_new_frames_or_whose_frames_show_nothing(
     screen, rendered, frame, fake_time, compute_queued
 ):
     content = frame(0, arrived_ns=fake_time.ns)
@@ -285,7 +304,7 @@ def test_the_operator_looks_twenty_times_a_second_and_keeps_four_pictures(fake_t
 
 
 @pytest.mark.parametrize(
-    ("state", "unused", "nobody"),
+    ("state", "unused", "outdated"),
     [
         (PictureState.LIVE, True, False),
         (PictureState.STALE, True, True),
@@ -294,9 +313,9 @@ def test_the_operator_looks_twenty_times_a_second_and_keeps_four_pictures(fake_t
         (PictureState.SOURCE_LOST, False, True),
     ],
 )
-def test_a_picture_is_memory_where_nothing_of_it_was_seen_for_long(rendered, frame, state, unused, nobody):
+def test_a_picture_is_memory_where_nothing_of_it_was_seen_for_long(rendered, frame, state, unused, outdated):
     for fields in ({"withheld": "black"}, {"status": FrameStatus.DAMAGED, "damage": "torn"}) if unused else ({},):
-        assert _nobody_sees(rendered(frame=frame(**fields)), state) is nobody
+        assert _is_outdated(rendered(frame=frame(**fields)), state) is outdated
 
 
 @pytest.mark.parametrize(("height", "edge"), [(64, 2), (160, 2), (240, 3)])
