@@ -14,10 +14,10 @@ from typing import Any
 
 import torch
 
+from gsplat_core.choices import Eyes
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
-from gsplat_core.training.config import Eyes
 from gsplat_core.training.live import LiveReconstructor
 from operators.frame_clock import FrameClock
 from operators.graph import Operator, OperatorSpec

@@ -8,7 +8,7 @@ import logging
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from gsplat_core.endoscope.out_of_body import BodyGate
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
+from operators.choices import Policy
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 
 log = logging.getLogger(__name__)
 
-Policy = Literal["withhold", "off"]
-"""`withhold`: replace such frames by black; `off`: pass all frames without a check."""
 WITHHELD = "out of body"
 """Value of `Frame.withheld` for frames that the gate replaced."""
 NOT_EXAMINED = "could not be examined"

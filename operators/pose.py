@@ -6,17 +6,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.geometry.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.geometry.odometry import DISTANCE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from operators.choices import Poses
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
-
-Poses = Literal["given", "estimated"]
 
 
 @dataclass(frozen=True)

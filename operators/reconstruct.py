@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from gsplat_core.choices import Eyes
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
-from gsplat_core.training.config import Eyes
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction

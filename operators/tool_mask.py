@@ -16,8 +16,8 @@ from gsplat_core.endoscope.mask_and_depth import MaskAndDepthSettings
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.registry import Registry
 from gsplat_core.scene.frames import Frame
+from operators.choices import TOOL_MASKS
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 
@@ -262,22 +262,16 @@ def _plain(kind: type[Operator], method: str) -> ToolMaskFactory:
     return make
 
 
-def _onnx(fragment: Any, name: str, argument: str) -> Operator:
+recorded_tool_mask = _plain(RecordedToolMaskOp, "recorded")
+builtin_tool_mask = _plain(BuiltInToolMaskOp, "builtin")
+no_tool_mask = _plain(NoToolMaskOp, "none")
+
+
+def onnx_tool_mask(fragment: Any, name: str, argument: str) -> Operator:
+    """Create an `OnnxToolMaskOp`. Raises InvalidSetting without the path of a model."""
     if not argument:
         raise InvalidSetting("tool mask 'onnx' needs the path of a model: onnx:PATH")
     return OnnxToolMaskOp(fragment, name=name, path=Path(argument))
-
-
-TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
-    "tool mask",
-    {
-        "recorded": _plain(RecordedToolMaskOp, "recorded"),
-        "builtin": _plain(BuiltInToolMaskOp, "builtin"),
-        "onnx": _onnx,
-        "none": _plain(NoToolMaskOp, "none"),
-    },
-)
-"""Factories of tool mask operators, by method."""
 
 
 def new_tool_mask(fragment: Any, choice: str, name: str = "tool_mask") -> Operator:

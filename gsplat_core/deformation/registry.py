@@ -1,25 +1,16 @@
-"""Registry of deformation fields. A new kind is a module with a `FieldKind` and an entry here."""
+"""Creation of deformation fields by name. A new kind is a module with a `FieldKind` and an entry in `gsplat_core.choices`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from gsplat_core.choices import FIELDS
 from gsplat_core.deformation.field import DeformationField, FieldKind
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.registry import Registry
 from gsplat_core.scene.gaussians import Gaussians
 
-FIELDS: Registry[FieldKind[Any]] = Registry(
-    "deformation field",
-    {
-        # the better field according to benchmarks/notes/replay.md
-        "auto": "gsplat_core.deformation.basis:KIND",
-        "basis": "gsplat_core.deformation.basis:KIND",
-        "hexplane": "gsplat_core.deformation.hexplane:KIND",
-    },
-)
-"""Kinds of deformation fields by the names that a user can choose; `auto` is an alias."""
+__all__ = ["FIELDS", "field_from_config", "kind_of", "new_field"]
 
 
 def kind_of(name: object) -> FieldKind[Any]:

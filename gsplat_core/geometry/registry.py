@@ -1,4 +1,4 @@
-"""Registered depth sources, and the selection of a source for each frame of a stream."""
+"""Creation of depth sources by name, and the selection of a source for each frame of a stream."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from gsplat_core.choices import DEPTHS
+from gsplat_core.choices import DEPTHS_WITH_ADDRESS as WITH_ADDRESS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.depth_map import DepthMap
 from gsplat_core.geometry.measured_depth import measured_confidence
-from gsplat_core.registry import Registry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
@@ -65,22 +66,6 @@ class NoDepth:
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
         return None
-
-
-DEPTHS: Registry[Callable[..., Estimator]] = Registry(
-    "depth",
-    {
-        "recorded": RecordedDepth,
-        "stereo": "gsplat_core.geometry.stereo:StereoDepth",
-        "light": "gsplat_core.geometry.light:LightDepth",
-        "parallax": "gsplat_core.geometry.key_frames:ParallaxDepth",
-        "onnx": "gsplat_core.geometry.learned:LearnedDepth",
-        "none": NoDepth,
-    },
-)
-"""Estimator factories by name. A factory takes an address if its name is in `WITH_ADDRESS`."""
-WITH_ADDRESS = {"onnx": "onnx:FILE"}
-"""Names that are followed by a colon and an address, with an example of the syntax."""
 
 
 def _always(frame: Frame) -> bool:

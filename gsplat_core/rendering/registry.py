@@ -1,19 +1,15 @@
-"""Registry of renderers."""
+"""Creation of renderers by name."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from gsplat_core.registry import Registry
-from gsplat_core.rendering.renderer import Precision, Renderer, RendererKind, check_background, check_choice
+from gsplat_core.choices import RENDERERS
+from gsplat_core.rendering.renderer import Precision, Renderer, check_background, check_choice
 from gsplat_core.scene.cameras import Camera
 
-RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.rendering.alpha:AlphaRenderer"})
-"""Renderers by name; "alpha" is alpha blending (Kerbl et al. 2023).
-
-CONTRIBUTING.md, "A renderer", describes how to add one.
-"""
+__all__ = ["RENDERERS", "check_renderer", "new_renderer"]
 
 
 def check_renderer(name: str, device: torch.device | str = "cpu", precision: str = "fp32") -> None:

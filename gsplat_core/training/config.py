@@ -5,17 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
+from gsplat_core.choices import FIELDS, Eyes
 from gsplat_core.deformation.field import FieldRates, check_rates
-from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.motion_priors import MOTION_PRIORS
-
-Eyes = Literal["left", "both"]
-"""Eyes of a stereo scope whose pictures are trained on."""
 
 
 def check_eyes(eyes: str) -> None:

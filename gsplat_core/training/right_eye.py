@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.choices import Eyes
 from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.config import Eyes
 from gsplat_core.training.eye_colours import EyeColours
 from gsplat_core.training.initialisation import believed_depth, unprojected
 from gsplat_core.training.observations import Observation, RightEye, scene_colours

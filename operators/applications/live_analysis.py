@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from operators.choices import Policy
 from operators.endoscope.cuts import SceneNumberStage
 from operators.endoscope.ordinary import OrdinaryStream, PictureStagesOp, TissueStagesOp
 from operators.endoscope.stage import StageOp
 from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
 from operators.graph import Operator
-from operators.out_of_body import OutOfBodyGateOp, Policy
+from operators.out_of_body import OutOfBodyGateOp
 from operators.side_by_side import SideBySideOp
 from operators.tool_mask import new_tool_mask
 

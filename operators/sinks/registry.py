@@ -1,4 +1,4 @@
-"""Registry of sinks for the frames of a run."""
+"""Parameters and inputs of sinks. `operators.choices.SINKS` lists them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.registry import Registry
+from operators.choices import SINKS
 from operators.graph import Operator
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from operators.sources.source import SourceDescription
 from operators.storage import StorageReserve
+
+__all__ = ["SINKS", "SinkFactory", "SinkOptions", "input_of"]
 
 
 @dataclass(frozen=True)
@@ -31,14 +33,6 @@ SinkFactory = Callable[[Any, str, SinkOptions], Operator]
 """Creates a sink from the fragment, the operator's name and the options. Its input takes
 `RenderedFrame` or `ScoredFrame`.
 """
-
-SINKS: Registry[SinkFactory] = Registry(
-    "sink",
-    {
-        "video": "operators.sinks.video:video_sink",
-        "keyframes": "operators.sinks.keyframes:keyframes_sink",
-    },
-)
 
 
 def input_of(sink: Operator) -> tuple[str, type]:

@@ -1,0 +1,52 @@
+"""Registries of the implementations that a user selects by name.
+
+Importing this module imports no implementation, and neither torch nor NumPy. The command line and the service list the names
+from here. A new implementation is a module and one line in this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+from gsplat_core.registry import Registry
+
+if TYPE_CHECKING:
+    from gsplat_core.deformation.field import FieldKind
+    from gsplat_core.geometry.registry import Estimator
+    from gsplat_core.rendering.renderer import RendererKind
+
+FIELDS: Registry[FieldKind[Any]] = Registry(
+    "deformation field",
+    {
+        # the better field according to benchmarks/notes/replay.md
+        "auto": "gsplat_core.deformation.basis:KIND",
+        "basis": "gsplat_core.deformation.basis:KIND",
+        "hexplane": "gsplat_core.deformation.hexplane:KIND",
+    },
+)
+"""Kinds of deformation fields by the names that a user can choose; `auto` is an alias."""
+
+RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.rendering.alpha:AlphaRenderer"})
+"""Renderers by name; "alpha" is alpha blending (Kerbl et al. 2023).
+
+CONTRIBUTING.md, "A renderer", describes how to add one.
+"""
+
+DEPTHS: Registry[Callable[..., Estimator]] = Registry(
+    "depth",
+    {
+        "recorded": "gsplat_core.geometry.registry:RecordedDepth",
+        "stereo": "gsplat_core.geometry.stereo:StereoDepth",
+        "light": "gsplat_core.geometry.light:LightDepth",
+        "parallax": "gsplat_core.geometry.key_frames:ParallaxDepth",
+        "onnx": "gsplat_core.geometry.learned:LearnedDepth",
+        "none": "gsplat_core.geometry.registry:NoDepth",
+    },
+)
+"""Factories of depth estimators by name. A factory takes an address if its name is in `DEPTHS_WITH_ADDRESS`."""
+DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
+"""Names that are followed by a colon and an address, with an example of the syntax."""
+
+Eyes = Literal["left", "both"]
+"""Eyes of a stereo scope whose pictures are trained on."""

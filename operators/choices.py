@@ -1,0 +1,38 @@
+"""Registries of the operators and modes that a user selects by name. Importing this module imports no implementation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from gsplat_core.registry import Registry
+
+if TYPE_CHECKING:
+    from operators.sinks.registry import SinkFactory
+    from operators.tool_mask import ToolMaskFactory
+
+TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
+    "tool mask",
+    {
+        "recorded": "operators.tool_mask:recorded_tool_mask",
+        "builtin": "operators.tool_mask:builtin_tool_mask",
+        "onnx": "operators.tool_mask:onnx_tool_mask",
+        "none": "operators.tool_mask:no_tool_mask",
+    },
+)
+"""Factories of tool mask operators, by method."""
+TOOL_MASKS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
+"""Methods that are followed by a colon and an address, with an example of the syntax."""
+
+SINKS: Registry[SinkFactory] = Registry(
+    "sink",
+    {
+        "video": "operators.sinks.video:video_sink",
+        "keyframes": "operators.sinks.keyframes:keyframes_sink",
+    },
+)
+"""Factories of sinks for the frames of a run, by name."""
+
+Poses = Literal["given", "estimated"]
+"""Camera poses: recorded with the frames, or estimated from the pictures."""
+Policy = Literal["withhold", "off"]
+"""Pictures from outside of the body: replace them by black, or pass all frames without a check."""
