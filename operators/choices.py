@@ -32,6 +32,8 @@ SINKS: Registry[SinkFactory] = Registry(
 )
 """Factories of sinks for the frames of a run, by name."""
 
+Device = Literal["cpu", "cuda"]
+"""Processors that train and render."""
 Poses = Literal["given", "estimated"]
 """Camera poses: recorded with the frames, or estimated from the pictures."""
 Policy = Literal["withhold", "off"]

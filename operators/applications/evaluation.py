@@ -15,7 +15,8 @@ from gsplat_core.evaluation.protocols import LAST_S, HeldOut, Retention, Return,
 from gsplat_core.evaluation.scores import Score
 from gsplat_core.evaluation.views import SecondEye
 from gsplat_core.training.motion_priors import MOTION_PRIORS
-from operators.applications.limits import check_max_frames, check_scale, check_steps
+from operators.choices import Device
+from operators.settings import check_option
 from operators.sources.source import SourceDescription
 
 PROTOCOLS = ("heldout", "live", "retention", "second_eye", "geometry", "causal")
@@ -32,7 +33,7 @@ class EvaluationSettings:
     recording: Path | str
     protocols: tuple[str, ...] = ()
     """Names in `PROTOCOLS`; empty selects all measurable protocols of `WITHOUT_LEARNING`."""
-    device: str = "cpu"
+    device: Device = "cpu"
     renderer: str = "alpha"
     scale: float | None = None
     """Scale of the frames; None for the scale at which the model was made."""
@@ -57,10 +58,10 @@ class EvaluationSettings:
         if self.motion_prior is not None:
             MOTION_PRIORS.check(self.motion_prior)
         if self.scale is not None:
-            check_scale(self.scale)
+            check_option("scale", self.scale)
         if self.steps_per_frame is not None:
-            check_steps("steps_per_frame", self.steps_per_frame)
-        check_max_frames(self.max_frames)
+            check_option("steps_per_frame", self.steps_per_frame)
+        check_option("max_frames", self.max_frames)
         if not 0 < self.last_s < 1e6:
             raise InvalidSetting(f"last_s is {self.last_s:g}; it must be positive")
 

@@ -1,4 +1,4 @@
-"""Ranges of options that several applications share."""
+"""Limits on pictures and rendered frames. `operators.settings` declares the ranges of options."""
 
 from __future__ import annotations
 
@@ -7,53 +7,16 @@ import math
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 
-MAX_SEED = 2**63 - 1
-"""Largest seed that all random generators accept."""
-MAX_SCALE = 64.0
 MAX_PIXELS = 64 * 2**20
 """Maximum number of pixels of a picture (8192x8192). Surgical video has at most 8 million."""
 MAX_SIDE_PX = 2**15
 """Maximum side of a picture. Videos show two side by side, and video formats are limited to
 65535.
 """
-MAX_STEPS = 100_000_000
-MAX_FRAMES = 10**9
 LEAST_FPS = 0.001
 """Minimum frame rate; video containers cannot store much lower rates."""
 MAX_RENDERED_FRAMES = 1_000_000
 """Maximum number of frames of one `render`: nine hours at 30 frames/s."""
-
-
-def check_seed(seed: int) -> None:
-    """Raise InvalidSetting for a seed that some random generator does not accept."""
-    if not 0 <= seed <= MAX_SEED:
-        raise InvalidSetting(f"seed is {seed}; it must be from 0 to {MAX_SEED}")
-
-
-def check_steps(name: str, steps: int) -> None:
-    """Raise InvalidSetting for a number of training steps out of range; `name` is the option's
-    name.
-    """
-    if not 1 <= steps <= MAX_STEPS:
-        raise InvalidSetting(f"{name} is {steps}; it must be from 1 to {MAX_STEPS}")
-
-
-def check_max_frames(max_frames: int | None) -> None:
-    """Raise InvalidSetting for a number of frames out of range; None means all frames."""
-    if max_frames is None:
-        return
-    if max_frames < 1:
-        raise InvalidSetting(f"max_frames must be at least 1, got {max_frames}")
-    if max_frames > MAX_FRAMES:
-        raise InvalidSetting(f"max_frames must be at most {MAX_FRAMES}, got {max_frames}")
-
-
-def check_scale(scale: float) -> None:
-    """Raise InvalidSetting for a scale that is not positive or above `MAX_SCALE`."""
-    if not 0 < scale < math.inf:
-        raise InvalidSetting(f"scale must be a positive number, got {scale:g}")
-    if scale > MAX_SCALE:
-        raise InvalidSetting(f"scale must be at most {MAX_SCALE:g}, got {scale:g}")
 
 
 def check_picture(camera: Camera, scale: float) -> None:

@@ -5,21 +5,17 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
-from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.registry import check_depth, depth_inputs
 from gsplat_core.io.sessions import WriterOptions
-from gsplat_core.training.config import Eyes, ReconstructorConfig, check_eyes
+from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.live_training import LiveTraining
-from operators.applications.limits import check_max_frames, check_scale, check_seed
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.result import RunSettings
 from operators.display import DisplaySettings
 from operators.frame_clock import ClockSettings
-from operators.out_of_body import Policy
-from operators.pose import Poses
+from operators.settings import LiveOptions
 from operators.tool_mask import check_tool_mask
 
 LIVE_WINDOW_FRAMES = {"cpu": 60, "cuda": 150}
@@ -75,32 +71,12 @@ times as long.
 
 
 @dataclass(frozen=True)
-class LiveSettings:
+class LiveSettings(LiveOptions):
     """Settings of a live run. Raises InvalidSetting for a value out of range."""
 
     source: str
     """Address of the source (see `open_source`)."""
     out: Path
-    device: str = "cpu"
-    field: str = "auto"
-    renderer: str = "alpha"
-    seed: int = 0
-    eyes: Eyes = "left"
-    """Pictures of a stereo scope used for training; `both` requires the right camera's calibration.
-    Stereo depth uses both pictures in any case. The display shows the left one. Training on the
-    right one reduces the steps on the left one.
-    """
-    scale: float | None = None
-    """Scale of the stream's pictures. None: chosen by measurement on a CPU (`working_size`), 1 on a
-    GPU.
-    """
-    max_frames: int | None = None
-    seconds: float | None = None
-    """Maximum duration in seconds; None: until the source ends or the run is interrupted."""
-    loop: bool = False
-    """Play a recording in a loop."""
-    fps: float | None = None
-    """Playback rate of a recording in frames/s; None: its own rate."""
     record: Path | None = None
     """New folder for a recording of the session; None: no recording."""
     recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
@@ -109,40 +85,16 @@ class LiveSettings:
     """Collect data for the report: per-frame scores, key frames, SSIM and a digest of the pictures.
     Disable for endless runs, because the log grows.
     """
-    tool_mask: str = "builtin"
-    """Tool detector for frames without a recorded mask, a name in
-    `operators.tool_mask.TOOL_MASKS`.
-    """
-    depth: str = "auto"
-    """Depth source: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
-    poses: Poses = "given"
-    """Pose source: recorded with the frames, or estimated from the pictures (`operators.pose`)."""
-    out_of_body: Policy = "withhold"
-    """Policy for pictures from outside of the body: `withhold`, or `off` for no check."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
+    """Display deadlines and step limits; `budget_ms` has precedence over its own."""
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining | None = None
     """Training parameters; None: device default."""
 
     def __post_init__(self) -> None:
-        check_seed(self.seed)
-        check_eyes(self.eyes)
-        check_scale(self.given_scale)
-        check_max_frames(self.max_frames)
-        if self.seconds is not None and not 0 < self.seconds < 1e9:
-            raise InvalidSetting(f"seconds is {self.seconds:g}; it must be positive")
-        if self.fps is not None and not 0 < self.fps <= 1000:
-            raise InvalidSetting(f"fps is {self.fps:g}; it must be above 0 and at most 1000")
-
-        if self.out_of_body not in get_args(Policy):
-            raise InvalidSetting(f"out-of-body is {self.out_of_body!r}; choose {' or '.join(get_args(Policy))}")
+        super().__post_init__()
         check_tool_mask(self.tool_mask)
         check_depth(self.depth)
-
-    @property
-    def given_scale(self) -> float:
-        """Requested scale; 1 if none was given."""
-        return 1.0 if self.scale is None else self.scale
 
     @property
     def chosen_clock(self) -> ClockSettings:
@@ -152,6 +104,7 @@ class LiveSettings:
         share, most_ms = LIVE_SHOW_AFTER[self.device]
         return dataclasses.replace(
             self.clock,
+            budget_ms=self.clock.budget_ms if self.budget_ms is None else self.budget_ms,
             auto_share=self.clock.auto_share or share,
             auto_most_ms=self.clock.auto_most_ms or most_ms,
             least_share=self.clock.least_share or LIVE_LEAST_SHARE[self.device],
@@ -192,7 +145,7 @@ class LiveSettings:
             motion_prior="flow",
             motion_detail=LIVE_MOTION_DETAIL,
             start_from_motion=LIVE_STARTS_FROM_MOTION[device],
-            eyes=self.eyes,
+            eyes=self.trained_eyes,
             ssim_weight=LIVE_SSIM_WEIGHT[device],
             squared_error=LIVE_SQUARED_ERROR[device],
         )

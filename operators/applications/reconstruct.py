@@ -23,12 +23,12 @@ from gsplat_core.training.right_eye import BothEyes
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
 from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
-from operators.applications.limits import check_steps
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session, Start
 from operators.errors import NothingShown
+from operators.settings import check_option
 from operators.sources.source import FrameSource
 
 
@@ -73,7 +73,7 @@ def reconstruct(
     Raises:
         InvalidSetting: `steps` is out of range. Also as `replay`.
     """
-    check_steps("steps", steps)
+    check_option("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
         if inside.poses != "given":

@@ -22,7 +22,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from gsplat_core.transfers import HostCopy
 from operators.applications.device import check_device
-from operators.applications.limits import check_picture, check_scale, check_shown_size, check_width, frames_to_render
+from operators.applications.limits import check_picture, check_shown_size, check_width, frames_to_render
 from operators.applications.memory import render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.views import RECORDED, View, ViewWish, view_of
@@ -31,6 +31,7 @@ from operators.layer_pictures import mark_unobserved
 from operators.output_folder import OutputFolder
 from operators.output_paths import check_file_path
 from operators.rasterize import displayed
+from operators.settings import check_option
 from operators.sinks.images import write_png
 from operators.sinks.video_file import VideoFile
 from operators.storage import StorageReserve, storage_errors
@@ -79,7 +80,7 @@ def render_model(
         InvalidSetting: an option is out of range.
         OutputError: `out` cannot be written or must not be replaced.
     """
-    check_scale(scale)
+    check_option("scale", scale)
     frames_to_render((0, 0), fps)
     inputs = [bundle, *view.inputs]
     to_video = out.suffix.lower() == VIDEO_SUFFIX

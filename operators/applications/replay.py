@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.registry import check_depth, depth_inputs
@@ -28,12 +28,12 @@ from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.config import Eyes, ReconstructorConfig, check_eyes
+from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, scheduler_for
 from operators.applications.finishing import measures_baselines, saves_model
-from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed, check_steps
+from operators.applications.limits import check_picture
 from operators.applications.memory import replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay_analysis import lacking_depth, replay_analysis
@@ -42,13 +42,14 @@ from operators.applications.session import Session
 from operators.applications.session_replay import FollowedSession, followed_session
 from operators.deform import DeformOp
 from operators.frame_log import FRAMES_FILE, FrameLog
-from operators.graph import Application, Engine
+from operators.graph import Application
 from operators.ingest import SourceOp
 from operators.messages import RenderedFrame
 from operators.metrics import MetricsOp, ScoredFrame
-from operators.pose import Poses, check_poses
+from operators.pose import check_poses
 from operators.rasterize import RasterizeOp
 from operators.reconstruct import ReconstructOp
+from operators.settings import ReplayOptions
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.registry import SINKS, SinkOptions, input_of
 from operators.sources.registry import SourceOptions, open_source
@@ -62,7 +63,7 @@ PIXELS_PER_GAUSSIAN = 4
 
 
 @dataclass(frozen=True)
-class ReplaySettings:
+class ReplaySettings(ReplayOptions):
     """Settings of a replay. Raises InvalidSetting for a value out of range."""
 
     recording: Path | str
@@ -70,43 +71,12 @@ class ReplaySettings:
     `open_source`).
     """
     out: Path
-    device: str = "cpu"
-    engine: Engine = "embedded"
-    field: str = "auto"
-    renderer: str = "alpha"
-    """Name in `gsplat_core.rendering.registry.RENDERERS`."""
     sinks: tuple[str, ...] = ("video", "keyframes")
-    """Names in `operators.sinks.registry.SINKS`."""
-    seed: int = 0
-    steps_per_frame: int | None = None
-    """Optimiser steps per frame; None for the reconstructor's default."""
-    max_frames: int | None = None
-    scale: float = 1.0
-    ignore_schedule: bool = False
-    """Replay a recorded session as a plain recording, ignoring its schedule of calls."""
-    depth: str = "auto"
-    """Depth source: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
-    eyes: Eyes | None = None
-    """Pictures of a stereo scope used for training; None: the left ones, which are also
-    displayed.
-    """
-    poses: Poses = "given"
-    """Pose source: the recording, or frame-by-frame estimation from the pictures
-    (`operators.pose`).
-    """
-    heldout: bool = False
-    """Exclude the protocol's held-out frames from training and score them separately."""
+    """Names in `operators.choices.SINKS`."""
 
     def __post_init__(self) -> None:
-        if self.engine not in get_args(Engine):
-            raise InvalidSetting(f"engine is {self.engine!r}; choose {' or '.join(get_args(Engine))}")
-        check_seed(self.seed)
-        check_scale(self.scale)
-        if self.steps_per_frame is not None:
-            check_steps("steps_per_frame", self.steps_per_frame)
-        check_max_frames(self.max_frames)
+        super().__post_init__()
         check_depth(self.depth)
-        check_eyes(self.eyes or "left")
         for name in self.sinks:
             SINKS.check(name)
 
@@ -126,7 +96,7 @@ class ReplaySettings:
             InvalidSetting: the settings are inconsistent.
         """
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
-        config = replace(config, eyes=self.eyes or "left")
+        config = replace(config, eyes=self.trained_eyes)
         if offline:
             config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:
@@ -146,7 +116,7 @@ class ReplaySettings:
             field=config.chosen_field,
             renderer=self.renderer,
             seed=self.seed,
-            scale=self.scale,
+            scale=self.given_scale,
             steps_per_frame=config.steps_per_frame if online else None,
             heldout=self.heldout,
         )
@@ -343,11 +313,11 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
     config = settings.reconstructor_config(offline=offline)
-    source = open_source(settings.recording, SourceOptions(settings.scale, settings.max_frames))
+    source = open_source(settings.recording, SourceOptions(settings.given_scale, settings.max_frames))
     description = source.description
     if description.frame_count is None:
         raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
-    check_picture(description.camera, settings.scale)
+    check_picture(description.camera, settings.given_scale)
     check_poses(settings.poses, description.camera)
     if settings.device == "cpu":
         sized = settings.reconstructor_config(description.width_px * description.height_px, offline=offline)

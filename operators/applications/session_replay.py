@@ -16,11 +16,11 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.live_training import LiveTraining
 from operators.applications.device import seeded
-from operators.applications.limits import check_seed
 from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.compare_shown import CompareShownOp
 from operators.graph import Application
 from operators.scheduled_reconstruct import ScheduledReconstructOp
+from operators.settings import check_option
 from operators.sources.session import SessionSource
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSess
     why = None
     if made is None:
         why = "its beginning is not there any more, or it has no schedule"
-    elif settings.scale != 1 or settings.heldout or settings.steps_per_frame is not None:
+    elif settings.given_scale != 1 or settings.heldout or settings.steps_per_frame is not None:
         why = "scale, held-out frames or steps per frame were given, which it does not have"
     if made is None or why is not None:
         notes.append(
@@ -95,7 +95,7 @@ def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSess
     try:
         config = TypeAdapter(ReconstructorConfig).validate_python(made.config)
         training = TypeAdapter(LiveTraining).validate_python(made.training)
-        check_seed(made.seed)
+        check_option("seed", made.seed)
         camera_of(made.camera)
     except (ValidationError, InvalidInput, InvalidSetting) as error:
         first = " ".join(str(error).split())[:200]

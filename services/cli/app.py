@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
 
+from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
 from services.cli import model_commands, recording_commands, service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
@@ -16,15 +18,13 @@ from services.cli.options import (
     EvaluationOutOption,
     FolderArgument,
     JsonOption,
-    LiveOptions,
     LiveOutOption,
     OutOption,
-    PosesFromOption,
     RecordingArgument,
     RecordKeepOption,
-    RunOptions,
     SourceArgument,
     SynthesizeOptions,
+    takes_options,
     takes_run_options,
 )
 from services.cli.streams import sentence
@@ -100,82 +100,39 @@ def _common(
 
 
 @app.command()
-@takes_run_options
-def replay(
-    recording: RecordingArgument,
-    out: OutOption,
-    options: RunOptions,
-    engine: Annotated[str, typer.Option(help="Graph engine: embedded or holoscan.")] = "embedded",
-    steps_per_frame: Annotated[
-        int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
-    ] = None,
-    heldout: Annotated[
-        bool,
-        typer.Option(
-            "--heldout/--no-heldout", help="Show frames 1, 9, 17, ... without training on them, and score them apart."
-        ),
-    ] = False,
-    poses: PosesFromOption = "given",
-    ignore_schedule: Annotated[
-        bool,
-        typer.Option(
-            "--ignore-schedule", help="Replay a recorded session like any recording, without the steps that it made."
-        ),
-    ] = False,
-    json: JsonOption = False,
-) -> int:
+@takes_options(ReplayOptions, "replay")
+def replay(recording: RecordingArgument, out: OutOption, options: Mapping[str, Any], json: JsonOption = False) -> int:
     """Reconstruct a recording as if it were live: train on each frame as it arrives, display it,
     score it."""
     from operators.applications.replay import ReplaySettings
     from services.cli.replay import replay_command
 
-    settings = ReplaySettings(
-        recording=recording,
-        out=out,
-        engine=engine,  # type: ignore[arg-type]
-        steps_per_frame=steps_per_frame,
-        heldout=heldout,
-        poses=poses,  # type: ignore[arg-type]
-        ignore_schedule=ignore_schedule,
-        **options.settings(),
-    )
-    return replay_command(settings, as_json=json)
+    return replay_command(ReplaySettings(recording, out, **options), as_json=json)
 
 
 @app.command()
-@takes_run_options
+@takes_options(JobOptions, "batch")
 def batch(
     folder: FolderArgument,
-    options: RunOptions,
+    options: Mapping[str, Any],
     out: BatchOutOption = None,
     workers: Annotated[
         int | None, typer.Option(min=1, max=256, help="Replays at one time.", show_default="half of the cores")
     ] = None,
-    steps_per_frame: Annotated[
-        int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
-    ] = None,
-    heldout: Annotated[
-        bool, typer.Option("--heldout/--no-heldout", help="As for replay: score frames that were not trained on.")
-    ] = False,
-    poses: PosesFromOption = "given",
     json: JsonOption = False,
 ) -> int:
     """Replay every recording of a folder. A repeated call continues an interrupted batch."""
     from services.cli.batch import batch_command
 
-    chosen = {**options.settings(), "steps_per_frame": steps_per_frame, "heldout": heldout, "poses": poses}
-    return batch_command(folder, out, workers, chosen, as_json=json)
+    return batch_command(folder, out, workers, options, as_json=json)
 
 
 @app.command()
-@takes_run_options
+@takes_options(LiveOptions, "live")
 def live(
     source: SourceArgument,
-    options: LiveOptions,
+    options: Mapping[str, Any],
     out: LiveOutOption = None,
-    budget_ms: Annotated[
-        str, typer.Option(help="Show a frame so many milliseconds after it came: auto, or a number.")
-    ] = "auto",
     record: Annotated[
         bool,
         typer.Option(
@@ -189,25 +146,21 @@ def live(
     its age."""
     from services.cli.live import live_command, live_settings
 
-    with live_settings(source, out, budget_ms, record, record_keep or (), **options.settings()) as settings:
+    with live_settings(source, out, record, record_keep or (), **options) as settings:
         return live_command(settings, keep=out is not None, as_json=json)
 
 
 @app.command()
-@takes_run_options
+@takes_options(ReconstructOptions, "reconstruct")
 def reconstruct(
-    recording: RecordingArgument,
-    out: OutOption,
-    options: RunOptions,
-    steps: Annotated[int, typer.Option(help="Optimiser steps over all training frames.")] = 2000,
-    json: JsonOption = False,
+    recording: RecordingArgument, out: OutOption, options: Mapping[str, Any], json: JsonOption = False
 ) -> int:
     """Reconstruct offline: train on all training frames, then evaluate the held-out ones."""
     from operators.applications.replay import ReplaySettings
     from services.cli.reconstruct import reconstruct_command
 
-    settings = ReplaySettings(recording=recording, out=out, **options.settings())
-    return reconstruct_command(settings, steps, as_json=json)
+    chosen = ReconstructOptions(**options)
+    return reconstruct_command(ReplaySettings(recording, out, **chosen.options(JobOptions)), chosen.steps, as_json=json)
 
 
 @app.command()

@@ -13,15 +13,13 @@ from types import FrameType
 from typing import Any
 
 import typer
-from pydantic import ValidationError
 
-from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.registry import check_depth
+from operators.settings import JobOptions
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.cli.interrupt import ASKING
 from services.cli.streams import printable
 from services.jobs.batch import Batch, Counts, Summary
-from services.jobs.options import ReplayOptions
 from services.jobs.pool import PoolSettings
 from services.jobs.process import new_runner
 
@@ -58,14 +56,10 @@ def batch_command(
     return NOTHING_SHOWN if nothing and all(nothing) and not summary.counts["done"] else BAD_INPUT
 
 
-def _checked(options: Mapping[str, Any]) -> ReplayOptions:
-    try:
-        chosen = ReplayOptions(**options)
-        check_depth(chosen.depth)  # reads the network of onnx:FILE once, before the recordings
-        return chosen
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InvalidSetting(f"--{str(first['loc'][0]).replace('_', '-')}: {first['msg']}") from error
+def _checked(options: Mapping[str, Any]) -> JobOptions:
+    chosen = JobOptions(**options)
+    check_depth(chosen.depth)  # reads the network of onnx:FILE once, before the recordings
+    return chosen
 
 
 class _Asked:

@@ -21,7 +21,6 @@ from operators.applications.live import LiveApplication, live
 from operators.applications.live_settings import LiveSettings
 from operators.applications.recording import new_recording_folder
 from operators.applications.result import RunOutcome
-from operators.frame_clock import ClockSettings
 from operators.metrics import ScoredFrame
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest
@@ -84,7 +83,6 @@ class LiveStatus:
 def live_settings(
     source: str,
     out: Path | None,
-    budget_ms: str,
     record: bool = False,
     record_keep: Sequence[str] = (),
     **settings: Any,
@@ -95,13 +93,6 @@ def live_settings(
     Raises:
         InvalidSetting: if a setting is not valid.
     """
-    if budget_ms == "auto":
-        clock = ClockSettings()
-    else:
-        try:
-            clock = ClockSettings(budget_ms=float(budget_ms))
-        except ValueError:
-            raise InvalidSetting(f"budget-ms is {budget_ms!r}; give auto, or a number of milliseconds") from None
     if record and out is None:
         raise InvalidSetting("--record needs a folder that stays; give --out, in which recordings/ is made")
     if record_keep and not record:
@@ -109,10 +100,10 @@ def live_settings(
     kept = recording_kept(record_keep)
     if out is not None:
         recording = new_recording_folder(out) if record else None
-        yield LiveSettings(source=source, out=out, clock=clock, record=recording, recording=kept, **settings)
+        yield LiveSettings(source=source, out=out, record=recording, recording=kept, **settings)
         return
     with TemporaryDirectory(prefix="intrasplat-live-") as folder:
-        yield LiveSettings(source=source, out=Path(folder) / "out", clock=clock, **settings)
+        yield LiveSettings(source=source, out=Path(folder) / "out", **settings)
 
 
 def recording_kept(texts: Sequence[str]) -> WriterOptions:

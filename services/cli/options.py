@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
+
+from gsplat_core.errors import InvalidSetting
+from operators.settings import Command, Declared, ReplayOptions, Section, options_for, options_of
 
 
 def _path(text: str) -> Path:
@@ -86,45 +89,35 @@ RecordKeepOption = Annotated[
     ),
 ]
 RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a folder of images.")]
-DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
-RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
-FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
-DepthOption = Annotated[
-    str,
-    typer.Option(
-        help="Depth of the frames: auto, recorded, stereo (from the two eyes), parallax (of a moving scope with poses), light (of one fixed eye; relative), onnx:FILE (by a network of yours; relative) or none."
-    ),
-]
-PosesFromOption = Annotated[
-    str,
-    typer.Option(
-        help="Where the scope was: given (by the recording), or estimated from the pictures, frame by frame (relative; never by default, since tissue that moves looks like a scope that does)."
-    ),
-]
-SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
-EYES = "Pictures of a stereo scope that are trained on: left or both."
-EyesOption = Annotated[str | None, typer.Option(help=EYES, show_default="left")]
-ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
-MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
+
+
+def help_of(each: Declared) -> str:
+    """Return the help text of an option: description, unit and choices."""
+    unit = "" if each.option.unit is None else f", in {each.option.unit}"
+    choices = f" One of: {', '.join(each.choices)}." if each.choices else ""
+    return f"{each.option.description}{unit}.{choices}"
+
+
+def _annotation(each: Declared) -> Any:
+    """Return the annotation from which typer makes a command line option."""
+    plain = each.plain if each.option.word is None else str
+    flags = (each.option.flag or f"--{each.name.replace('_', '-')}",) if plain is bool else ()
+    shown: Any = True if each.default is not None or each.option.word else each.option.null or False
+    kind = plain if each.default is not None or each.option.word else plain | None
+    return Annotated[kind, typer.Option(*flags, help=help_of(each), show_default=shown)]
+
+
+def _shared(name: str) -> Any:
+    """Return the typer declaration of an option of the engine, for a command with options of its own."""
+    return typer.Option(help=help_of(options_of(ReplayOptions)[name]))
+
+
+DeviceOption = Annotated[str, _shared("device")]
+RendererOption = Annotated[str, _shared("renderer")]
+SeedOption = Annotated[int, _shared("seed")]
+ScaleOption = Annotated[float, _shared("scale")]
+MaxFramesOption = Annotated[int | None, _shared("max_frames")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options common to `replay` and `reconstruct`, named as in `ReplaySettings`."""
-
-    device: DeviceOption = "cpu"
-    field: FieldOption = "auto"
-    renderer: RendererOption = "alpha"
-    seed: SeedOption = 0
-    max_frames: MaxFramesOption = None
-    scale: ScaleOption = 1.0
-    depth: DepthOption = "auto"
-    eyes: EyesOption = None
-
-    def settings(self) -> dict[str, Any]:
-        """Return the options by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -191,51 +184,72 @@ class SynthesizeOptions:
     ] = "usual"
 
 
-@dataclass(frozen=True)
-class LiveOptions(RunOptions):
-    """Additional options of `live`, named as in `LiveSettings`."""
+def takes_options(kind: type[Section], command: Command) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Decorate a command whose parameter `options` is a mapping: each option of the class `kind` that applies to
+    `command` becomes a command line option. The mapping has their values by name."""
+    declared = options_for(kind, command)
+    annotations = {name: _annotation(each) for name, each in declared.items()}
+    defaults = {
+        name: each.option.word if each.option.word and each.default is None else each.default
+        for name, each in declared.items()
+    }
 
-    scale: Annotated[
-        float | None,
-        typer.Option(
-            help="Resize the frames by this factor.", show_default="1; on a CPU what this machine keeps up with"
-        ),
-    ] = None  # type: ignore[assignment]
-    eyes: Annotated[str, typer.Option(help=EYES)] = "left"
-    seconds: Annotated[
-        float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
-    ] = None
-    tool_mask: Annotated[
-        str, typer.Option(help="Tools in frames without a mask: builtin, none, or another way to find them.")
-    ] = "builtin"
-    poses: PosesFromOption = "given"
-    out_of_body: Annotated[
-        str, typer.Option(help="Pictures from outside of the body: withhold, or off to let them pass.")
-    ] = "withhold"
-    loop: Annotated[bool, typer.Option("--loop", help="Play a recording again and again.")] = False
-    fps: Annotated[float | None, typer.Option(help="Play a recording at this rate.", show_default="its own")] = None
+    def made(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: _value(each, values[name]) for name, each in declared.items()}
+
+    return lambda function: _with_parameters(function, annotations, defaults, made)
 
 
 def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
-    """Wrap a command whose parameter `options` is a dataclass: each field becomes a command line
-    option."""
+    """Decorate a command whose parameter `options` is a dataclass: each field becomes a command line option."""
     kind: Any = get_type_hints(command, include_extras=True)["options"]
-    shared = [
-        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default) for field in fields(kind)
-    ]
+    hints = get_type_hints(kind, include_extras=True)
+    annotations = {field.name: hints[field.name] for field in fields(kind)}
+    return _with_parameters(
+        command, annotations, {field.name: field.default for field in fields(kind)}, lambda values: kind(**values)
+    )
+
+
+def _value(each: Declared, given: Any) -> Any:
+    """Return the value of an option from the command line.
+
+    Raises:
+        InvalidSetting: if a number is neither a number nor the word for None.
+    """
+    if each.option.word is None or given is None:
+        return given
+    if given == each.option.word:
+        return None
+    try:
+        return float(given)
+    except ValueError:
+        raise InvalidSetting(f"{each.name} is {given!r:.60}; give {each.option.word}, or a number") from None
+
+
+def _with_parameters(
+    command: Callable[..., int],
+    annotations: Mapping[str, Any],
+    defaults: Mapping[str, Any],
+    made: Callable[[Mapping[str, Any]], Any],
+) -> Callable[..., int]:
+    """Return the command with the parameters `annotations` in place of its parameter `options`, which `made` makes of
+    their values."""
 
     @functools.wraps(command)
     def call(**values: Any) -> int:
-        options = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        options = made({name: values.pop(name) for name in annotations})
         return command(options=options, **values)
 
-    parameters = list(inspect.signature(command).parameters.values())
-    place = [parameter.name for parameter in parameters].index("options")
-    hints = get_type_hints(command, include_extras=True) | get_type_hints(kind, include_extras=True)
-    both = [
-        each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[each.name])
-        for each in [*parameters[:place], *shared, *parameters[place + 1 :]]
-    ]
+    hints = {**get_type_hints(command, include_extras=True), **annotations}
+    both = []
+    for parameter in inspect.signature(command).parameters.values():
+        if parameter.name != "options":
+            both.append(parameter)
+            continue
+        both += [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name]) for name in annotations
+        ]
+    both = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[each.name]) for each in both]
     call.__signature__ = inspect.Signature(both)  # type: ignore[attr-defined]
     call.__annotations__ = {each.name: each.annotation for each in both}
     del call.__dict__["__wrapped__"]  # otherwise typer inspects the wrapped command's signature

@@ -19,8 +19,8 @@ from gsplat_core.io.recordings.layouts import split_eyes
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES
 from operators.output_folder import is_whole_output
 from operators.output_paths import BATCH_DATABASE, DESCRIPTIONS
+from operators.settings import JobOptions
 from operators.storage import storage_errors
-from services.jobs.options import ReplayOptions
 from services.jobs.pool import JobPool, PoolSettings
 from services.jobs.records import JobRecord, JobState, NewJob
 from services.jobs.results import RUNNING, Results
@@ -63,7 +63,7 @@ class Batch:
         StoreUnavailable: if the output folder or the database cannot be used.
     """
 
-    def __init__(self, folder: Path, out: Path, options: ReplayOptions) -> None:
+    def __init__(self, folder: Path, out: Path, options: JobOptions) -> None:
         recordings, self.unusable = recordings_in(folder)
         _check_out(out, folder)
         self._results = Results(out.absolute())

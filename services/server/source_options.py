@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from gsplat_core.errors import InvalidSetting
+from operators.settings import MAX_SEED
 from operators.sources.address import Address
 from operators.sources.options import MAX_FPS, MAX_SPEED, StereoLayout
 from operators.sources.registry import split_address
 from operators.sources.url_address import PROTOCOLS, UrlAddress
 
 Check = Callable[[Address, str], object]
-MAX_SEED = 2**63 - 1
 
 
 def _number(least: float, most: float) -> Check:

@@ -7,8 +7,9 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, SecretStr, model_validator
+from pydantic import AfterValidator, Field, SecretStr, field_validator, model_validator
 
+from operators.settings import check_stream_options
 from services.settings.oidc import OidcSettings
 from services.settings.section import Section
 
@@ -234,3 +235,9 @@ class StreamSettings(Section):
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="auto, cpu, cuda or cuda:1.")
     start: bool = Field(default=True, description="Start it with the service.")
     options: dict[str, Any] = Field(default={}, description="Options of the source and of the reconstruction.")
+
+    @field_validator("options")
+    @classmethod
+    def _known_options(cls, options: dict[str, Any]) -> dict[str, Any]:
+        check_stream_options(options)
+        return options

@@ -99,7 +99,7 @@ class Capture:
         spec = self.spec
         # This process runs only the source. If the source hangs or dies, the supervisor restarts
         # the process.
-        return SourceOptions(scale=spec.scale, fps=spec.fps, loop=spec.loop, realtime=True, process=False)
+        return SourceOptions(scale=spec.given_scale, fps=spec.fps, loop=spec.loop, realtime=True, process=False)
 
     def _publish(self, source: FrameSource, worker: Worker, publisher: PicturePublisher, backoff: Backoff) -> None:
         source.open()

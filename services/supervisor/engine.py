@@ -23,9 +23,9 @@ from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
 from operators.applications.working_size import WorkingSize
 from operators.errors import SourceUnavailable
-from operators.frame_clock import ClockSettings
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
+from operators.settings import EngineOptions
 from operators.sources.source import SourceDescription
 from services.bus.pictures import PicturePublisher
 from services.private_files import keep_files_private
@@ -58,17 +58,8 @@ def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
     return LiveSettings(
         source=source,
         out=out,
-        device=spec.device,
-        field=spec.field,
-        renderer=spec.renderer,
-        seed=spec.seed,
-        tool_mask=spec.tool_mask,
-        depth=spec.depth,
-        eyes=spec.eyes,
-        poses=spec.poses,
-        out_of_body=spec.out_of_body,
-        clock=ClockSettings(budget_ms=spec.budget_ms),
         report=False,
+        **spec.options(EngineOptions),
     )
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsplat_core.errors import UserError
-from operators.applications.limits import check_scale
 from operators.applications.working_size import WorkingSize
+from operators.settings import check_option
 from operators.sources.source import SourceDescription
 from services.bus.errors import BadMessage
 from services.bus.runtime import read_json, write_json
@@ -40,7 +40,7 @@ def engine_scale(
     try:
         found = read_json(kept)
         scale = float(found["scale"])
-        check_scale(scale)
+        check_option("scale", scale)
         if found["size"] == size and scale <= 1:
             return scale
     except (OSError, BadMessage, UserError, KeyError, TypeError, ValueError):

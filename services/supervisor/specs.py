@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from gsplat_core.errors import InvalidSetting
+from operators.settings import CallerCaptureOptions, CallerEngineOptions, Option
 from services.bus.runtime import Role, StreamFolder, read_json, write_json
 
 StreamName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
@@ -21,39 +23,21 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class SourceSpec(_Strict):
+@dataclass(frozen=True, kw_only=True)
+class SourceSpec(CallerCaptureOptions):
     """Source of a stream and the processing in the capture process."""
 
-    address: Annotated[str, StringConstraints(min_length=1, max_length=4096)]
-    """Source address in the format of `intrasplat live`."""
-    scale: float = Field(default=1.0, gt=0, le=4)
-    fps: float | None = Field(default=None, gt=0, le=1000)
-    """Frame rate for playing a recording, in place of its own."""
-    loop: bool = True
-    """Play a recording repeatedly."""
+    address: Annotated[str, Option("Source address in the format of `intrasplat live`", commands=(), least_length=1)]
 
 
-class EngineSpec(_Strict):
+@dataclass(frozen=True, kw_only=True)
+class EngineSpec(CallerEngineOptions):
     """Reconstruction settings of a stream."""
 
-    device: Literal["cpu", "cuda"] = "cpu"
-    gpu: int | None = Field(default=None, ge=0, le=1023)
-    """GPU index (`CUDA_VISIBLE_DEVICES`). None uses the first GPU."""
-    engine_scale: float | None = Field(default=None, gt=0, le=1)
-    """Scale of the reconstruction relative to the stream's pictures. None means full size on a GPU;
-    on a CPU the engine measures a size that keeps up (`services.supervisor.engine_size`)."""
-    field: str = "auto"
-    renderer: str = "alpha"
-    seed: int = Field(default=0, ge=0, lt=2**31)
-    budget_ms: float | None = Field(default=None, gt=0, le=10_000)
-    tool_mask: str = "builtin"
-    depth: Annotated[str, StringConstraints(min_length=1, max_length=4096)] = "auto"
-    """Depth source in the format of `intrasplat live`."""
-    eyes: Literal["left", "both"] = "left"
-    """Pictures of a stereo endoscope used for training."""
-    poses: Literal["given", "estimated"] = "given"
-    """Endoscope pose: taken from the frames, or estimated from the pictures."""
-    out_of_body: Literal["withhold", "off"] = "withhold"
+    gpu: Annotated[
+        int | None,
+        Option("Index of the GPU (`CUDA_VISIBLE_DEVICES`)", commands=(), null="the first one", ge=0, le=1023),
+    ] = None
 
 
 class ProcessLimits(_Strict):
@@ -86,7 +70,7 @@ class StreamSpec(_Strict):
         return {
             "stream": self.name,
             "role": role,
-            role: about.model_dump(mode="json"),
+            role: asdict(about),
             "limits": self.limits.model_dump(mode="json"),
         }
 
@@ -150,6 +134,6 @@ def assigned(specs: list[StreamSpec], gpus: int) -> list[StreamSpec]:
         if spec.engine.device == "cuda" and spec.engine.gpu is None:
             gpu = load.index(min(load))
             load[gpu] += 1
-            spec = spec.model_copy(update={"engine": spec.engine.model_copy(update={"gpu": gpu})})
+            spec = spec.model_copy(update={"engine": replace(spec.engine, gpu=gpu)})
         placed.append(spec)
     return placed

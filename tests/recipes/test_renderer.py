@@ -120,6 +120,6 @@ def test_its_own_outputs_are_asked_for_by_name(points, tiny, tmp_path):
 
 
 def test_an_unknown_name_is_refused_before_anything_is_written(tiny, tmp_path):
-    with pytest.raises(InvalidSetting, match="unknown renderer 'points'; known are alpha"):
+    with pytest.raises(InvalidSetting, match="renderer is 'points'; choose alpha"):
         replay(ReplaySettings(recording=tiny, out=tmp_path / "out", renderer="points"))
     assert not (tmp_path / "out").exists()

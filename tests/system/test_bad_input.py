@@ -212,13 +212,13 @@ def test_a_gpu_that_is_not_there(tiny, tmp_path, refused, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        (("--scale", "0"), "scale must be a positive number, got 0"),
-        (("--max-frames", "0"), "max_frames must be at least 1, got 0"),
+        (("--scale", "0"), "scale is 0.0; it must be above 0 and at most 64"),
+        (("--max-frames", "0"), "max_frames is 0; it must be from 1 to"),
         (("--steps-per-frame", "0"), "steps_per_frame is 0"),
         (("--seed", "-1"), "seed is -1"),
-        (("--field", "fourier"), "unknown deformation field 'fourier'"),
+        (("--field", "fourier"), "field is 'fourier'; choose auto, basis or hexplane"),
         (("--engine", "steam"), "engine is 'steam'"),
-        (("--device", "tpu"), "device 'tpu' is not known"),
+        (("--device", "tpu"), "device is 'tpu'; choose cpu or cuda"),
     ],
 )
 def test_wrong_options(tiny, tmp_path, refused, options, match):

@@ -165,7 +165,7 @@ def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intraspl
     ("arguments", "said"),
     [
         (["--protocol", "magic"], "choose among heldout, live, retention, second_eye, geometry, causal"),
-        (["--scale", "0"], "scale must be a positive number"),
+        (["--scale", "0"], "scale is 0.0; it must be above 0"),
         (["--steps-per-frame", "0"], "steps_per_frame"),
         (["--max-frames", "0"], "max_frames"),
         (["--motion-prior", "magic"], "magic"),

@@ -10,12 +10,12 @@ from fastapi import Header, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.requests import HTTPConnection, Request
 
+from operators.settings import CallerJobOptions
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.problems import Missing, problem_answer
 from services.control.recorded import recorded
 from services.control.replay_parts import Jobs
 from services.control.state import part
-from services.jobs.options import RemoteReplayOptions
 from services.settings import ResourceName
 
 router = new_router("replays")
@@ -34,7 +34,7 @@ class ReplayWanted(BaseModel):
     )
     recording: ResourceName | None = Field(None, examples=["case-7"])
     recordings: list[ResourceName] = Field([], max_length=MOST_RECORDINGS, examples=[[]])
-    options: RemoteReplayOptions = RemoteReplayOptions()
+    options: CallerJobOptions = CallerJobOptions()
 
     @model_validator(mode="after")
     def _one_or_many(self) -> ReplayWanted:

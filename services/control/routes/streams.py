@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 from starlette.requests import Request
 
+from operators.settings import stream_options_schema
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.parts import NewStream, Streams, StreamState
 from services.control.problems import Forbidden
@@ -26,7 +27,9 @@ class StreamOptions(BaseModel):
     """Source and reconstruction options by name; null restores the default."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    options: dict[str, Option] = Field(max_length=MOST_OPTIONS, examples=[{"tool_mask": "builtin"}])
+    options: dict[str, Option] = Field(
+        max_length=MOST_OPTIONS, examples=[{"tool_mask": "builtin"}], json_schema_extra=stream_options_schema()
+    )
 
 
 class StreamWanted(StreamSettings):
@@ -35,9 +38,7 @@ class StreamWanted(StreamSettings):
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
     start: bool = Field(True, description="Start it at once.")
-    options: dict[str, Any] = Field(
-        {}, max_length=MOST_OPTIONS, json_schema_extra={"additionalProperties": TypeAdapter(Option).json_schema()}
-    )
+    options: dict[str, Any] = Field({}, max_length=MOST_OPTIONS, json_schema_extra=stream_options_schema())
 
     @field_validator("options")
     @classmethod

@@ -9,6 +9,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from operators.applications import limits
+from operators.settings import check_option
 
 
 def camera(width_px, height_px):
@@ -16,31 +17,31 @@ def camera(width_px, height_px):
 
 
 POSSIBLE = [
-    (limits.check_seed, (0,)),
-    (limits.check_seed, (9223372036854775807,)),
-    (limits.check_steps, ("steps", 1)),
-    (limits.check_steps, ("steps", 100_000_000)),
-    (limits.check_max_frames, (None,)),
-    (limits.check_max_frames, (1,)),
-    (limits.check_max_frames, (1_000_000_000,)),
-    (limits.check_scale, (1e-9,)),
-    (limits.check_scale, (64.0,)),
+    (check_option, ("seed", 0)),
+    (check_option, ("seed", 9223372036854775807)),
+    (check_option, ("steps", 1)),
+    (check_option, ("steps", 100_000_000)),
+    (check_option, ("max_frames", None)),
+    (check_option, ("max_frames", 1)),
+    (check_option, ("max_frames", 1_000_000_000)),
+    (check_option, ("scale", 1e-9)),
+    (check_option, ("scale", 64.0)),
     (limits.check_picture, (camera(8192, 8192), 1.0)),
     (limits.check_picture, (camera(32768, 2048), 1.0)),
     (limits.check_picture, (camera(2048, 32768), 1.0)),
     (limits.check_width, (32768,)),
 ]
 IMPOSSIBLE = [
-    (limits.check_seed, (-1,), "seed is -1; it must be from 0 to 9223372036854775807"),
-    (limits.check_seed, (9223372036854775808,), "seed is 9223372036854775808"),
-    (limits.check_steps, ("rounds", 0), "rounds is 0; it must be from 1 to 100000000"),
-    (limits.check_steps, ("rounds", 100_000_001), "rounds is 100000001"),
-    (limits.check_max_frames, (0,), "at least 1, got 0"),
-    (limits.check_max_frames, (1_000_000_001,), "at most 1000000000, got 1000000001"),
-    (limits.check_scale, (0.0,), "a positive number, got 0"),
-    (limits.check_scale, (math.inf,), "a positive number, got inf"),
-    (limits.check_scale, (math.nan,), "a positive number, got nan"),
-    (limits.check_scale, (64.01,), "at most 64, got 64.01"),
+    (check_option, ("seed", -1), "seed is -1; it must be from 0 to 9223372036854775807"),
+    (check_option, ("seed", 9223372036854775808), "seed is 9223372036854775808"),
+    (check_option, ("steps", 0), "steps is 0; it must be from 1 to 100000000"),
+    (check_option, ("steps", 100_000_001), "steps is 100000001"),
+    (check_option, ("max_frames", 0), "max_frames is 0; it must be from 1 to 1000000000"),
+    (check_option, ("max_frames", 1_000_000_001), "max_frames is 1000000001"),
+    (check_option, ("scale", 0.0), "scale is 0.0; it must be above 0"),
+    (check_option, ("scale", math.inf), "scale is inf; it must be above 0"),
+    (check_option, ("scale", math.nan), "scale is nan; it must be above 0"),
+    (check_option, ("scale", 64.01), "scale is 64.01; it must be above 0 and at most 64"),
     (
         limits.check_picture,
         (camera(8193, 8192), 2.0),

@@ -117,5 +117,5 @@ def test_progress_is_said_every_few_seconds_and_at_the_end(capsys, monkeypatch):
 
 
 def test_a_wrong_option_is_named_as_the_command_names_it():
-    with pytest.raises(InvalidSetting, match="--steps-per-frame: "):
+    with pytest.raises(InvalidSetting, match="steps_per_frame is -1; it must be from 1 to"):
         batch._checked({"steps_per_frame": -1})

@@ -45,7 +45,7 @@ def test_what_is_no_bound_is_refused_in_a_sentence(texts):
 
 
 def test_a_bound_without_a_recording_is_refused(tmp_path):
-    with pytest.raises(InvalidSetting, match="give --record"), live_settings("a", tmp_path, "auto", False, ("1h",)):
+    with pytest.raises(InvalidSetting, match="give --record"), live_settings("a", tmp_path, False, ("1h",)):
         pass
-    with live_settings("a", tmp_path, "auto", True, ("1h",)) as settings:
+    with live_settings("a", tmp_path, True, ("1h",)) as settings:
         assert settings.recording.keep_s == 3600 and settings.record is not None

@@ -7,13 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.registry import DEPTHS
 from operators.output_folder import OutputFolder
+from operators.settings import CallerJobOptions, JobOptions
 from services.jobs.batch import Batch, recordings_in
-from services.jobs.options import RemoteReplayOptions, ReplayOptions
 from services.jobs.records import JobState
 from services.jobs.tables import JOBS
 
@@ -36,7 +35,7 @@ def place(tmp_path):
 
 def begin(place: Path, done: bool = True) -> dict[str, int]:
     """Begin the batch as the command does, and let every job end well."""
-    batch = Batch(place / "in", place / "out", ReplayOptions())
+    batch = Batch(place / "in", place / "out", JobOptions())
     counts = batch._store.counts()
     with batch._store.database.writing() as connection:
         connection.execute(JOBS.update().values(state=str(JobState.DONE)))
@@ -117,23 +116,27 @@ def test_a_name_that_is_no_text_refuses_itself_alone(tmp_path, name):
 
 @pytest.mark.parametrize("depth", ["auto", *(name for name in DEPTHS if name != "onnx")])
 def test_jobs_take_every_registered_depth(depth):
-    assert ReplayOptions(depth=depth).depth == RemoteReplayOptions(depth=depth).depth == depth
+    assert JobOptions(depth=depth).depth == CallerJobOptions(depth=depth).depth == depth
 
 
 @pytest.mark.parametrize("depth", ["onnx", "onnx:", "nothing", "", "stereo:x", "auto:x", "ONNX:x", "light:"])
 def test_a_depth_that_there_is_not_is_refused(depth):
-    for kind in (ReplayOptions, RemoteReplayOptions):
-        with pytest.raises(ValidationError):
+    for kind in (JobOptions, CallerJobOptions):
+        with pytest.raises(InvalidSetting):
             kind(depth=depth)
 
 
-def test_a_network_is_for_the_machine_itself():
-    assert ReplayOptions(depth="onnx:/a/b.onnx").depth == "onnx:/a/b.onnx"
-    with pytest.raises(ValidationError, match="names a file of the server"):
-        RemoteReplayOptions(depth="onnx:/a/b.onnx")
+def test_a_caller_names_a_network_of_the_server_by_its_absolute_path(tmp_path):
+    assert JobOptions(depth="onnx:b.onnx").depth == "onnx:b.onnx", "a batch may name any local file"
+    network = tmp_path / "depth.onnx"
+    for missing in ("onnx:depth.onnx", f"onnx:{network}", "onnx:/etc/passwd"):
+        with pytest.raises(InvalidSetting, match=r"absolute path|no file of the server that ends in \.onnx"):
+            CallerJobOptions(depth=missing)
+    network.write_bytes(b"")
+    assert CallerJobOptions(depth=f"onnx:{network}").depth == f"onnx:{network}"
 
 
 def test_jobs_take_estimated_poses():
-    assert RemoteReplayOptions(poses="estimated").chosen() == {"poses": "estimated"}
-    with pytest.raises(ValidationError):
-        RemoteReplayOptions(poses="x")
+    assert CallerJobOptions(poses="estimated").chosen() == {"poses": "estimated"}
+    with pytest.raises(InvalidSetting):
+        CallerJobOptions(poses="x")

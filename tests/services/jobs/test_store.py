@@ -9,9 +9,8 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
-from services.cli.options import RunOptions
+from operators.settings import JobOptions
 from services.jobs.claims import Claims
-from services.jobs.options import ReplayOptions
 from services.jobs.records import JobState, NewJob
 from services.jobs.store import DAY_S, MOST_AT_ONCE, uses_recording
 from services.jobs.tables import METADATA, SCHEMA
@@ -128,10 +127,5 @@ def test_a_recording_is_in_use_until_its_jobs_have_ended(new_store):
 
 
 def test_options_that_are_defaults_are_not_kept():
-    assert ReplayOptions(seed=0, scale=0.5).chosen() == {"scale": 0.5}
-    assert ReplayOptions().chosen() == {}
-
-
-def test_every_option_of_the_command_is_one_of_a_job():
-    """`intrasplat batch` hands all of them on."""
-    ReplayOptions(**RunOptions().settings())
+    assert JobOptions(seed=0, scale=0.5).chosen() == {"scale": 0.5}
+    assert JobOptions().chosen() == {}

@@ -8,17 +8,13 @@ from importlib import import_module
 
 import pytest
 
-from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED
-from gsplat_core.rendering.registry import RENDERERS
 from operators.sources.registry import SOURCES
-from operators.tool_mask import TOOL_MASKS
 from services.control.parts import NewStream
 from services.server import source_options
 from services.server.source_options import OPTIONS, check_source_options
-from services.server.stream_specs import KNOWN, spec_of
+from services.server.stream_specs import spec_of
 
 MODULES = {
     "synthetic": "synthetic", "v4l2": "v4l2", "folder": "folder", "pipe": "pipe", "realtime": "realtime",
@@ -68,16 +64,11 @@ def test_the_options_are_those_of_the_source(scheme):
     assert set(OPTIONS[scheme]) == asked
 
 
-def test_nothing_that_the_engine_knows_is_refused():
-    assert set(KNOWN["field"]) == {"auto", *FIELDS}
-    assert set(KNOWN["renderer"]) == set(RENDERERS)
-    assert set(KNOWN["tool_mask"]) == set(TOOL_MASKS)
-    assert set(KNOWN["depth"]) == {"auto", *DEPTHS}
+def test_the_schemes_are_those_of_sources():
     assert set(OPTIONS) <= set(SOURCES) and source_options.MAX_SEED == MAX_SEED
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", ["field", "renderer", "tool_mask", "depth"])
 def test_names_that_the_engine_does_not_know_are_refused(name):
     with pytest.raises(InvalidSetting, match=f"{name} is 'nope'"):
         spec_of(NewStream("theatre-1", "synthetic:", "live", "cpu", {name: "nope"}))
-    spec_of(NewStream("theatre-1", "synthetic:", "live", "cpu", {name: KNOWN[name][0]}))

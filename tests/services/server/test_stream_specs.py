@@ -38,8 +38,8 @@ def test_devices(monkeypatch, device, found, expected):
     [
         ({"scael": 1}, "no option 'scael'; the nearest is 'scale'"),
         ({"gpu": 1}, "no option 'gpu'"),
-        ({"scale": 9}, "scale: "),
-        ({"budget_ms": "soon"}, "budget_ms: "),
+        ({"scale": 9}, "scale is 9; it must be above 0 and at most 4"),
+        ({"budget_ms": "soon"}, "budget_ms is 'soon'; it must be a number"),
     ],
 )
 def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
@@ -132,6 +132,6 @@ def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_pa
     settings = live_settings(asked, tmp_path, "a source")
     assert (settings.depth, settings.eyes, settings.poses) == ("stereo", "both", "estimated")
     usual = live_settings(spec_of(wanted()).engine, tmp_path, "a source")
-    assert (usual.depth, usual.eyes, usual.poses) == ("auto", "left", "given")
+    assert (usual.depth, usual.trained_eyes, usual.poses) == ("auto", "left", "given")
     with pytest.raises(InvalidSetting, match="eyes"):
         spec_of(wanted(eyes="right"))

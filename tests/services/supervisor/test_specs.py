@@ -41,7 +41,7 @@ def test_names_that_are_no_names(name):
     "wrong", [{"scale": 0}, {"scale": float("nan")}, {"fps": -1}, {"address": ""}, {"adress": "x"}], ids=str
 )
 def test_sources_that_are_none(wrong):
-    with pytest.raises(ValidationError):
+    with pytest.raises((InvalidSetting, TypeError)):
         SourceSpec(**{"address": "synthetic:", **wrong})
 
 
