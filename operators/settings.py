@@ -5,7 +5,8 @@ An option is a field with its type, range, unit, description and the commands th
 `intrasplat`, the streams of the settings file, the requests of the REST API, stored jobs, the specifications of stream
 processes and the forms of the console are derived from these fields.
 
-A new option is one field of a section, and its use in the operator or application that needs it. Importing this module
+A new option is one field of a section, and its use in the operator or application that needs it. An option whose name is a
+field of `ReconstructorConfig` reaches the reconstructor without further code. Importing this module
 loads neither torch, NumPy nor pydantic; values are checked by pydantic when an object is created.
 """
 
@@ -27,6 +28,7 @@ from typing import (
     Literal,
     TypeVar,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -39,6 +41,7 @@ from operators.choices import TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Polic
 from operators.graph.engines import Engine
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, ValidationError
     from pydantic_core import CoreSchema
 
@@ -252,7 +255,7 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
 
 def options_of(kind: type[Section]) -> Mapping[str, Declared]:
     """Return the options of a class by name: those of its sections in order, then those of combined classes."""
-    return _options_of(kind)
+    return _options_of(cast(Any, kind))
 
 
 @cache
@@ -284,6 +287,9 @@ def options_for(kind: type[Section], command: Command) -> Mapping[str, Declared]
     return {name: each for name, each in options_of(kind).items() if command in each.option.commands}
 
 
+Config = TypeVar("Config", bound="DataclassInstance")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Section:
     """Base of the sections and of their combinations.
@@ -302,6 +308,15 @@ class Section:
         """Return the options that differ from their defaults."""
         values = {name: getattr(self, name) for name in options_of(type(self))}
         return {name: value for name, value in values.items() if value != options_of(type(self))[name].default}
+
+    def applied_to(self, config: Config) -> Config:
+        """Return a dataclass of the core with the values of options that it has fields of the same name for.
+
+        None keeps the value of the field.
+        """
+        shared = {field.name for field in dataclasses.fields(config)} & options_of(type(self)).keys()
+        given = {name: getattr(self, name) for name in shared if getattr(self, name) is not None}
+        return dataclasses.replace(config, **given)
 
     def options(self, kind: type[Section] | None = None) -> dict[str, Any]:
         """Return the options by name; those of the class `kind` alone if one is given."""

@@ -134,8 +134,7 @@ class LiveSettings(LiveOptions):
         if device == "cuda":
             wanted = max(wanted, min(LIVE_MOST_GAUSSIANS, pixels // LIVE_PIXELS_PER_GAUSSIAN))
         wanted = min(wanted, max(64, pixels // PIXELS_PER_GAUSSIAN))
-        return ReconstructorConfig(
-            field=self.field,
+        config = ReconstructorConfig(
             gaussians=wanted,
             max_gaussians=2 * wanted,
             window_frames=LIVE_WINDOW_FRAMES[device],
@@ -145,10 +144,10 @@ class LiveSettings(LiveOptions):
             motion_prior="flow",
             motion_detail=LIVE_MOTION_DETAIL,
             start_from_motion=LIVE_STARTS_FROM_MOTION[device],
-            eyes=self.trained_eyes,
             ssim_weight=LIVE_SSIM_WEIGHT[device],
             squared_error=LIVE_SQUARED_ERROR[device],
         )
+        return self.applied_to(config)
 
     def stated(self) -> RunSettings:
         """Return the settings that the report states."""

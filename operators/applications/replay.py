@@ -95,8 +95,7 @@ class ReplaySettings(ReplayOptions):
         Raises:
             InvalidSetting: the settings are inconsistent.
         """
-        config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
-        config = replace(config, eyes=self.trained_eyes)
+        config = self.applied_to(ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig())
         if offline:
             config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:
@@ -105,7 +104,7 @@ class ReplaySettings(ReplayOptions):
             config = replace(
                 config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most)
             )
-        return config if self.steps_per_frame is None else replace(config, steps_per_frame=self.steps_per_frame)
+        return config
 
     def stated(self, *, online: bool) -> RunSettings:
         """Return the settings that the report states. online: training is done frame by frame."""

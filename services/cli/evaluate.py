@@ -34,7 +34,7 @@ def evaluation_settings(recording: Path, options: EvaluateOptions) -> Evaluation
     return EvaluationSettings(
         recording,
         tuple(options.protocol or ()),
-        device=options.device,  # type: ignore[arg-type] - checked by check_device
+        device=options.device,  # type: ignore[arg-type]  # checked by check_device
         renderer=options.renderer,
         scale=options.scale,
         max_frames=options.max_frames,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 PAGE = Path(__file__).parent / "page"
-MODULES = "main api viewer plot table models streams audit badge layers legend orbit exports recordings replays sha256 dialogs times keys health"
+MODULES = "main api viewer plot table models streams audit badge layers legend orbit options exports recordings replays sha256 dialogs times keys health"
 FILES = {
     "style.css": "text/css",
     "icon.svg": "image/svg+xml",

@@ -2,6 +2,7 @@
 
 import { call, download, fetched, useTicket } from "./api.js";
 import { confirmed } from "./dialogs.js";
+import { chosenOptions, offerOptions } from "./options.js";
 import { button, replaceRows, row } from "./table.js";
 import { when } from "./times.js";
 
@@ -17,6 +18,7 @@ export function replaysPage(report) {
 
   async function renew() {
     const number = ++asked;
+    await offerOptions(at("replay-options"), "ReplayWanted");
     const [recordings, replays] = await Promise.all([call("GET", "/v1/recordings"), call("GET", "/v1/replays?count=50")]);
     if (number >= current) offer(recordings.filter((each) => each.state === "ready").map((each) => each.name));
     shown = replays;
@@ -114,7 +116,7 @@ export function replaysPage(report) {
   at("start-replay").addEventListener("submit", (event) => {
     event.preventDefault();
     report(async () => {
-      const wanted = { recording: at("replay-recording").value, options: chosen() };
+      const wanted = { recording: at("replay-recording").value, options: chosenOptions(at("replay-options")) };
       await call("POST", "/v1/replays", wanted, { "Idempotency-Key": idempotencyKey() });
       await renew();
     });
@@ -129,16 +131,6 @@ export function replaysPage(report) {
   }
 
   return { renew, choose };
-}
-
-/** The options of the form that were filled in. */
-function chosen() {
-  const options = {};
-  for (const field of at("start-replay").querySelectorAll("[data-option]")) {
-    if (field.type === "checkbox") { if (field.checked) options[field.dataset.option] = true; }
-    else if (field.value !== "") options[field.dataset.option] = field.type === "number" ? Number(field.value) : field.value;
-  }
-  return options;
 }
 
 function idempotencyKey() {

@@ -2,6 +2,7 @@
 
 import { call } from "./api.js";
 import { confirmed } from "./dialogs.js";
+import { chosenOptions, offerOptions } from "./options.js";
 import { button, long, replaceRows, row } from "./table.js";
 import { age } from "./times.js";
 
@@ -13,6 +14,7 @@ export function streamsPage(report, onStreams) {
     const streams = await call("GET", "/v1/streams");
     onStreams(streams);
     replaceRows(at("stream-rows"), streams.map(line));
+    await offerOptions(at("stream-options"), "StreamWanted");
   }
 
   function line(stream) {
@@ -45,7 +47,8 @@ export function streamsPage(report, onStreams) {
   at("new-stream").addEventListener("submit", (event) => {
     event.preventDefault();
     report(async () => {
-      const wanted = { name: at("stream-name").value, source: at("stream-source").value, show: at("stream-show").value };
+      const options = chosenOptions(at("stream-options"));
+      const wanted = { name: at("stream-name").value, source: at("stream-source").value, show: at("stream-show").value, options };
       await call("POST", "/v1/streams", wanted);
       await renew();
     });

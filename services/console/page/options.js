@@ -1,0 +1,65 @@
+// Form fields for options of the engine, made from the server's OpenAPI document.
+
+import { call } from "./api.js";
+
+let described = null;
+
+/** Fill `place` with a field for each option of the request `schema`, such as "ReplayWanted". Does nothing if it has them already. */
+export async function offerOptions(place, schema) {
+  if (place.childElementCount) return;
+  described ??= call("GET", "/openapi.json").catch((error) => { described = null; throw error; });
+  const { schemas } = (await described).components;
+  const wanted = schemas[schema].properties.options;
+  const { properties } = wanted.$ref ? schemas[wanted.$ref.split("/").pop()] : wanted;
+  if (!place.childElementCount) place.replaceChildren(...Object.entries(properties).map(labelled));
+}
+
+/** The options in `place` that differ from their defaults, by name. */
+export function chosenOptions(place) {
+  const options = {};
+  for (const field of place.querySelectorAll("[data-option]")) {
+    if (field.type === "checkbox") { if (field.checked !== field.defaultChecked) options[field.dataset.option] = field.checked; }
+    else if (field.value !== "") options[field.dataset.option] = field.type === "number" ? Number(field.value) : field.value;
+  }
+  return options;
+}
+
+function labelled([name, schema]) {
+  const label = document.createElement("label"), field = fieldOf(schema);
+  const unit = schema["x-unit"] ? `, ${schema["x-unit"]}` : "";
+  const text = `${name[0].toUpperCase()}${name.slice(1).replaceAll("_", " ")}${unit}`;
+  field.dataset.option = name;
+  label.title = schema.description ?? "";
+  if (field.type === "checkbox") { label.className = "choice"; label.append(field, ` ${text}`); }
+  else label.append(`${text} `, field);
+  return label;
+}
+
+/** An empty field stands for the default, which it shows. */
+function fieldOf(schema) {
+  const kinds = schema.anyOf ?? [schema], usual = schema.default ?? /; null: (.*)\.$/.exec(schema.description ?? "")?.[1] ?? "";
+  const words = kinds.flatMap((kind) => kind.enum ?? []);
+  const number = kinds.find((kind) => ["integer", "number"].includes(kind.type));
+  if (words.length && !kinds.some((kind) => kind.pattern)) {
+    const field = document.createElement("select");
+    field.append(new Option(usual, ""), ...words.filter((word) => word !== usual).map((word) => new Option(word)));
+    return field;
+  }
+  const field = document.createElement("input");
+  if (kinds.some((kind) => kind.type === "boolean")) {
+    field.type = "checkbox";
+    field.defaultChecked = schema.default === true;
+    return field;
+  }
+  field.placeholder = usual;
+  if (number) {
+    field.type = "number";
+    field.step = number.type === "integer" ? 1 : "any";
+    field.min = number.minimum ?? number.exclusiveMinimum ?? "";
+    field.max = number.maximum ?? number.exclusiveMaximum ?? "";
+  } else {
+    field.title = words.join(", ");
+    field.autocomplete = "off";
+  }
+  return field;
+}

@@ -1,0 +1,144 @@
+"""Every name of every registry is accepted by the command line, the settings file, the REST API and jobs, and nothing else is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, RENDERERS
+from gsplat_core.errors import InvalidSetting
+from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS
+from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions, options_for
+from operators.sources.registry import SOURCES
+from services.cli import app as command_line
+from services.control import sources
+from services.control.parts import NewStream
+from services.control.routes.jobs import ReplayWanted
+from services.control.routes.streams import StreamWanted
+from services.server.stream_specs import spec_of
+from services.settings import SettingsInvalid, load_settings
+
+NAMES = [
+    *(("field", name) for name in FIELDS),
+    *(("renderer", name) for name in RENDERERS),
+    *(("depth", name) for name in ("auto", *DEPTHS)),
+    *(("tool_mask", name) for name in TOOL_MASKS),
+    *(("poses", name) for name in ("given", "estimated")),
+    *(("eyes", name) for name in ("left", "both")),
+]
+KINDS = {"replay": ReplayOptions, "batch": JobOptions, "reconstruct": ReconstructOptions, "live": LiveOptions}
+
+
+@dataclass
+class Network:
+    """File that an option with an address names."""
+
+    path: str
+
+    def of(self, name: str) -> str:
+        return f"{name}:{self.path}" if name in DEPTHS_WITH_ADDRESS or name in TOOL_MASKS_WITH_ADDRESS else name
+
+
+@pytest.fixture
+def network(tmp_path):
+    (tmp_path / "network.onnx").write_bytes(b"")
+    return Network(str(tmp_path / "network.onnx"))
+
+
+@pytest.fixture
+def given(monkeypatch, tmp_path):
+    """The options that a command hands on for a command line."""
+
+    def parse(command: str, *words: str):
+        found = {}
+
+        def keep(*_, **options):
+            raise Kept(options)
+
+        class Kept(Exception):
+            def __init__(self, options):
+                found.update(options)
+
+        monkeypatch.setattr("operators.applications.replay.ReplaySettings", keep)
+        monkeypatch.setattr("services.cli.live.live_settings", keep)
+        monkeypatch.setattr(
+            "services.cli.batch.batch_command", lambda folder, out, workers, options, **_: keep(**options)
+        )
+        where = ["--out", str(tmp_path / "out")] if command in ("replay", "reconstruct") else []
+        monkeypatch.setattr(command_line, "exit_code_of", lambda error, arguments: 7 if isinstance(error, Kept) else 2)
+        assert command_line.run([command, "a", *where, *words]) == 7
+        return KINDS[command](**{name: found[name] for name in options_for(KINDS[command], command) if name in found})
+
+    return parse
+
+
+@pytest.mark.parametrize(("option", "name"), NAMES)
+def test_every_name_is_accepted_everywhere(option, name, given, network, tmp_path):
+    value = network.of(name)
+    for command, kind in KINDS.items():
+        if option in options_for(kind, command):
+            assert getattr(given(command, f"--{option.replace('_', '-')}", value), option) == value
+    if option in options_for(JobOptions, "job"):
+        wanted = ReplayWanted.model_validate({"recording": "a", "options": {option: value}})
+        stored = json.loads(json.dumps(wanted.options.chosen()))
+        assert getattr(JobOptions(**stored), option) == value
+    file = tmp_path / "settings.yaml"
+    file.write_text(json.dumps({"streams": {"a": {"source": "synthetic:", "options": {option: value}}}}))
+    listed = load_settings(file).streams["a"]
+    asked = StreamWanted.model_validate({"name": "a", "source": "synthetic:", "options": {option: value}})
+    for stream in (listed, asked):
+        spec = spec_of(NewStream("a", stream.source, "live", "cpu", stream.options))
+        assert getattr(spec.engine, option) == value
+
+
+@pytest.mark.parametrize(
+    "option", ["field", "renderer", "depth", "tool_mask", "poses", "eyes", "out_of_body", "device"]
+)
+def test_a_name_that_there_is_not_is_refused_everywhere(option, tmp_path, capsys):
+    flag = f"--{option.replace('_', '-')}"
+    for command, kind in KINDS.items():
+        if option in options_for(kind, command):
+            where = ["--out", str(tmp_path / "out")] if command in ("replay", "reconstruct") else []
+            assert command_line.run([command, str(tmp_path), *where, flag, "nope"]) == 2
+            assert f"{option} is 'nope'; choose " in capsys.readouterr().err
+    with pytest.raises(ValidationError):
+        ReplayWanted.model_validate({"recording": "a", "options": {option: "nope"}})
+    options = {"streams": {"a": {"source": "synthetic:", "options": {option: "nope"}}}}
+    (tmp_path / "settings.yaml").write_text(json.dumps(options))
+    with pytest.raises(SettingsInvalid, match=r"line 1: .*(is 'nope'; choose|has no option 'device')"):
+        load_settings(tmp_path / "settings.yaml")
+    with pytest.raises(InvalidSetting, match=r"nope|has no option 'device'"):
+        spec_of(NewStream("a", "synthetic:", "live", "cpu", {option: "nope"}))
+
+
+def test_names_that_are_added_at_run_time_are_accepted_and_documented():
+    RENDERERS.add("points", "nowhere:Points")
+    try:
+        assert ReplayOptions(renderer="points").renderer == "points"
+
+        class Wanted(BaseModel):
+            options: JobOptions
+
+        assert Wanted.model_json_schema()["$defs"]["JobOptions"]["properties"]["renderer"]["enum"] == [
+            "alpha",
+            "points",
+        ]
+    finally:
+        RENDERERS.remove("points")
+    with pytest.raises(InvalidSetting, match="renderer is 'points'; choose alpha"):
+        ReplayOptions(renderer="points")
+
+
+def test_every_source_has_a_rule():
+    """A scheme without a rule could not be allowed by the settings."""
+    known = sources.OF_NETWORKS | sources.OF_FOLDERS | sources.OF_DEVICES | sources.OF_NOTHING
+    assert set(SOURCES) == known
+
+
+@pytest.mark.parametrize("registry", [FIELDS, RENDERERS, DEPTHS, TOOL_MASKS, SINKS], ids=lambda each: each.what)
+def test_every_entry_can_be_imported(registry):
+    for name in registry:
+        assert registry[name] is not None
