@@ -37,7 +37,7 @@ from typing import (
 from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, RENDERERS, Eyes
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
-from operators.choices import TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
+from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
 from operators.graph.engines import Engine
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def _either(words: list[str]) -> str:
 def _strict(kind: Any, limits: Mapping[str, Any], least_length: int | None) -> Any:
     """Return a type that pydantic accepts without conversions, such as true for the number 1, and with limits for its
     numbers."""
-    from pydantic import Field
+    from pydantic import BeforeValidator, Field
 
     if get_origin(kind) in (Union, UnionType):
         return Union[tuple(_strict(each, limits, least_length) for each in get_args(kind))]  # noqa: UP007 - of a computed tuple
@@ -183,7 +183,16 @@ def _strict(kind: Any, limits: Mapping[str, Any], least_length: int | None) -> A
         return Annotated[int, Field(strict=True, **limits)]
     if kind is str:
         return Annotated[str, Field(min_length=least_length, max_length=MAX_TEXT)]
+    if get_origin(kind) is tuple:
+        return Annotated[kind, BeforeValidator(_listed)]
     return Annotated[bool, Field(strict=True)] if kind is bool else kind
+
+
+def _listed(value: Any) -> Any:
+    """Return the words of a text such as "video,keyframes", of which "none" means no word."""
+    if isinstance(value, str):
+        return () if value == "none" else tuple(value.split(","))
+    return value
 
 
 @dataclass(frozen=True)
@@ -202,7 +211,8 @@ class Declared:
         """Return the texts that the option accepts; empty if they are not limited to a list."""
         if get_origin(self.kind) is Literal:
             return [str(each) for each in get_args(self.kind)]
-        return next((each.choices for each in _metadata(self.kind) if isinstance(each, Names)), [])
+        kind = get_args(self.kind)[0] if get_origin(self.kind) is tuple else self.kind
+        return next((each.choices for each in _metadata(kind) if isinstance(each, Names)), [])
 
     @property
     def plain(self) -> type:
@@ -231,6 +241,8 @@ class Declared:
         first = error.errors(include_input=False)[0]
         if first["type"] == "value_error":
             return str(first["ctx"]["error"])
+        if get_origin(self.kind) is tuple:
+            return f"it must be a list of {_either(self.choices)}"
         if self.choices:
             return f"choose {_either(self.choices)}"
         kind = {int: "a whole number", float: "a number", bool: "true or false"}.get(self.kind)
@@ -305,9 +317,10 @@ class Section:
             object.__setattr__(self, name, each.checked(getattr(self, name)))
 
     def chosen(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults."""
+        """Return the options that differ from their defaults, as values of JSON."""
         values = {name: getattr(self, name) for name in options_of(type(self))}
-        return {name: value for name, value in values.items() if value != options_of(type(self))[name].default}
+        changed = {name: value for name, value in values.items() if value != options_of(type(self))[name].default}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in changed.items()}
 
     def applied_to(self, config: Config) -> Config:
         """Return a dataclass of the core with the values of options that it has fields of the same name for.
@@ -421,6 +434,18 @@ class DisplaySection(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class OutputSection(Section):
+    """Files that a run writes beside its report and its model."""
+
+    sinks: Annotated[
+        tuple[Annotated[str, Names(SINKS)], ...], Option("Outputs for the report, or none", TRAINING_RUNS)
+    ] = (
+        "video",
+        "keyframes",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScheduleSection(Section):
     """Work per frame of a replay."""
 
@@ -482,7 +507,9 @@ class LiveSection(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JobOptions(ReconstructSection, DepthSection, DisplaySection, SourceSection, LengthSection, ScheduleSection):
+class JobOptions(
+    ReconstructSection, DepthSection, DisplaySection, SourceSection, LengthSection, ScheduleSection, OutputSection
+):
     """Options of a replay job, as stored with the job. A job of `intrasplat batch` may name local files."""
 
 

@@ -71,14 +71,10 @@ class ReplaySettings(ReplayOptions):
     `open_source`).
     """
     out: Path
-    sinks: tuple[str, ...] = ("video", "keyframes")
-    """Names in `operators.choices.SINKS`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_depth(self.depth)
-        for name in self.sinks:
-            SINKS.check(name)
 
     @property
     def inputs(self) -> tuple[Path, ...]:

@@ -189,10 +189,7 @@ def takes_options(kind: type[Section], command: Command) -> Callable[[Callable[.
     `command` becomes a command line option. The mapping has their values by name."""
     declared = options_for(kind, command)
     annotations = {name: _annotation(each) for name, each in declared.items()}
-    defaults = {
-        name: each.option.word if each.option.word and each.default is None else each.default
-        for name, each in declared.items()
-    }
+    defaults = {name: _default(each) for name, each in declared.items()}
 
     def made(values: Mapping[str, Any]) -> dict[str, Any]:
         return {name: _value(each, values[name]) for name, each in declared.items()}
@@ -208,6 +205,12 @@ def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
     return _with_parameters(
         command, annotations, {field.name: field.default for field in fields(kind)}, lambda values: kind(**values)
     )
+
+
+def _default(each: Declared) -> Any:
+    if each.option.word and each.default is None:
+        return each.option.word
+    return ",".join(each.default) if isinstance(each.default, tuple) else each.default
 
 
 def _value(each: Declared, given: Any) -> Any:

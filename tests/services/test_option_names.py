@@ -132,6 +132,20 @@ def test_names_that_are_added_at_run_time_are_accepted_and_documented():
         ReplayOptions(renderer="points")
 
 
+@pytest.mark.parametrize("name", [*SINKS, ",".join(SINKS), "none"])
+def test_every_sink_is_accepted_by_runs_and_jobs(name, given):
+    sinks = () if name == "none" else tuple(name.split(","))
+    for command in ("replay", "batch", "reconstruct"):
+        assert given(command, "--sinks", name).sinks == sinks
+    for value in (name, list(sinks)):
+        wanted = ReplayWanted.model_validate({"recording": "a", "options": {"sinks": value}})
+        assert JobOptions(**json.loads(json.dumps(wanted.options.chosen()))).sinks == sinks
+    with pytest.raises(InvalidSetting, match="sinks is 'film'; choose video or keyframes"):
+        JobOptions(sinks="film")
+    with pytest.raises(InvalidSetting, match="sinks is 3; it must be a list of video or keyframes"):
+        JobOptions(sinks=3)
+
+
 def test_every_source_has_a_rule():
     """A scheme without a rule could not be allowed by the settings."""
     known = sources.OF_NETWORKS | sources.OF_FOLDERS | sources.OF_DEVICES | sources.OF_NOTHING

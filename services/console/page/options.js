@@ -19,6 +19,7 @@ export function chosenOptions(place) {
   const options = {};
   for (const field of place.querySelectorAll("[data-option]")) {
     if (field.type === "checkbox") { if (field.checked !== field.defaultChecked) options[field.dataset.option] = field.checked; }
+    else if ("list" in field.dataset) { if (field.value !== "") options[field.dataset.option] = field.value.split(",").map((word) => word.trim()); }
     else if (field.value !== "") options[field.dataset.option] = field.type === "number" ? Number(field.value) : field.value;
   }
   return options;
@@ -52,13 +53,15 @@ function fieldOf(schema) {
     return field;
   }
   field.placeholder = usual;
+  const list = kinds.find((kind) => kind.type === "array");
+  if (list) field.dataset.list = "";
   if (number) {
     field.type = "number";
     field.step = number.type === "integer" ? 1 : "any";
     field.min = number.minimum ?? number.exclusiveMinimum ?? "";
     field.max = number.maximum ?? number.exclusiveMaximum ?? "";
   } else {
-    field.title = words.join(", ");
+    field.title = [...words, ...(list?.items.enum ?? [])].join(", ");
     field.autocomplete = "off";
   }
   return field;
