@@ -11,6 +11,7 @@ from gsplat_core.errors import InvalidSetting
 from services.cli import ctl_admin, ctl_replays
 from services.cli.ctl_admin import stream_row
 from services.cli.ctl_client import DEFAULT_URL, CaOption, KeyFileOption, UrlOption, print_found, with_client
+from services.cli.ctl_replays import OptionsOption, assigned
 from services.cli.exit_codes import OK
 from services.cli.options import JsonOption
 from services.cli.tables import Columns
@@ -63,12 +64,18 @@ def create(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="Its address.", show_default=False)],
     show: Annotated[str, typer.Option(help="`live`, or `model NAME`.")] = "live",
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "auto",
+    option: OptionsOption = None,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
     """Create a stream and start it."""
-    made = with_client(url, key_file, ca, lambda client: client.create_stream(name, source, show=show, device=device))
+    options = assigned(option or ())
+
+    def act(client: Any) -> Any:
+        return client.create_stream(name, source, show=show, device=device, options=options)
+
+    made = with_client(url, key_file, ca, act)
     return print_found([made], STREAM, False, stream_row)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,6 +36,15 @@ REPLAY: Columns = {
 }  # fmt: skip
 KEPT: Columns = {"name": "MODEL", "version": "VERSION", "state": "STATE"}
 RecordingName = Annotated[str, typer.Argument(metavar="RECORDING", show_default=False)]
+OptionsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="<name=value>",
+        help="An option of the engine, as `intrasplat replay` and `live` have it; more than once for several.",
+        show_default=False,
+    ),
+]
 ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays` shows it.", show_default=False)]
 
 
@@ -94,19 +103,14 @@ def replays(
 
 def replay(
     names: Annotated[list[str], typer.Argument(metavar="RECORDING...", show_default=False)],
-    option: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--option", metavar="<name=value>", help="As `intrasplat replay` has it; more than once for several."
-        ),
-    ] = None,
+    option: OptionsOption = None,
     wait: Annotated[bool, typer.Option("--wait", help="Wait until it has ended.")] = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
 ) -> int:
     """Start a replay of each given recording."""
-    options = dict(_assigned(each) for each in option or ())
+    options = assigned(option or ())
 
     def act(client: Any) -> Any:
         made = client.start_replays(names, options)
@@ -177,6 +181,11 @@ def _packed(path: Path) -> Iterator[Path]:
                 except OSError as error:
                     raise InvalidSetting(f"{file} cannot be read: {error.strerror or error}; check it") from error
         yield archive
+
+
+def assigned(texts: Iterable[str]) -> dict[str, Any]:
+    """Parse options of the form `name=value`. Raises InvalidSetting for another form."""
+    return dict(_assigned(each) for each in texts)
 
 
 def _assigned(text: str) -> tuple[str, Any]:
