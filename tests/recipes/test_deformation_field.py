@@ -179,7 +179,7 @@ def test_a_bundle_with_a_field_that_is_not_registered_is_refused(registered, rec
     try:
         with pytest.raises(BundleCorrupt, match="unknown deformation field 'drift'; known are basis, hexplane"):
             load_bundle(tmp_path / "out" / "model")
-        with pytest.raises(InvalidSetting, match="known are auto, basis, hexplane"):
+        with pytest.raises(InvalidSetting, match="field is 'drift'; choose auto, basis or hexplane"):
             replay(ReplaySettings(recording, tmp_path / "other", field="drift"))
     finally:
         FIELDS.add("drift", DRIFT)
