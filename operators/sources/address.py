@@ -76,6 +76,10 @@ class Address:
             )
         return value
 
+    @overload
+    def whole(self, name: str, default: int, least: int, most: int) -> int: ...
+    @overload
+    def whole(self, name: str, default: int | None, least: int, most: int) -> int | None: ...
     def whole(self, name: str, default: int | None, least: int, most: int) -> int | None:
         """Return an integer option between `least` and `most`. Raises InvalidSetting."""
         text = self.text(name)

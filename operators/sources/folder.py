@@ -7,19 +7,16 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.plain_files import Picture, UnreadableFile, decode_picture
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
-from operators.sources.address import Address
+from operators.sources.address_options import OPEN_S, FolderAddress
 from operators.sources.new_files import NewFiles
-from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.options import SourceOptions
 from operators.sources.steady_clock import SteadyClock
 from operators.sources.stream import DEFAULT_FPS, StreamSource
 
 LOOK_S = 0.01
-OPEN_S = 10.0
-"""Timeout for the first image, in seconds."""
 UNREADABLE_AFTER_S = 2.0
 """Time in seconds after which an unreadable file that no longer changes is skipped."""
 
@@ -140,11 +137,5 @@ class FolderSource(StreamSource):
 
 def folder_source(rest: str, options: SourceOptions) -> FolderSource:
     """Open `folder:/path/of/images?fps=30&every=0`. Raises InvalidSetting and SourceUnavailable."""
-    address = Address.parse("folder", rest)
-    fps = address.number("fps", options.fps, 0.01, MAX_FPS)
-    every = address.flag("every")
-    open_s = address.number("open_s", OPEN_S, 0.1, 600.0)
-    address.refuse_others()
-    if not address.place:
-        raise InvalidSetting("folder: say which: folder:/path/of/images")
-    return FolderSource(address.place, fps, options, every=every, open_s=open_s)
+    address = FolderAddress.parse(rest, options)
+    return FolderSource(address.place, address.fps, options, every=address.every, open_s=address.open_s)

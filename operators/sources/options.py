@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from gsplat_core.errors import InvalidSetting
+from operators.settings import check_option
 
 StereoLayout = Literal["side_by_side", "top_bottom"]
 MAX_FPS = 1000.0
@@ -46,8 +47,7 @@ class SourceOptions:
             raise InvalidSetting(f"speed is {self.speed:g}; it must be positive, 1 is real time")
         if math.isfinite(self.speed) and self.speed > MAX_SPEED:
             raise InvalidSetting(f"speed is {self.speed:g}; it must be at most {MAX_SPEED:g}, or infinite")
-        if self.fps is not None and not 0 < self.fps <= MAX_FPS:
-            raise InvalidSetting(f"fps is {self.fps:g}; it must be above 0 and at most {MAX_FPS:g}")
+        check_option("fps", self.fps)
         if not 1 <= self.waiting <= MAX_WAITING:
             raise InvalidSetting(f"waiting is {self.waiting}; it must be from 1 to {MAX_WAITING} frames")
         if self.stereo is not None and self.stereo not in get_args(StereoLayout):

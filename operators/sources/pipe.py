@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost, SourceUnavailable
-from operators.sources.address import Address
-from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.address_options import PipeAddress
+from operators.sources.options import SourceOptions
 from operators.sources.raw_pictures import RawFormat
 from operators.sources.steady_clock import SteadyClock
 from operators.sources.stream import DEFAULT_FPS, StreamSource
@@ -211,16 +211,7 @@ def pipe_source(rest: str, options: SourceOptions) -> PipeSource:
     """Open `pipe:-?size=640x512&format=rgb24&fps=30` or `pipe:/path/of/a/fifo`. Raises
     InvalidSetting and SourceUnavailable.
     """
-    address = Address.parse("pipe", rest)
-    size, name = address.size(), address.text("format")
-    fps = address.number("fps", options.fps, 0.01, MAX_FPS)
-    address.refuse_others()
-    if not address.place:
-        raise InvalidSetting("pipe: say which: pipe:- for standard input, or pipe:/path/of/a/fifo")
-    if size is None:
-        if name not in (None, "y4m"):
-            raise InvalidSetting(f"pipe: raw frames in {name!r:.60} need their size: ?size=640x512&format={name:.60}")
-        return PipeSource(address.place, None, fps, options)
-    if name in (None, "y4m"):
-        raise InvalidSetting("pipe: raw frames need their format as well as their size: ?size=640x512&format=rgb24")
-    return PipeSource(address.place, RawFormat(str(name), *size), fps or DEFAULT_FPS, options)
+    address = PipeAddress.parse(rest, options)
+    if address.size is None:
+        return PipeSource(address.place, None, address.fps, options)
+    return PipeSource(address.place, RawFormat(str(address.format), *address.size), address.fps or DEFAULT_FPS, options)

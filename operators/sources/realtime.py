@@ -13,9 +13,9 @@ from gsplat_core.io.recordings import Recording, open_recording
 from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost
-from operators.sources.address import Address
+from operators.sources.address_options import RealtimeAddress
 from operators.sources.live import LiveSource
-from operators.sources.options import MAX_FPS, MAX_SPEED, SourceOptions
+from operators.sources.options import SourceOptions
 from operators.sources.source import SourceDescription
 
 DECODED_AHEAD = 4
@@ -148,17 +148,8 @@ def realtime_source(rest: str, options: SourceOptions) -> RealtimeSource:
 
     Raises InvalidSetting for invalid options, and the errors of `open_recording`.
     """
-    address = Address.parse("realtime", rest)
-    bounces = address.text("loop") == "bounce"
-    options = replace(
-        options,
-        loop=bounces or address.flag("loop", options.loop),
-        bounce=bounces or options.bounce,
-        speed=math.inf if address.text("speed") == "max" else address.number("speed", options.speed, 0.01, MAX_SPEED),
-        fps=address.number("fps", options.fps, 0.01, MAX_FPS),
-    )
-    address.refuse_others()
-    return play(address.place, options)
+    address = RealtimeAddress.parse(rest, options)
+    return play(address.place, address.options)
 
 
 def play(path: str, options: SourceOptions) -> RealtimeSource:

@@ -14,10 +14,12 @@ from typing import cast, get_args
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
+from operators.sources.address_options import PARSERS
 from operators.sources.options import SourceOptions, StereoLayout
 from operators.sources.source import FrameSource
+from operators.sources.url_address import UrlAddress
 
-__all__ = ["SOURCES", "SourceFactory", "SourceOptions", "open_source", "split_address"]
+__all__ = ["SOURCES", "SourceFactory", "SourceOptions", "check_address", "open_source", "split_address"]
 
 SourceFactory = Callable[[str, SourceOptions], FrameSource]
 """Creates a closed source from the text after the scheme and the options. Raises a UserError if it
@@ -105,8 +107,6 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     if scheme in _OF_PATHS and not rest.partition("?")[0].strip():
         raise InvalidSetting(f"{scheme}: the path is empty; give it as {scheme}:PATH")
     if scheme in _URLS and scheme in _BUILT_IN:
-        from operators.sources.url_address import UrlAddress
-
         # Reject a malformed address before a process is started and a connection times out.
         UrlAddress.parse(scheme, rest)
     if _reads_in_a_process(scheme, rest, options):
@@ -121,6 +121,25 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     else:
         source = SOURCES[scheme](rest, options)
     return source if layout is None else _split(source, layout)
+
+
+def check_address(address: str) -> None:
+    """Check an address without opening it or loading the libraries of its source.
+
+    Raises:
+        InvalidSetting: if the source would refuse an option; the message names it.
+    """
+    if address.startswith(_TWO_SOURCES):
+        for eye in address.removeprefix(_TWO_SOURCES).split("|"):
+            check_address(eye)
+        return
+    options = SourceOptions()
+    text, _ = _stereo_of(address, options)
+    scheme, rest = split_address(text)
+    if scheme in _URLS:
+        UrlAddress.parse(scheme, rest)
+    elif scheme in PARSERS:
+        PARSERS[scheme](rest, options)
 
 
 def _reads_in_a_process(scheme: str, rest: str, options: SourceOptions) -> bool:

@@ -8,13 +8,12 @@ import stat
 
 from gsplat_core.errors import InvalidSetting
 from operators.errors import SourceUnavailable
-from operators.sources.address import Address
+from operators.sources.address_options import V4l2Address
 from operators.sources.connection import Place
-from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.options import SourceOptions
 from operators.sources.url import ConnectedSource
 
 _DEVICE = re.compile(r"/dev/video\d{1,4}")
-_FORMATS = ("auto", "mjpeg", "h264", "yuyv422", "uyvy422", "nv12", "yuv420p", "rgb24", "bgr24", "gray")
 READ_S = 5.0
 
 
@@ -25,10 +24,8 @@ def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
     A disconnected camera is searched for again. Raises InvalidSetting, and SourceUnavailable if the
     device does not exist.
     """
-    address = Address.parse("v4l2", rest)
-    size, fps = address.size(), address.number("fps", options.fps, 0.01, MAX_FPS)
-    name = address.choice("format", "auto", _FORMATS)
-    address.refuse_others()
+    address = V4l2Address.parse(rest, options)
+    size, fps, name = address.size, address.fps, address.format
     asked = {
         "video_size": None if size is None else f"{size[0]}x{size[1]}",
         "framerate": None if fps is None else f"{fps:g}",

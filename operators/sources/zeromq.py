@@ -15,8 +15,8 @@ from zmq.utils.monitor import recv_monitor_message
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceUnavailable
-from operators.sources.address import Address
-from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.address_options import OPEN_S, ZeroMqAddress
+from operators.sources.options import SourceOptions
 from operators.sources.stream import StreamSource
 from operators.sources.zeromq_address import connected, keys_from, require_encryption
 from operators.sources.zeromq_message import MOST_BYTES, BadMessage, unpacked
@@ -24,8 +24,6 @@ from operators.sources.zeromq_message import MOST_BYTES, BadMessage, unpacked
 LOOK_MS = 50
 NEW_SOCKET_S = 2.0
 """Time without a connection, in seconds, after which the socket is replaced."""
-OPEN_S = 10.0
-"""Timeout for the first frame, which defines the picture size, in seconds."""
 
 
 class ZeroMqSource(StreamSource):
@@ -167,11 +165,8 @@ def zeromq_source(transport: str, rest: str, options: SourceOptions) -> ZeroMqSo
     Remote endpoints require the certificates `server=FILE` and optionally `client=FILE`. Raises
     InvalidSetting and SourceUnavailable.
     """
-    address = Address.parse(f"zmq+{transport}", rest)
-    fps = address.number("fps", options.fps, 0.01, MAX_FPS)
-    open_s = address.number("open_s", OPEN_S, 0.1, 600.0)
-    server, client = address.text("server"), address.text("client")
-    address.refuse_others()
+    address = ZeroMqAddress.parse(f"zmq+{transport}", rest, options)
+    server, client = address.server, address.client
     curve: dict[int, bytes] = {}
     if server is not None:
         curve[zmq.CURVE_SERVERKEY] = keys_from(server)[0]
@@ -181,7 +176,7 @@ def zeromq_source(transport: str, rest: str, options: SourceOptions) -> ZeroMqSo
         curve |= {zmq.CURVE_PUBLICKEY: public, zmq.CURVE_SECRETKEY: secret}
     elif client is not None:
         raise InvalidSetting("client=… needs server=…, the file with the sender's public key")
-    return ZeroMqSource(f"{transport}://{address.place}", curve, fps, options, open_s)
+    return ZeroMqSource(f"{transport}://{address.place}", curve, address.fps, options, address.open_s)
 
 
 tcp_source = partial(zeromq_source, "tcp")

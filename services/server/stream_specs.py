@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from operators.settings import Section, check_stream_options, options_for
+from operators.sources.registry import check_address
 from services.control.parts import NewStream
-from services.server.source_options import check_source_options
 from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
 
 NVIDIA = Path("/proc/driver/nvidia/gpus")
@@ -22,7 +22,7 @@ def spec_of(stream: NewStream) -> StreamSpec:
     options = {name: value for name, value in stream.options.items() if value is not None}
     check_stream_options(options)
     device, gpu = _device(stream.device)
-    check_source_options(stream.source)
+    check_address(stream.source)
 
     def of(kind: type[Section]) -> dict[str, Any]:
         return {name: value for name, value in options.items() if name in options_for(kind, "stream")}

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
-from importlib import import_module
-
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED
-from operators.sources.registry import SOURCES
+from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED as SYNTHESIZED
+from operators.settings import MAX_SEED
+from operators.sources.address_options import PARSERS
+from operators.sources.registry import SOURCES, check_address
+from operators.sources.url_address import PROTOCOLS
 from services.control.parts import NewStream
-from services.server import source_options
-from services.server.source_options import OPTIONS, check_source_options
 from services.server.stream_specs import spec_of
-
-MODULES = {
-    "synthetic": "synthetic", "v4l2": "v4l2", "folder": "folder", "pipe": "pipe", "realtime": "realtime",
-    "zmq+tcp": "zeromq", "zmq+ipc": "zeromq",
-}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -33,6 +25,7 @@ MODULES = {
         ("rtsp://10.0.0.1/x#open_s=nan", "open_s"), ("rtsp://10.0.0.1/x#transport=carrier", "transport"),
         ("rtsp://10.0.0.1/x#opens=1", "opens"), ("stereo:synthetic:|synthetic:?fps=nan", "fps"),
         ("realtime:/a?speed=nan", "speed"), ("folder:/a?every=x", "every"), ("zmq+tcp://10.0.0.1:1?open_s=inf", "open_s"),
+        ("pipe:/a?format=rgb24", "size"), ("pipe:/a?size=64x48", "format"), ("v4l2:/dev/video0?format=film", "format"),
     ],
 )  # fmt: skip
 def test_what_a_source_would_refuse_is_refused_with_its_name(address, option):
@@ -50,22 +43,12 @@ def test_what_a_source_would_refuse_is_refused_with_its_name(address, option):
     ],
 )  # fmt: skip
 def test_what_a_source_takes_is_taken(address):
-    check_source_options(address)
+    check_address(address)
 
 
-@pytest.mark.parametrize("scheme", MODULES)
-def test_the_options_are_those_of_the_source(scheme):
-    asked = set()
-    for node in ast.walk(ast.parse(inspect.getsource(import_module(f"operators.sources.{MODULES[scheme]}")))):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in {
-            f"address.{kind}" for kind in ("text", "choice", "number", "whole", "flag", "size")
-        }:
-            asked.add(ast.literal_eval(node.args[0]) if node.args else "size")
-    assert set(OPTIONS[scheme]) == asked
-
-
-def test_the_schemes_are_those_of_sources():
-    assert set(OPTIONS) <= set(SOURCES) and source_options.MAX_SEED == MAX_SEED
+def test_addresses_of_every_scheme_with_options_are_checked():
+    assert set(PARSERS) <= set(SOURCES) and set(SOURCES) - set(PARSERS) == {"recording", *PROTOCOLS}
+    assert MAX_SEED == SYNTHESIZED
 
 
 @pytest.mark.parametrize("name", ["field", "renderer", "tool_mask", "depth"])
