@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gsplat_core.choices import Eyes
 from gsplat_core.io.files import read_regular
 from operators.storage import write_whole
 
@@ -56,7 +57,7 @@ class RunFacts(Part):
     """Deformation field in use: `basis` or `hexplane`, never `auto`."""
     renderer: str = "alpha"
     steps_per_frame: int | None = None
-    eyes: Literal["left", "both"] = "left"
+    eyes: Eyes = "left"
     """Pictures of a stereo endoscope used for training."""
     scale: float = 1.0
     started_at: str

@@ -59,3 +59,16 @@ def test_streams_are_spread_over_gpus():
     streams = [spec(engine=engine) for engine in (cuda, cpu, fixed, cuda, cuda)]
     assert [each.engine.gpu for each in assigned(streams, 2)] == [1, None, 0, 0, 1]
     assert assigned(streams, 0) == streams
+
+
+def test_a_file_of_an_earlier_version_loads(runtime):
+    engine = {
+        "device": "cuda", "gpu": 1, "engine_scale": None, "field": "auto", "renderer": "alpha", "seed": 7, "budget_ms": 20.0,
+        "tool_mask": "none", "depth": "stereo", "eyes": "left", "poses": "given", "out_of_body": "off",
+    }  # fmt: skip
+    capture = {"address": "synthetic:", "scale": 0.5, "fps": None, "loop": True}
+    for role, part in (("engine", engine), ("capture", capture)):
+        path = runtime.path / role
+        write_json(path, {**spec().part(role), "digest": "", role: part})
+        read = getattr(ProcessSpec.read(path), role)
+        assert {name: getattr(read, name) for name in part} == part
