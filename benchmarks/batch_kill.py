@@ -37,7 +37,7 @@ def make_recordings(folder: Path, count: int, frames: int) -> None:
 
 @dataclass
 class Killed:
-    """What was done to a batch, and what was seen of its results."""
+    """Faults injected into a batch and changes observed in its results."""
 
     attempts: int = 0
     batches: int = 0
@@ -63,7 +63,7 @@ def children(pid: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Kills:
-    """How often, and whom."""
+    """Frequency and targets of the injected kills."""
 
     between_s: tuple[float, float] = (0.5, 2.0)
     """Shortest and longest time between two kills."""

@@ -70,7 +70,7 @@ class Shown:
         self._renderer.prepare(self.published)
 
     def psnr_db(self, frame: Frame, time_s: float | None = None) -> float:
-        """Of the picture at the frame's time, or another one, from the frame's camera."""
+        """Return the tissue PSNR of the picture rendered at the frame's pose, at `time_s` or at the frame's time."""
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         at_s = frame.time_s if time_s is None else time_s
         image = self._renderer.render(camera, at_s, ("image",)).result().image

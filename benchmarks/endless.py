@@ -57,7 +57,7 @@ def looped(frames: list[Frame], fps: float, new_scenes: bool, first: int = 0) ->
 
 
 def memory_mib(device: str) -> dict[str, float]:
-    """What the process and the device hold now, without what was freed already."""
+    """Return the memory in use by the process and the device in MiB, after freed memory was returned."""
     return_freed_memory()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     held = {"process_mib": round(pages * resource.getpagesize() / 2**20, 1)}

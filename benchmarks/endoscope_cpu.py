@@ -1,4 +1,4 @@
-"""What each stage for a real endoscope's video costs on one core, in processor time a frame.
+"""Measure the processor time per frame of each stage that prepares a real endoscope's video, on one core.
 
 Usage: python benchmarks/endoscope_cpu.py RECORDING... [--frames 150] [--width 640 --height 512]
 """

@@ -1,4 +1,4 @@
-"""What the host does for each live frame outside of training, in processor time of one thread: analysis, display, scoring.
+"""Measure the processor time per live frame of one thread outside training: analysis, display and scoring.
 
 One JSON line for each stage: milliseconds a frame at p50, p95 and the most, over all frames after the first second. `analysis` is the sum of its
 chains, which live runs side by side. The picture that is shown is the frame before. Masks that come with a recording are left out, so that tools are looked for.

@@ -1,4 +1,4 @@
-"""How well a further camera's picture can be known from the left one at all: the left picture, carried over by the true depth, against what that camera saw.
+"""Warp the left picture into a further camera by the true depth and score it, as an upper bound for that view.
 
     python benchmarks/geometry_carried.py RECORDING [--every 8]
 

@@ -1,4 +1,4 @@
-"""How good each eye's picture is when one or both eyes of a stereo scope are trained on.
+"""Score each eye's picture when training uses one eye or both eyes of a stereo scope.
 
     python benchmarks/geometry_eyes.py heart/left.mp4 --right heart/right.mp4 --below 0.5 [--eyes left both] [--steps 3 10 30]
     python benchmarks/geometry_eyes.py heart/left.mp4 --right heart/right.mp4 --below 0.5 --fps 30 --device cuda
@@ -69,7 +69,7 @@ def frames_of(asked: Asked) -> tuple[list[Frame], Camera]:
 
 
 class Scores:
-    """What one run's pictures score."""
+    """Scores of one run's pictures."""
 
     def __init__(self, camera: Camera, left_out_px: int | None) -> None:
         self._camera, self._left_out_px = camera, left_out_px
@@ -79,7 +79,7 @@ class Scores:
         self._views: dict[int, np.ndarray] = {}
 
     def take(self, frame: Frame, model: Model) -> None:
-        """What the model shows for a frame."""
+        """Score the model's left and right pictures and its depth for a frame."""
         now = model.at(frame.time_s)
         pose = self._camera.world_to_camera if frame.pose is None else frame.pose
         eye = frame.right_camera
@@ -121,7 +121,7 @@ class Scores:
 
 
 def live(asked: Asked, eyes: str, camera: Camera) -> LiveReconstructor:
-    """As the live application makes it."""
+    """Return a reconstructor configured as in the live application."""
     settings = LiveSettings(source="", out=Path(), device=asked.device, eyes=eyes)  # type: ignore[arg-type]
     config = replace(settings.reconstructor_config(camera.width_px * camera.height_px), **asked.set)
     learning = LiveReconstructor(config, camera, live=settings.chosen_training, device=asked.device)
@@ -138,7 +138,7 @@ def by_steps(learning: LiveReconstructor, frame: Frame, steps: int) -> Iterator[
 
 
 def by_clock(learning: LiveReconstructor, frame: Frame, fps: float, first: bool, made: list[int]) -> Iterator[Model]:
-    """The same within the frame's time."""
+    """Train within the frame's time budget and yield the model to score."""
     began = time.monotonic()
     until = began + min(SHOW_AFTER / fps, SHOW_AFTER_S)
     report = learning.observe(frame, budget=Budget.until(until, at_least=5 if first else 3))
@@ -181,7 +181,7 @@ def offline(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps:
 
 
 def arguments() -> Asked:
-    """Of the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--right", type=Path, help="the right eye's video; without it the recording has both")

@@ -1,4 +1,4 @@
-"""What knowing where highlights lie is worth: cameras that training never had, with the colours that the scope's eye saw and with those seen from there.
+"""Score held-out cameras with highlights as seen by the scope and as seen from the new viewpoint.
 
     python benchmarks/geometry_synthetic.py depth --width 320 --height 256 --frames 48 --fps 20 --steps 300 --work FOLDER
     python benchmarks/geometry_highlights.py FOLDER depth [--device cuda]

@@ -43,7 +43,7 @@ def bare(frame: Frame) -> Frame:
 
 
 def known_tissue(frame: Frame) -> NDArray[np.bool_]:
-    """Where the true depth is that of tissue."""
+    """Return the mask of tissue pixels with known true depth."""
     assert frame.depth is not None
     return (frame.depth > 0) if frame.mask is None else (frame.depth > 0) & (frame.mask != 0)
 

@@ -40,7 +40,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 FARTHEST_MM = 110.0
-"""Of the ways that lead back: a picture shows 82 mm of the tissue."""
+"""Greatest distance that the scope moves away on paths that return. A picture shows 82 mm of the tissue."""
 
 
 def measured(

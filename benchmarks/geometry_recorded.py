@@ -1,4 +1,4 @@
-"""How far the depth of a model is off from the depth that a recording came with, for each choice of where training takes depth from.
+"""Compare a model's depth with the recorded depth, for each depth source of training.
 
     python benchmarks/geometry_recorded.py RECORDING [--depth recorded light none] [--steps 2000] [--device cuda] [--scale 1]
 

@@ -28,7 +28,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 DEVICE = "cpu"
-"""Where pictures are matched."""
+"""Device that matches the pictures."""
 HEART_BORDER_PX, HEART_ONE_EYED_PX = 10, 110
 
 

@@ -1,4 +1,4 @@
-"""How true reconstructions of synthetic recordings are in three dimensions, for each thing that a recording may lack.
+"""Measure the 3D accuracy of reconstructions of synthetic recordings, for each kind of missing input.
 
 One line for each case:
 * depth: root mean squared error as a share of the median depth, as it is and after one scale; of each frame's median depth everywhere
@@ -48,7 +48,7 @@ from operators.applications.replay import ReplaySettings, replay
 
 @dataclass(frozen=True)
 class Case:
-    """What training gets besides pictures, tool masks and intrinsics."""
+    """Inputs of training in addition to pictures, tool masks and intrinsics."""
 
     camera: str
     stereo: bool = False
@@ -160,7 +160,7 @@ def recording_of(case: Case, arguments: argparse.Namespace, work: Path) -> Path:
 
 
 def copy_of(whole: Path, given: Path, case: Case) -> None:
-    """What training may have of a recording."""
+    """Copy the parts of a recording that the case gives to training."""
     if given.exists():
         shutil.rmtree(given)
     given.mkdir()

@@ -1,4 +1,4 @@
-"""What a model's depth and normals are worth where the recording has depth: by definition of depth, and by the weight of depth in the loss.
+"""Compare a model's depth and normals with the recorded depth, by depth definition and by depth weight in the loss.
 
 Usage: python benchmarks/geometry_views.py [--frames N] [--width W] [--moving] [--weights 0.0003 0.02 0.1 0.2]
 
@@ -23,7 +23,7 @@ from gsplat_core.scene.frames import Frame
 
 
 def errors_of(model: Model, frame: Frame, camera: Any) -> dict[str, float]:
-    """Of one frame."""
+    """Return the depth and normal errors of one frame."""
     assert frame.depth is not None and frame.mask is not None
     tissue = (frame.mask != 0) & (frame.depth > 0)
     true = frame.depth[tissue].astype(np.float64)

@@ -1,4 +1,4 @@
-"""How fast one NVIDIA GPU deforms Gaussians at a new time, alone and with the picture, beside plain PyTorch and gsplat.
+"""Measure how fast one NVIDIA GPU deforms Gaussians, with and without rendering, against plain PyTorch and gsplat.
 
     python benchmarks/gpu_deformation.py
     python benchmarks/gpu_deformation.py --fields 85M --repetitions 100
@@ -53,7 +53,7 @@ def camera_of(scene: Scene) -> Camera:
 
 
 def deltas_alone(field: DeformationField, gaussians: Gaussians, repetitions: int, dtype: torch.dtype) -> Times:
-    """What the field adds, at a time that changes in device memory between replays."""
+    """Time the field's deltas alone, at a time that changes in device memory between graph replays."""
     time = torch.zeros(1, device="cuda")
     deltas = field.frame_deltas(gaussians, dtype)
     with torch.no_grad():

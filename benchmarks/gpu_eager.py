@@ -1,4 +1,4 @@
-"""How fast `rasterization()` is called eagerly on one NVIDIA GPU, beside gsplat's in the same process.
+"""Measure eager `rasterization()` calls on one NVIDIA GPU against gsplat's in the same process.
 
     python benchmarks/gpu_eager.py
     PYTHONPATH=build/peers python benchmarks/gpu_eager.py --scenes surgical50k_640x512 --packed

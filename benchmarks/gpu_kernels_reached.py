@@ -1,4 +1,4 @@
-r"""Which kernels of the CUDA library the tests launch, which they do not, and a few tests that together launch all that are launched.
+r"""List the CUDA kernels that the tests launch and miss, and select a few tests that launch all reached kernels.
 
     python benchmarks/gpu_kernels_reached.py                                     # all CUDA tests; fails if a kernel is not launched
     xargs -d '\n' python benchmarks/gpu_kernels_reached.py < benchmarks/sanitized_tests.txt  # of those tests alone
@@ -32,12 +32,12 @@ QUICK_US = 3000.0
 MUCH = 0.5
 """A test gives a kernel much work if the kernel takes at least this part of the longest time that it takes in a quick test."""
 SETUP_US = 1000.0
-"""What a test costs under a sanitizer besides its kernels, in the same measure, roughly."""
+"""Rough cost of a test under a sanitizer in addition to its kernels, in the same unit."""
 
 
 @dataclass
 class Launched:
-    """By one test."""
+    """Kernels launched by one test."""
 
     kernels_us: dict[str, float] = field(default_factory=dict)
     records_graphs: bool = False

@@ -1,4 +1,4 @@
-"""How good offline reconstruction is on held-out frames, and how soon, on an NVIDIA GPU.
+"""Measure offline reconstruction on held-out frames against training time, on an NVIDIA GPU.
 
     python benchmarks/gpu_offline.py RECORDING... [--device cuda] [--fields basis hexplane] [--seconds 15]
     python benchmarks/gpu_offline.py RECORDING --device cpu --scale 0.25 --steps 500
@@ -69,13 +69,13 @@ def quality(learning: Reconstructor, frames: list[Frame], camera: Camera) -> tup
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run trains with."""
+    """Settings of a training run."""
 
     config: ReconstructorConfig
     fit: FitSettings
 
     def changed(self, values: str) -> Settings:
-        """With the values of one `--set`: name=value,…"""
+        """Return settings changed by one `--set` value: name=value,…"""
         config, fit = self.config, self.fit
         for one in filter(None, values.split(",")):
             name, value = one.split("=")
@@ -87,12 +87,12 @@ class Settings:
 
 
 def split(frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-    """Those to train on, and those held out."""
+    """Split frames into training frames and held-out frames."""
     return [each for each in frames if not is_heldout(each.seq)], [each for each in frames if is_heldout(each.seq)]
 
 
 def steps_within(seconds: float, frames: list[Frame], camera: Camera, settings: Settings, device: torch.device) -> int:
-    """How many steps fit, the start included, by a trial with the most Gaussians.
+    """Return the number of steps that fit into `seconds`, start included, from a trial with the most Gaussians.
 
     Its fastest stretch counts: other work on the device slows a trial down, and never makes it faster.
     """

@@ -17,7 +17,7 @@ class Scene:
     """Gaussians of degree 3 in front of one camera, on the GPU."""
 
     arguments: dict[str, Any]
-    """Those of `rasterization`, which is the same in gsplat and here: linear scales and opacities."""
+    """Keyword arguments of `rasterization`, equal in gsplat and here: linear scales and opacities."""
 
     @property
     def size_px(self) -> tuple[int, int]:

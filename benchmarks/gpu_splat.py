@@ -1,4 +1,4 @@
-"""How fast one NVIDIA GPU renders the scenes of the peers' measurements, forward and backward, beside gsplat in the same run.
+"""Measure forward and backward rendering of the peers' scenes on one NVIDIA GPU, against gsplat in the same run.
 
     python benchmarks/gpu_splat.py
     python benchmarks/gpu_splat.py --scenes volume1m_1080p --repetitions 100

@@ -1,4 +1,4 @@
-"""What the `gpu_*.py` benchmarks share: how a time on an NVIDIA GPU is taken, and the line that a comparison prints.
+"""Timing methods for an NVIDIA GPU and the comparison line that the `gpu_*.py` benchmarks print.
 
 Three times for each piece of work, in milliseconds:
 
@@ -32,7 +32,7 @@ Work = Callable[[], object]
 
 @dataclass(frozen=True)
 class Times:
-    """Of one piece of work, in milliseconds."""
+    """Times of one piece of work, in milliseconds."""
 
     ms: float
     queued_ms: float

@@ -1,4 +1,4 @@
-"""How fast one NVIDIA GPU takes a training step: deform, render, compare, go back, update; beside the same step on gsplat.
+"""Measure a full training step on one NVIDIA GPU (deformation to optimiser update) against the same step on gsplat.
 
     python benchmarks/gpu_training.py
     python benchmarks/gpu_training.py --fields basis --repetitions 100
@@ -38,7 +38,7 @@ class Case:
 
     gaussians: int
     degree: int
-    """Of the spherical harmonics."""
+    """Degree of the spherical harmonics."""
     asked_ms: float
 
 
@@ -50,7 +50,7 @@ CASES = {
 
 
 def observations(scene: Scene) -> list[Observation]:
-    """The same picture and tool mask at several times."""
+    """Return one picture and tool mask as observations at several times."""
     width, height = scene.size_px
     g = torch.Generator().manual_seed(4)
     image = (torch.rand(height, width, 3, generator=g) * 255).to(torch.uint8).cuda()

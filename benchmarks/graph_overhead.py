@@ -142,7 +142,7 @@ def wake_us(wakes: int) -> dict[str, float]:
 
 
 def native_holoscan_us(messages: int) -> float:
-    """The same chain as native Holoscan operators on its greedy scheduler."""
+    """Time the same chain built from native Holoscan operators on the SDK's greedy scheduler."""
     from holoscan.conditions import CountCondition as NativeCount
     from holoscan.core import Application as NativeApplication
     from holoscan.core import Operator as NativeOperator

@@ -1,4 +1,4 @@
-"""What a live model makes of depth that comes after its frames: none, with the frame, or so many frames later and of some frames only.
+"""Measure a live model's use of depth: without depth, with each frame, or some frames later for a subset of frames.
 
     python benchmarks/live_depth.py RECORDING [--depth stereo] [--late 0 3 10] [--every 3] [--steps 2] [--rehearsed 2] [--scale 0.5]
 
@@ -31,7 +31,7 @@ Asked = argparse.Namespace
 
 
 class DepthErrors:
-    """How far depth is off, of all frames and of the last third."""
+    """Depth errors over all frames and over the last third."""
 
     def __init__(self, recording: FileRecording, points: SparsePoints | None) -> None:
         self._recording, self._points = recording, points
@@ -39,7 +39,7 @@ class DepthErrors:
         self._errors: list[float] = []
 
     def take(self, frame: Frame, depth: NDArray[np.float32]) -> None:
-        """What the model says of a frame."""
+        """Add the error of the model's depth for a frame."""
         if self._points is not None:
             for sums in self._sums[: 1 + (3 * frame.seq >= 2 * self._recording.frame_count)]:
                 sums.add(frame.seq, depth, self._recording.camera_at(frame.seq))
@@ -48,7 +48,7 @@ class DepthErrors:
             self._errors.append(float(np.median(np.abs(depth[known] / frame.depth[known] - 1))))
 
     def stated(self) -> dict[str, float]:
-        """In percent."""
+        """Return the errors in percent."""
         if self._sums:
             found = [sums.errors() for sums in self._sums]
             pair = [one.median for one in found if one is not None]

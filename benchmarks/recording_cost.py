@@ -1,4 +1,4 @@
-"""What recording a session costs: processor time and bytes a frame for each part of it, and how much the graph's thread waits.
+"""Measure the cost of recording a session: processor time and bytes per frame by part, and blocking of the graph thread.
 
 A frame comes in with its masks and is handed on with another loss mask, then its picture is shown. First each part is written by itself in this
 thread, then all of it through `SessionRecorder` at the recording's rate, in its own thread.

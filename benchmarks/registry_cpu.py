@@ -1,4 +1,4 @@
-"""What a version costs in the model registry: upload, check and activation of a model of 50,000 Gaussians.
+"""Measure upload, check and activation of a 50,000-Gaussian model version in the model registry.
 
     python benchmarks/registry_cpu.py [--gaussians 50000] [--runs 3]
 

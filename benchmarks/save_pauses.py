@@ -1,4 +1,4 @@
-"""For how long saving a model lets no other thread of the process run: what a thread that sleeps 0.2 ms at a time sees, while a model of 69 MB is saved.
+"""Measure how long saving a 69 MB model blocks other threads, as seen by a thread that sleeps 0.2 ms at a time.
 
     python benchmarks/save_pauses.py [--saves 4]
 
@@ -26,7 +26,7 @@ SLEEP_S = 0.0002
 
 
 def pauses_during(work: Callable[[], object]) -> dict[str, float]:
-    """What another thread sees."""
+    """Return the gaps that another thread observes while `work` runs."""
     gaps_s: list[float] = []
     over = threading.Event()
 

@@ -1,4 +1,4 @@
-"""What it costs that a stream's frames and pictures cross processes: CPU time and delay of each hop, beside reading the source alone.
+"""Measure CPU time and delay of each process hop of a stream's frames and pictures, against reading the source alone.
 
     python benchmarks/service_cost.py --width 640 --height 512 --frames 300
 

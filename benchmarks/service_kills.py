@@ -90,7 +90,7 @@ async def until(what: Any, within_s: float = BACK_WITHIN_S) -> None:
 
 
 def newer(viewer: FastViewer, at_ns: int) -> bool:
-    """Whether a picture of a frame that came in later is there."""
+    """Return true if the viewer has a picture of a frame that arrived after `at_ns`."""
     return viewer.last.get("new", True) is True and viewer.last.get("arrived_ns", 0) > at_ns
 
 

@@ -1,4 +1,4 @@
-"""What further pictures (depth, confidence, the virtual view) and snapshots cost a live stream: age, rate and PSNR of what is shown, with and without them.
+"""Measure age, rate and PSNR of a live stream with and without layers (depth, confidence, virtual view) and snapshots.
 
     python benchmarks/service_layers.py --seconds 20 [--snapshots 5]
 

@@ -25,7 +25,7 @@ ROUTES = ("/v1/streams", "/v1/version", "/v1/models")
 
 
 class Marks:
-    """What the processes have done until now."""
+    """Counters of the stream's processes at one time."""
 
     def __init__(self, server: Server, pids: dict[str, int]) -> None:
         processes = server.stream()["processes"]
@@ -39,7 +39,7 @@ class Marks:
         self.at_s = time.monotonic()
 
     def since(self, earlier: Marks) -> dict[str, Any]:
-        """What came since then."""
+        """Return rates and processor shares since an earlier reading."""
         took_s = self.at_s - earlier.at_s
         own = {name: round((after - earlier.cpu_s[name]) / took_s, 3) for name, after in self.cpu_s.items()}
         return {

@@ -63,7 +63,7 @@ def roll_back(server: Server) -> int:
 
 
 def registered(server: Server) -> dict[str, Any]:
-    """What the registry has: the active version, and each version's digest and size."""
+    """Return the registry's active version, and each version's digest and size."""
     versions = server.ask(f"/v1/models/{NAME}/versions")
     active = next(model["active"] for model in server.ask("/v1/models") if model["name"] == NAME)
     return {

@@ -1,5 +1,4 @@
-"""What a stream costs as a service, beside bare `live` of the same source with the same settings: processor time for each frame of the source, and the age
-of a picture when it is shown.
+"""Compare a served stream with bare `live` on the same source and settings: processor time per frame and picture age.
 
     python benchmarks/service_overhead.py --seconds 15 --rounds 2
 
@@ -73,7 +72,7 @@ def bare(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def tree_cpu_s() -> float:
-    """Of this process and those that it has started."""
+    """Return the processor time of this process and its descendants."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*"):
         try:
@@ -88,7 +87,7 @@ def tree_cpu_s() -> float:
 
 
 def served(options: argparse.Namespace) -> dict[str, Any]:
-    """The same as a service."""
+    """Run the source through the service and measure it."""
     wanted = {"engine_scale": 1.0}  # bare `live` reconstructs the whole picture
     if options.budget_ms is not None:
         wanted["budget_ms"] = options.budget_ms

@@ -50,12 +50,12 @@ class Server:
 
     @property
     def data(self) -> Path:
-        """What the service keeps."""
+        """Return the service's data folder."""
         return self.path / "data"
 
     @property
     def runtime(self) -> Path:
-        """Where its sockets lie."""
+        """Return the folder of the service's sockets."""
         return self.path / "run"
 
     @property
@@ -97,7 +97,7 @@ class Server:
         return json.loads(content) if "json" in answer.headers.get("Content-Type", "") else content.decode()
 
     def stream(self) -> dict[str, Any]:
-        """What the API says of the stream."""
+        """Return the stream's state from the API."""
         return self.ask(f"/v1/streams/{STREAM}")
 
     def until(self, what: Callable[[dict[str, Any]], Any], within_s: float = 120.0) -> float:
@@ -122,7 +122,7 @@ class Server:
         return {"control": self.process.pid, **{role: processes[role]["pid"] for role in ("capture", "engine")}}
 
     def ticket(self) -> str:
-        """For one display."""
+        """Return a ticket for one display connection."""
         return self.ask("/v1/tickets", "POST", {"path": f"/v1/streams/{STREAM}/display"})["ticket"]
 
     def kill(self) -> None:

@@ -107,7 +107,7 @@ def swapped(server: Server, pictures: Pictures, versions: list[int], count: int)
 
 
 def judged(swaps: list[Swap], seen: list[Shown], first: int) -> dict[str, Any]:
-    """What the pictures say."""
+    """Check the displayed pictures for lost frames and wrong versions around the swaps."""
     new = [each for each in seen if each.new]
     missing = [after.seq - before.seq - 1 for before, after in itertools.pairwise(new)]
     at_swaps = {swap.first.seq for swap in swaps}
@@ -136,7 +136,7 @@ def _near(seq: int, swaps: set[int]) -> bool:
 
 
 def _allowed(at_ns: int, changes: list[tuple[int, int, int]], first: int) -> set[int]:
-    """Which versions may be shown at a time: the one that is active; while a change is asked for and followed, either."""
+    """Return the versions allowed at a time: the active one, or both during a change."""
     active = first
     for asked_ns, shown_ns, version in changes:
         if at_ns >= shown_ns:

@@ -29,9 +29,9 @@ class FastViewer(asyncio.BufferedProtocol):
         self._opened = False
         self.pictures = self.bytes = 0
         self.ages_ms: list[float] = []
-        """From a frame's arrival at the capture process to here, of new pictures."""
+        """Age of each new picture: arrival of its frame at the capture process to receipt here."""
         self.gaps_ms: list[float] = []
-        """Between two new pictures."""
+        """Time between successive new pictures."""
         self.last: dict[str, Any] = {}
         self.last_ns = 0
         self.closed = asyncio.get_running_loop().create_future()

@@ -41,7 +41,7 @@ class Watch:
         self.steps.clear()
 
     def last_from_after(self, at_ns: int) -> bool:
-        """Whether a picture of something that came in after that time is there."""
+        """Return true if the last picture shows a frame that arrived after `at_ns`."""
         return self._sent_ns > at_ns
 
     def close(self) -> None:

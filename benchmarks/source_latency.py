@@ -1,4 +1,4 @@
-"""How long a frame takes from a source to its reader: in one process, and from a process of its own through shared memory.
+"""Measure the latency from a source to its reader, in one process and through shared memory from a child process.
 
     python benchmarks/source_latency.py [RECORDING ...]
 
@@ -24,7 +24,7 @@ RATES = (30.0, 60.0)
 
 
 def processor_s() -> float:
-    """Of this process and of those that it has waited for."""
+    """Return the processor time of this process and its terminated children."""
     return sum(
         usage.ru_utime + usage.ru_stime
         for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -43,7 +43,7 @@ def copy_ms(shape: tuple[int, ...]) -> float:
 
 
 def latencies_ms(source: FrameSource) -> np.ndarray:
-    """Of every frame that was read."""
+    """Return the latency of every frame read after the skipped ones."""
     found = []
     source.open()
     while len(found) < FRAMES + SKIPPED:

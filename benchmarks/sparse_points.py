@@ -76,7 +76,7 @@ class SparsePoints:
         return cls(points.astype(np.float64), point.astype(np.int64), frame.astype(np.int64))
 
     def seen_in(self, number: int, camera: Camera) -> tuple[Array, Array]:
-        """Where the points of a frame are in its picture [n, 2] (x, y), and their depth z [n]; `camera` is a pinhole with the frame's pose."""
+        """Return the pixels [n, 2] (x, y) and depths z [n] of a frame's points."""
         world = self.points[self.seen_point[self.seen_frame == number]]
         seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         seen = seen[seen[:, 2] > 0]

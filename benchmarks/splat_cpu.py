@@ -1,4 +1,4 @@
-"""How fast the CPU renders a tissue-like surface, and how that compares with the plain-torch reference.
+"""Measure CPU rendering of a tissue-like surface against the plain-torch reference.
 
     python benchmarks/splat_cpu.py                       # 50,000 Gaussians at 640x512, colours of degree 3 and expected depth
     python benchmarks/splat_cpu.py --skip-reference --threads 1

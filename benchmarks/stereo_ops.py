@@ -1,4 +1,4 @@
-"""What a frame of stereo depth costs on a device: each op, and the whole of it.
+"""Measure stereo depth of one frame on a device: each op and the total.
 
     python benchmarks/stereo_ops.py [--device cuda] [--threads 1]
 

@@ -1,4 +1,4 @@
-"""How well tools are found, how many are found where there are none, whether the out-of-body gate lets a recording pass, and what both cost.
+"""Measure tool segmentation (hits and false positives), the out-of-body gate, and the processor time of both.
 
 One JSON line for each recording, on one core: `iou` (tool class, mean and minimum over the frames with a tool, where the recording has
 masks), `recall`, `found_share` (pixels called tool: false ones where there is no tool), `withheld` (frames that the gate did not let
@@ -93,12 +93,12 @@ def measured(path: Path, count: int, finder: MaskFinder, change: Change = lambda
 
 
 def has_tool_masks(path: Path) -> bool:
-    """Whether the masks beside a recording are of tools."""
+    """Return true if the recording has a folder of tool masks."""
     return (path / "masks").is_dir()
 
 
 def changes() -> dict[str, Change]:
-    """What may be different about another scope's picture of the same scene."""
+    """Return image changes that imitate another scope's picture of the same scene."""
     noise = np.random.default_rng(0)
     return {
         "hue +12 degrees": lambda image: hue(image, 6),

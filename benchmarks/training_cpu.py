@@ -71,7 +71,7 @@ def new_field(kind: str, gaussians: Gaussians) -> DeformationField:
 
 
 def seen_at(observation: Observation, time_s: float) -> Observation:
-    """The same picture at another time."""
+    """Return the observation at another time."""
     fields = {name: getattr(observation, name) for name in ("seq", "camera", "image", "mask", "depth")}
     return Observation(time_s=time_s, **fields)
 

@@ -1,4 +1,4 @@
-"""What reading and writing video costs: a recording decoded as a replay does it, and its frames written as a run's video, beside OpenCV.
+"""Measure video decoding (as in a replay) and encoding (as a run's video), against OpenCV.
 
 Usage: python benchmarks/video_cpu.py RECORDING_VIDEO [--frames 150]
 """

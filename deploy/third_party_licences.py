@@ -38,7 +38,7 @@ the kernels that it builds contain CUDA's static runtime.
 
 
 def locked(path: Path) -> tuple[dict[str, Requirement], list[str]]:
-    """What the lock file pins for this platform by name, and `name version` of what it pins for others."""
+    """Return the requirements pinned for this platform by name, and `name version` of those pinned for others."""
     here: dict[str, Requirement] = {}
     elsewhere: list[str] = []
     for line in path.read_text(encoding="utf-8").splitlines():

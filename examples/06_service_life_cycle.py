@@ -89,7 +89,7 @@ def models_change(client: Client, folder: Path) -> None:
 
 
 def snapshot_is_taken(client: Client, folder: Path) -> None:
-    """What a stream has reconstructed up to now, as a file for other programs."""
+    """Take a snapshot of a live stream and export the reconstruction for other programs."""
     client.create_stream(STREAM, SOURCE, show="live", device="cpu")
     end_s = time.monotonic() + WITHIN_S
     while client.stream(STREAM).state != "live" and time.monotonic() < end_s:

@@ -1,4 +1,4 @@
-"""What a test needs and this machine lacks: the test is skipped, saying so; in CI, which installs all of it, it fails."""
+"""Skip a test if this machine lacks a requirement; fail instead in CI, where all of them are installed."""
 
 from __future__ import annotations
 

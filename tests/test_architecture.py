@@ -114,7 +114,7 @@ WITHOUT_TORCH = [
     "services.client",
     *(f"services.{name}" for name in ("audit", "control", "control.server", "settings")),
 ]
-"""What the control plane's process loads."""
+"""Modules that the control plane's process loads."""
 
 
 def test_the_control_plane_loads_neither_torch_nor_opencv():

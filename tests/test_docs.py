@@ -96,7 +96,7 @@ def commands() -> dict[str, set[str]]:
 
 
 def command_lines(document: Path) -> list[str]:
-    """What follows `intrasplat` in code blocks and in code within sentences."""
+    """Return the arguments after `intrasplat` in code blocks and inline code."""
     text = document.read_text(encoding="utf-8").replace("\\|", "|")  # tables escape their bars
     code = "\n".join([*CODE_BLOCK.findall(text), *re.findall(r"`([^`\n]+)`", CODE_BLOCK.sub("", text))])
     return re.findall(r"^(?:\S*/)?intrasplat +(\S.*)$", code, re.MULTILINE)

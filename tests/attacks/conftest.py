@@ -32,7 +32,7 @@ class TamperedBundle:
         save_bundle(Model(1, gaussians, field, Camera.from_focal(50.0, 8, 8), (0.0, 1.0)), folder)
 
     def values(self) -> dict[str, Any]:
-        """What the manifest says."""
+        """Return the manifest's content."""
         return json.loads(self.manifest.read_text())
 
     def edit(self, change: Callable[[dict[str, Any]], object]) -> None:
@@ -65,7 +65,7 @@ class TamperedBundle:
         return payload[8 : 8 + size], payload[8 + size :]
 
     def replace_header(self, header: bytes) -> None:
-        """The same data under another header."""
+        """Write the same tensor data under another header."""
         self.replace_tensors(struct.pack("<Q", len(header)) + header + self.header_and_data()[1])
 
 

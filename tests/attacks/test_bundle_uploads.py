@@ -66,7 +66,7 @@ def archive(*members, style=tarfile.USTAR_FORMAT):
 
 
 def with_header(payload, start, offset, value):
-    """The same archive with other bytes in a header, and the checksum that fits."""
+    """Return the archive with other bytes in a header and a matching checksum."""
     block = bytearray(payload[start : start + BLOCK])
     block[offset : offset + len(value)] = value
     block[148:156] = b" " * 8
@@ -75,7 +75,7 @@ def with_header(payload, start, offset, value):
 
 
 def second_header(payload):
-    """Where that of the tensors begins."""
+    """Return the offset of the tensor file's header."""
     size = int(payload[124:135], 8)
     return BLOCK + size + -size % BLOCK
 

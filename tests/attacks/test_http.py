@@ -1,4 +1,4 @@
-"""What a stranger may try over HTTP: headers of a proxy, forged log lines, keys in odd places, odd paths and methods."""
+"""Attacks over HTTP: proxy headers, forged log lines, misplaced keys, malformed paths and methods."""
 
 from __future__ import annotations
 

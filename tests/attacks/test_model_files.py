@@ -1,4 +1,4 @@
-"""What lies in place of a model's files: pipes, devices, folders, links; and bytes that a fuzzer changed."""
+"""Model files replaced by pipes, devices, folders, links or fuzzed bytes."""
 
 from __future__ import annotations
 

@@ -57,6 +57,6 @@ def tool() -> Run:
 
 @pytest.fixture(autouse=True)
 def no_settings_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What somebody has set for a service of theirs changes no test."""
+    """Remove service settings from the environment."""
     for name in [name for name in os.environ if name.startswith("INTRASPLAT_") and "__" in name]:
         monkeypatch.delenv(name)

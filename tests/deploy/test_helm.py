@@ -25,7 +25,7 @@ WITHOUT_A_GPU = ["plaintext=true", "gpu.count=0", "image.tag=cpu", "persistence.
 
 @pytest.fixture
 def render(tool):
-    """What helm makes of the chart with values, by kind."""
+    """Return a function that renders the chart with values and returns its documents by kind and name."""
 
     def rendered(values: list[str], release: str = "room-1") -> dict[str, dict]:
         given = [argument for value in values for argument in ("--set", value)]

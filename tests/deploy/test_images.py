@@ -20,7 +20,7 @@ def instructions() -> list[tuple[str, str]]:
 
 
 def stages() -> dict[str, tuple[str, list[tuple[str, str]]]]:
-    """What each stage begins with, and its instructions."""
+    """Return each build stage's base image and instructions."""
     found: dict[str, tuple[str, list[tuple[str, str]]]] = {}
     current: list[tuple[str, str]] = []
     for name, rest in instructions():
@@ -40,7 +40,7 @@ def lineage(stage: str) -> list[tuple[str, str]]:
 
 
 def let_through(path: str) -> bool:
-    """Whether .dockerignore lets a file or folder reach the build: the last line that fits decides."""
+    """Return true if .dockerignore lets a path into the build. The last matching line decides."""
     passes = True
     for line in (ROOT / ".dockerignore").read_text().splitlines():
         if not line or line.startswith("#"):

@@ -1,4 +1,4 @@
-"""What the compiled libraries take from the C++ runtime, and that an op refuses an argument however they were linked."""
+"""Symbols that the compiled libraries take from the C++ runtime, and argument errors under either linkage."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def symbols(library: Path, *options: str) -> list[str]:
 
 
 def test_no_iostreams(library):
-    """In a library with a libstdc++ of its own they are a second copy that nothing initialises."""
+    """In a library with a static libstdc++, iostreams are a second copy that is never initialised."""
     found = sorted({name for name in symbols(library) if IOSTREAMS.search(name)})
     assert not found, (
         f"{library.name} needs iostreams: {found}; native/torch_abi.h says how torch's headers bring them in"

@@ -20,7 +20,7 @@ WIDTH, HEIGHT = 24, 16
 
 @dataclass
 class FakeInput:
-    """What a port would hand over, by name."""
+    """Input port with prepared messages by name."""
 
     messages: dict[str, Any]
 

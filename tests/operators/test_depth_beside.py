@@ -62,7 +62,7 @@ def beside(estimator):
 
 
 def taken(beside):
-    """What is found next."""
+    """Wait for the next estimated depth and return it."""
     until = time.monotonic() + WAIT_S
     while (found := beside.take()) is None:
         assert time.monotonic() < until, "no depth was found"

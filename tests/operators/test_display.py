@@ -1,4 +1,4 @@
-"""What is on the screen says how old it is and what that means."""
+"""The displayed age of a picture and its meaning."""
 
 from __future__ import annotations
 

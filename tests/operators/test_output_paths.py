@@ -1,4 +1,4 @@
-"""Where a run must not write, whatever name the place is given."""
+"""Protected output locations, under every spelling of their path."""
 
 from __future__ import annotations
 

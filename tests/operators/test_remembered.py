@@ -102,7 +102,7 @@ def test_highlights_are_seen():
 
 
 def test_the_marking_survives_video_coding(tmp_path):
-    """As the recorder codes what was shown: 4:2:0, lossy."""
+    """Code the picture as the recorder does: 4:2:0, lossy."""
     size = (256, 320)
     rng = np.random.default_rng(3)
     noise = cv2.GaussianBlur(rng.integers(0, 256, (*size, 3), np.uint8), (0, 0), 3).astype(np.float32)

@@ -12,7 +12,7 @@ from operators.side_thread import NICENESS, step_back, usable_cores
 
 
 def in_a_thread(work):
-    """What `work` answers in a thread of its own."""
+    """Return the result of `work` run in another thread."""
     answers = []
     thread = threading.Thread(target=lambda: answers.append(work()))
     thread.start()

@@ -1,4 +1,4 @@
-"""What the camera does not show is scored against the truth, where it was seen before, beside trivial baselines."""
+"""Tissue outside the current picture is scored against the truth if it was seen before, next to trivial baselines."""
 
 from __future__ import annotations
 

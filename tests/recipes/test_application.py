@@ -29,7 +29,7 @@ from operators.storage import write_whole
 
 @dataclass(frozen=True)
 class SharpnessResult:
-    """What the application has measured."""
+    """Result of the sharpness application."""
 
     frames: int
     least: float

@@ -134,7 +134,7 @@ def mean_psnr_db(model: Model, recording: Path) -> float:
 
 
 def without_motion(model: Model) -> Model:
-    """The same Gaussians, at rest."""
+    """Return the model with its Gaussians at rest."""
     return dataclasses.replace(model, field=None)
 
 

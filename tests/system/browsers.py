@@ -23,12 +23,12 @@ PROGRAMS = {"chromium": ("chromium", "chromium-browser", "google-chrome"), "fire
 
 
 def find(browser: str) -> str | None:
-    """Where a browser's program is; None where it is not installed."""
+    """Return the path of a browser's program, or None if it is not installed."""
     return next((path for name in PROGRAMS[browser] if (path := shutil.which(name))), None)
 
 
 def required(browser: str) -> str:
-    """Where a browser's program is. Where it is not installed the test is skipped; in CI it fails."""
+    """Return the path of a browser's program. If missing, skip the test; fail in CI."""
     path = find(browser)
     if path is None:
         missing(f"{browser} is not installed (Debian: apt-get install chromium firefox-esr)")

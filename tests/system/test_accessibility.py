@@ -33,7 +33,7 @@ def page() -> Iterator[Any]:
 
 
 def violations(page: Any, rules: list[str] | None = None, within: str | None = None) -> list[str]:
-    """What axe-core finds, a line for each element."""
+    """Return axe-core's violations, one line per element."""
     wanted = (
         {"type": "rule", "values": rules}
         if rules

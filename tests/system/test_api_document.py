@@ -1,4 +1,4 @@
-"""What the API's document says holds for a real server: `make fuzz` tries more of it, for longer."""
+"""A real server conforms to the API document. `make fuzz` runs a longer search."""
 
 from __future__ import annotations
 

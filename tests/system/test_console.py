@@ -131,7 +131,7 @@ def test_nothing_is_deleted_at_one_click(page, client):
 
 
 def test_every_delete_of_the_page_asks(page):
-    """What is deleted or revoked goes through the question, wherever it stands in the modules."""
+    """Every deletion and revocation in the modules passes through the confirmation dialog."""
     folder = Path(__file__).resolve().parents[2] / "services" / "console" / "page"
     asking = {}
     for module in sorted(folder.glob("*.js")):

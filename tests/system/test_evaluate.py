@@ -242,7 +242,7 @@ def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
 
 
 def test_a_live_run_that_looped_faster_than_the_recording_is_seen_at_its_own_times(intrasplat, long, offline, tmp_path):
-    """As `live --loop --fps 60` would leave it: the model's time is 2.5 rounds of 0.2 s."""
+    """Imitate the output of `live --loop --fps 60`: the model's time is 2.5 rounds of 0.2 s."""
     folder = shutil.copytree(offline, tmp_path / "live")
     manifest = json.loads((folder / "model" / "manifest.json").read_text())
     manifest["time_window_s"] = [0.0, 0.5 - 1 / 60]

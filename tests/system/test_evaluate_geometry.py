@@ -67,7 +67,7 @@ def test_it_is_printed_and_written_with_units_and_marks(intrasplat, known, made,
 
 
 def test_the_poses_that_a_model_was_made_with_are_compared(intrasplat, known, made, tmp_path):
-    """The same way in lengths that are half as long: only its scale is wrong, and the model is not where it is said to be."""
+    """Halve the trajectory's lengths: its scale is wrong, and the model is away from its stated place."""
     recording = open_recording(known)
     poses = np.stack([recording.camera_at(k).world_to_camera for k in range(9)])
     halved = poses.copy()

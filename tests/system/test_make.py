@@ -1,4 +1,4 @@
-"""What the Makefile would do, without doing it."""
+"""Dry runs of the Makefile's targets."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Server:
         return self.client
 
     def until(self, found):
-        """What `found` returns once that is true."""
+        """Poll `found` until its result is true and return the result."""
         end_s = time.monotonic() + WITHIN_S
         while time.monotonic() < end_s:
             result = found()
@@ -81,7 +81,7 @@ def children(pid: int) -> list[int]:
 
 
 def command(pid: int) -> bytes:
-    """What a process was started with."""
+    """Return the command line of a process."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except FileNotFoundError:

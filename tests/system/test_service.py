@@ -55,7 +55,7 @@ def served():
 
 
 def until(found, log, within_s=WITHIN_S):
-    """What `found` returns once that is true."""
+    """Poll `found` until its result is true and return the result."""
     end_s = time.monotonic() + within_s
     while time.monotonic() < end_s:
         result = found()

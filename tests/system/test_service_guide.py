@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def programs() -> None:
-    """What the guide's commands call: where it is missing the test is skipped, but in CI it fails."""
+    """Require the programs that the guide's commands call. If one is missing, skip the test; fail in CI."""
     absent = [name for name in ("bash", "curl", "openssl") if shutil.which(name) is None]
     if absent:
         missing(f"the guide's commands need {', '.join(absent)}; install it")

@@ -42,7 +42,7 @@ class Scene:
         return View(viewmat, K, self.width, self.height, background, self.camera_model)
 
     def render_tensors(self, tensors: list[Tensor | None], capacity: int, mode: FrameMode) -> Frame:
-        """With others in place of `tensors`."""
+        """Render the view with `tensors` in place of the scene's own."""
         return render_frame(tensors[:5], tensors[5], self.view(*tensors[6:]), capacity, mode)
 
     def exact(self, training: bool = False) -> tuple[Tensor, Tensor]:
@@ -137,7 +137,7 @@ def check_lists(frame: Frame) -> None:
 
 
 def plain(s: Scene) -> tuple[Tensor, Tensor]:
-    """What `rasterization` makes of the scene on the same device, on the CPU."""
+    """Return `rasterization`'s picture of the scene on the GPU, moved to the CPU."""
     means, quats, log_scales, logits, sh, d, viewmat, K, background = s.tensors("cuda", torch.float32)
     if d is not None:
         means, quats, log_scales, logits = (

@@ -62,7 +62,7 @@ class FrameScene:
         return v_image, torch.randn(self.height, self.width, generator=g) if with_alphas else None
 
     def reference_gradients(self, with_alphas: bool = True) -> dict[str, Tensor]:
-        """By autograd, in float64 on the CPU: of the raw parameters, and of the deltas where there are any."""
+        """Return float64 CPU autograd gradients of the raw parameters, and of the deltas if present."""
         scene = self.to("cpu").to(torch.float64)
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in NAMES}
         if scene.deltas is not None:

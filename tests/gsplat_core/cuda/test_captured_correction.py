@@ -20,7 +20,7 @@ FRAME = frame_at(2)
 
 @pytest.fixture
 def step(gpu):
-    """That of a scene at 80, with rows that are not in use."""
+    """Return the training step of a scene at 80 mm that has unused rows."""
     config = ReconstructorConfig(gaussians=300, max_gaussians=400, preallocate=True, depth_weight=0.1)
     made = LiveReconstructor(config, CAMERA, device="cuda")
     for k in range(3):

@@ -66,7 +66,7 @@ def train(
 
 @pytest.mark.parametrize("weights", [LossWeights(squared=True), LossWeights(ssim=0.2, depth=0.5)])
 def test_colours_are_corrected_as_on_the_cpu(make_gaussians, observation, weights):
-    """By the residual, whatever the loss is; the other gradients are those of the loss."""
+    """Correct colours by the residual for every loss; the other gradients follow the loss."""
     from gsplat_core.training.photometric import loss_and_gradients
 
     seen = dataclasses.replace(observation, depth=None)

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.cuda
 
 @pytest.fixture(autouse=True)
 def calls(monkeypatch) -> list[bool]:
-    """Whether each call of `rasterization` was taken by the native one."""
+    """Record for each `rasterization` call if the native path took it."""
     found: list[bool] = []
     take = single_call._takes
 

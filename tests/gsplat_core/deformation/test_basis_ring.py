@@ -29,7 +29,7 @@ def online(count: int, history_s: float | None = HISTORY_S, start_s: float = 0.0
 
 
 def exact(field: BasisField) -> BasisField:
-    """In float64: training amplifies rounding, and bumps that lie in another order are summed in another order."""
+    """Convert to float64. Bumps are summed in another order, and training amplifies rounding."""
     return field.double()
 
 
@@ -39,7 +39,7 @@ def wave(count: int, time_s: float) -> torch.Tensor:
 
 
 def watch(field: BasisField, time_s: float, newest_s: float, steps: int = 2, rates: BasisRates = RATES) -> None:
-    """What the reconstructor does with a frame."""
+    """Train the field on one frame as the reconstructor does."""
     field.cover(time_s, newest_s)
     for _ in range(steps):
         target = wave(field.count, time_s).to(field.weights.device)

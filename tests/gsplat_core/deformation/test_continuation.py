@@ -1,4 +1,4 @@
-"""What a field does after the newest frame, and how it is moved at one time."""
+"""Extrapolation of a field after the newest frame, and moving a field at one time."""
 
 from __future__ import annotations
 

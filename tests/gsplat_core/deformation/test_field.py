@@ -1,4 +1,4 @@
-"""What both deformation fields promise."""
+"""Contract common to both deformation fields."""
 
 import json
 

@@ -49,5 +49,5 @@ def resized(images: tuple[Image, ...] | list[Image], like: Image) -> list[Image]
 
 
 def brightened(image: Image, gains: float | NDArray[np.floating]) -> Image:
-    """As a camera with another gain takes it: multiplied, and clipped."""
+    """Return the image with camera gain applied: multiplied and clipped."""
     return np.clip(np.rint(image * np.asarray(gains)), 0, 255).astype(np.uint8)

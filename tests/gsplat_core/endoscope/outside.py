@@ -172,7 +172,7 @@ OUTSIDE: dict[str, Draw] = {
     "lamps": lamps,
     "bars": bars,
 }
-"""What holds evidence of the outside, whatever the seed."""
+"""Scenes with evidence of the outside for every seed."""
 WITHOUT_EVIDENCE: dict[str, Draw] = {
     "black": lambda rng: plain(0, 0, 0),
     "overexposed": lambda rng: plain(255, 255, 255),
@@ -183,4 +183,4 @@ WITHOUT_EVIDENCE: dict[str, Draw] = {
     "near face": lambda rng: face(rng, close=True),
     "monitor": monitor,
 }
-"""What passes: nothing in it tells it from tissue that is pale, red or overexposed."""
+"""Scenes that pass: indistinguishable from pale, red or overexposed tissue."""

@@ -20,7 +20,7 @@ OTHERS = list(itertools.permutations(PLACES, 2))
 
 
 def verdicts(images, withheld=()):
-    """What was reported, by the index of the frame."""
+    """Return the reported verdicts by frame index."""
     detector, found = CutDetector(), {}
     for k, image in enumerate(images):
         if k in withheld:

@@ -80,7 +80,7 @@ def test_every_picture_from_outside_is_withheld_at_once(name):
 
 @pytest.mark.parametrize("name", sorted({*OUTSIDE} - {"bars"}))
 def test_brightness_size_and_a_round_view_do_not_hide_the_outside(name):
-    """In a round view most of a picture is face, not wall, and half of the screen's windows are cut."""
+    """A round view replaces much of the wall by face and cuts half of the screen's windows."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
         image = OUTSIDE[name](rng)

@@ -1,4 +1,4 @@
-"""Which part of a deformation explains the change of a sequence, where it is known which does."""
+"""Attribution of a sequence's change to the parts of a deformation, on known deformations."""
 
 from __future__ import annotations
 

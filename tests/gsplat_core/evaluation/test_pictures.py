@@ -1,4 +1,4 @@
-"""What is scored is what a model shows: at the frame's time, from its pose, with its exposure."""
+"""Pictures for scoring are rendered at the frame's time, pose and exposure."""
 
 from __future__ import annotations
 

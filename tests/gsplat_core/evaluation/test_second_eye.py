@@ -1,4 +1,4 @@
-"""What the right eye's view is measured by, and what doing nothing scores there."""
+"""Scoring of the right eye's view and of its trivial baselines."""
 
 import numpy as np
 import pytest

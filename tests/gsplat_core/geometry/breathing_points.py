@@ -28,7 +28,7 @@ def swaying(times_s: NDArray[np.float64], reach: float = 1.0) -> NDArray[np.floa
 
 
 def places(times_s: NDArray[np.float64], breathes: float = 1.0, count: int = 300) -> NDArray[np.float64]:
-    """Where the points are [T, N, 3]."""
+    """Return the positions of the points over time [T, N, 3]."""
     random = np.random.default_rng(5)
     x, y = random.uniform(-35, 35, count), random.uniform(-27, 27, count)
     z = DISTANCE + 4 * np.sin(x / 11) * np.cos(y / 9) + 0.1 * x
@@ -41,7 +41,7 @@ def places(times_s: NDArray[np.float64], breathes: float = 1.0, count: int = 300
 def tracks_of(
     points: NDArray[np.float64], poses: NDArray[np.float64], times_s: NDArray[np.float64], noise_px: float = 0.2
 ) -> GridTracks:
-    """Where points [T, N, 3] are seen, with noise; one in eight sightings is missing."""
+    """Return noisy tracks of points [T, N, 3]. One in eight sightings is missing."""
     random = np.random.default_rng(6)
     local = np.einsum("tij,tnj->tni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
     rays = local[..., :2] / local[..., 2:] + random.normal(0, noise_px / FOCAL_PX, (*points.shape[:2], 2))

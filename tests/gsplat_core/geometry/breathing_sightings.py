@@ -1,4 +1,4 @@
-"""What a swaying scope sees of a sheet that breathes, and the poses that come out when it is taken to be at rest; exact, without pictures."""
+"""Exact sightings of a breathing sheet by a swaying scope, and the poses estimated if the sheet is taken as static."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swayin
 def seen_for(
     length_s: float, breathes: float = 1.0, rate_hz: float = 10.0, noise_px: float = 0.2, pulled: int = 0
 ) -> tuple[Sightings, NDArray[np.float64]]:
-    """What is seen, and the true poses. pulled: so many points are dragged about, never twice alike."""
+    """Return sightings and true poses. `pulled`: number of points dragged about without repetition."""
     times_s = np.arange(0, length_s, 1 / rate_hz)
     poses, points = swaying(times_s), places(times_s, breathes)
     points[:, :pulled] += 6 * np.clip(np.sin(times_s**1.7), 0, 1)[:, None, None] * np.array([0.5, 0.3, -0.8])

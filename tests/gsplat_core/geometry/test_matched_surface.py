@@ -22,7 +22,7 @@ def plane(slope: float = 3.0) -> np.ndarray:
 
 
 def noise(seed: int = 0) -> np.ndarray:
-    """As matching leaves it: neighbours are off alike."""
+    """Return noise as left by matching: correlated between neighbours."""
     rough = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH)), (0, 0), 1.5)
     return (NOISE_PX * rough / rough.std()).astype(np.float32)
 
@@ -36,7 +36,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def slopes(values: np.ndarray) -> float:
-    """How steep what is wrong is: what makes normals wrong."""
+    """Return the RMS gradient of an error map, the cause of wrong normals."""
     return rms(np.gradient(values, axis=0)) + rms(np.gradient(values, axis=1))
 
 

@@ -1,4 +1,4 @@
-"""Which pixels of a measured depth map are believed: not those that lie on neither side of an edge, nor those about zero."""
+"""Confidence of measured depth: pixels between the two sides of an edge and near-zero values are rejected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def slope(nearest=45.0, farthest=75.0) -> np.ndarray:
 
 
 def one_by_one(depth: np.ndarray) -> np.ndarray:
-    """The same as `measured_confidence`, a pixel at a time."""
+    """Compute `measured_confidence` one pixel at a time."""
     known = np.isfinite(depth) & (depth > 0)
     sampled = known[2::4, 2::4]
     found = depth[2::4, 2::4][sampled] if sampled.any() else depth[known]

@@ -50,7 +50,7 @@ def seen(scene: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def off_px(scene: Gaussians, camera: Camera) -> float:
-    """How far from their places a camera sees the Gaussians, as a median. Turning and moving sideways look much alike before a wall."""
+    """Return the median pixel offset of the Gaussians from their places in `CAMERA`. A wall hardly separates pan from shift."""
     return float((seen(scene, camera) - seen(scene, CAMERA)).norm(dim=1).median())
 
 

@@ -1,4 +1,4 @@
-"""Which estimator is asked for a stream's depth, and in which frames."""
+"""Selection of a stream's depth estimator and of the frames that it processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a relief shows: against a surface that is rendered from its points and normals, and the derivatives against differences."""
+"""Appearance of a relief against a rendering of its points and normals, and derivatives against finite differences."""
 
 from __future__ import annotations
 

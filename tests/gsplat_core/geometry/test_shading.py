@@ -1,4 +1,4 @@
-"""What shading holds of a picture."""
+"""Extraction of the shading of a picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be expected of a scope's trajectory."""
+"""Prior of a scope's trajectory."""
 
 from __future__ import annotations
 

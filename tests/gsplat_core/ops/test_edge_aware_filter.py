@@ -22,7 +22,7 @@ def case(shape, seed=0):
 
 
 def check_against_reference(shape, device="cpu", strength=100.0, grey_step=5.0):
-    """To 1e-4 of the largest value: float32 against float64."""
+    """Compare float32 with the float64 reference to 1e-4 of the largest value."""
     planes, guide = case(shape)
     found = smooth_within_edges(planes.to(device), guide.to(device), strength, grey_step)
     expected = reference.smooth_within_edges(planes.double(), guide, strength, grey_step)

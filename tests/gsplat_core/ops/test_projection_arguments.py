@@ -1,4 +1,4 @@
-"""What `fully_fused_projection` refuses, and what it says."""
+"""Argument checks of `fully_fused_projection` and their messages."""
 
 from __future__ import annotations
 

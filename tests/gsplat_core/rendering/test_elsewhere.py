@@ -39,7 +39,7 @@ def at(model, time_s, centre):
 
 
 def squared_error(recorded, shown):
-    """Of the third camera's pictures, over tissue that the scope sees as well."""
+    """Return the error of the third camera's pictures over tissue that the scope also sees."""
     recording, truth, model = recorded
     errors = []
     for frame in recording:

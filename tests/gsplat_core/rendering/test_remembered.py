@@ -1,4 +1,4 @@
-"""How much of a picture is of Gaussians that nobody sees, against the reference and where it is known exactly."""
+"""Share of a picture that comes from Gaussians currently out of view, against a reference and known scenes."""
 
 from __future__ import annotations
 

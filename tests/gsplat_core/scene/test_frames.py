@@ -1,4 +1,4 @@
-"""What a frame refuses, and what it says about its right eye and its depth."""
+"""Validation of frames, and their properties for the right eye and depth."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def test_the_middle_stays_in_the_middle_at_its_distance(orbit):
 
 
 def test_azimuth_goes_right_and_elevation_up():
-    """In the start's own axes, which are x to the right and y down."""
+    """Axes are those of the start camera: x to the right, y down."""
 
     def moved(orbit: Orbit) -> np.ndarray:
         centre = orbit.camera(START, DISTANCE).position

@@ -1,4 +1,4 @@
-"""Where the scope was: which times are kept, and where its eye is between them."""
+"""Times that a scope path keeps, and interpolation of positions between them."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a published state has to show after its newest frame, whichever prior says how it goes on."""
+"""Checks of a published state after its newest frame, for any motion prior."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pixels show nothing of a scene, and from how many on Gaussians are added."""
+"""Detection of uncovered pixels, and the count from which Gaussians are added."""
 
 from __future__ import annotations
 

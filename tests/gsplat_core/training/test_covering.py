@@ -31,7 +31,7 @@ def seen(frame, camera):
 
 @pytest.fixture
 def step(frame, camera):
-    """That of a scene which covers the left part of the picture."""
+    """Return the training step of a scene that covers the left part of the picture."""
     whole = gaussians_from_frame(frame, camera, 400, sh_degree=0, default_depth_mm=60.0)
     left = whole.select(whole.means[:, 0] / whole.means[:, 2] * 50 + 24 < 30)
     return TrainingStep(left, BasisField(left.count, (0.0, 1.0)), CONFIG, camera)

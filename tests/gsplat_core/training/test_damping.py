@@ -1,4 +1,4 @@
-"""Which share of the last motion is expected to go on."""
+"""Expected share of the last motion that continues."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_frames_that_say_nothing_change_nothing() -> None:
 
 @pytest.mark.parametrize(("ratio", "share"), [(1.0, 0.66), (0.0, 0.51), (50.0, 0.735), (-50.0, 0.435)])
 def test_one_frame_counts_by_fifteen_hundredths_and_no_further_than_its_bounds(ratio: float, share: float) -> None:
-    """From 0.6 on: 0.6 + 0.15 (ratio - 0.6), the ratio within -0.5 and 1.5."""
+    """The estimate starts at 0.6 and moves by 0.15 (ratio - 0.6), with the ratio clamped to [-0.5, 1.5]."""
     damping, last = Damping(), torch.ones(5, 3)
     damping.learn(last, ratio * last)
     assert share_of(damping) == pytest.approx(share, abs=1e-6)

@@ -1,4 +1,4 @@
-"""What makes the right eye's colours those of the left one."""
+"""Matching of the right eye's colours to the left eye's."""
 
 from itertools import pairwise
 

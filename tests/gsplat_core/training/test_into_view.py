@@ -1,4 +1,4 @@
-"""What a moving camera brings into view is there before training on the frame."""
+"""Gaussians for tissue that a moving camera brings into view exist before training on the frame."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from gsplat_core.training.live import LiveReconstructor
 WIDTH, HEIGHT = 48, 40
 CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)
 PLANE = 60.0
-"""Where a scene without depth starts."""
+"""Initial distance of a scene without depth."""
 
 
 def frame_at(k: int, **fields: object) -> Frame:

@@ -1,4 +1,4 @@
-"""What is assumed about motion after the newest frame: predictions of moving, still and broken streams."""
+"""Motion prior after the newest frame: predictions for moving, still and broken streams."""
 
 from __future__ import annotations
 

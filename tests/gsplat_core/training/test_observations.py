@@ -1,4 +1,4 @@
-"""What a frame becomes for training, and which frames the steps take."""
+"""Conversion of frames to observations, and selection of frames for training steps."""
 
 from dataclasses import replace
 

@@ -67,7 +67,7 @@ def there_and_on(first, columns):
 
 @pytest.mark.parametrize("rows", [6000, 700])
 def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
-    """With room for all of it, and with room for two pictures only, so that most of it is archived meanwhile."""
+    """Cover capacity for the whole scene, and capacity for two pictures, where most of the scene is archived."""
     made = reconstructor(rows, device)
     watch(made, there_and_on(0, [0] * 30), steps=8)
     watch(made, there_and_on(30, range(0, 380, 4)))
@@ -164,7 +164,7 @@ def test_the_archive_is_bounded_and_counts_what_it_drops():
 
 
 def test_a_published_model_knows_what_was_not_seen(device):
-    """What the scope looked at first is seen then, and is not any more when it has moved on by a picture."""
+    """The first view counts as seen, and no longer after the scope has moved by one picture."""
     made = reconstructor(2000, device)
     here, there = frame_at(0, 0), frame_at(60, WIDTH, time_s=2.0)
 

@@ -1,4 +1,4 @@
-"""Which frames of a recording get depth from the camera's motion, and which recordings are left as they are."""
+"""Selection of frames for depth from camera motion, and of recordings that are left unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reconstructor refuses, and that a refusal leaves its model alone."""
+"""Input rejected by a reconstructor leaves its model unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What followed earlier moments like now."""
+"""Prediction from earlier moments that resemble the current one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How evenly pictures change."""
+"""Evenness of the change between pictures."""
 
 from __future__ import annotations
 

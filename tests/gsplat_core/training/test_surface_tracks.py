@@ -41,14 +41,14 @@ def observations(recording) -> list[Observation]:
 
 
 def points_of(asked: Asked) -> torch.Tensor:
-    """Where the generator has a grid of the tissue's points in each frame [T, P, 3]."""
+    """Return the generator's grid of tissue points in each frame [T, P, 3]."""
     moves = asked.camera == "moving"
     scene = SyntheticScene.from_seed(asked.seed, asked.width_px, asked.height_px, asked.frames / asked.fps, moves)
     return torch.from_numpy(np.stack([scene.track(number / asked.fps) for number in range(asked.frames)]))
 
 
 def seen_throughout(recording, points: torch.Tensor) -> torch.Tensor:
-    """Of each point, whether all frames show it well inside and off the tool [P]."""
+    """Return the mask of points [P] that all frames show well inside the picture and off the tool."""
     shown = torch.ones(points.shape[1], dtype=torch.bool)
     for frame, here in zip(recording, points, strict=True):
         seen = Seen(recording.camera.with_pose(frame.pose), here)
@@ -139,7 +139,7 @@ def test_between_what_is_known():
 
 
 def test_a_model_has_the_motion_along_the_line_of_sight_after_few_steps(fixed):
-    """Which steps alone would not learn: positions move by hundredths of a pixel in a step."""
+    """Optimiser steps alone cannot learn it: positions move by hundredths of a pixel per step."""
     config = replace(ReconstructorConfig.offline(), gaussians=1500, max_gaussians=2000)
     learner = Reconstructor(config, fixed.camera)
     learner.fit(list(fixed), 24)

@@ -1,4 +1,4 @@
-"""What no picture shows stays where it is, and what no picture needs leaves."""
+"""Gaussians without observations stay in place, and unneeded Gaussians are removed."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def test_between_two_renewals_it_only_relaxes(make_frame, camera):
 
 
 def spread_of(depth, pixels):
-    """How far depths lie from the plane that fits them best, as a share of their mean."""
+    """Return the standard deviation of depths from their best-fit plane, relative to their mean."""
     plane = torch.cat([pixels, torch.ones(len(pixels), 1)], 1)
     rest = depth - plane @ torch.linalg.lstsq(plane, depth[:, None]).solution[:, 0]
     return float(rest.std() / depth.mean())

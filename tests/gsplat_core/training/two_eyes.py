@@ -18,7 +18,7 @@ LEFT = Camera.from_focal(60.0, WIDTH, HEIGHT)
 BASELINE_MM = 5.0
 RIGHT = LEFT.right_eye(BASELINE_MM)
 THIRD = LEFT.with_pose([[1, 0, 0, 8.0], [0, 1, 0, 6.0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""To the left and above: no eye of the scope."""
+"""Camera to the left and above; not an eye of the scope."""
 
 
 def true_depth(width: int, height: int) -> np.ndarray:
@@ -29,7 +29,7 @@ def true_depth(width: int, height: int) -> np.ndarray:
 
 @cache
 def surface() -> Gaussians:
-    """What there is; it reaches beyond what the cameras see."""
+    """Return the scene's Gaussians, which reach beyond the cameras' pictures."""
     width, height = WIDTH + 2 * MARGIN, HEIGHT + 2 * MARGIN
     wide = Camera.from_focal(60.0, width, height)
     random = np.random.default_rng(3)

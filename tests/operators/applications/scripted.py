@@ -42,9 +42,9 @@ class Scripted:
 
     frame: Frame
     good: bool
-    """Whether it may be learned from."""
+    """True if training may use the frame."""
     pause_s: float = 0.0
-    """How long nothing comes before it."""
+    """Time without frames before it."""
 
 
 def scope_picture(index: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
@@ -123,7 +123,7 @@ class Watched:
     events: list[ScheduleEvent] = field(default_factory=list)
 
     def part(self, kind: type) -> Any:
-        """What an operator said of the run."""
+        """Return an operator's part of the run's outcome."""
         assert self.outcome is not None
         found = self.outcome.find(kind)
         assert found is not None, kind

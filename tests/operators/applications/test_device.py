@@ -1,4 +1,4 @@
-"""Which devices are accepted, and what an application runs on beside them."""
+"""Accepted devices, and the host settings of an application on each."""
 
 from __future__ import annotations
 

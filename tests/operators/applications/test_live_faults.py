@@ -39,7 +39,7 @@ from tests.operators.applications.scripted import (
 SLOW = DisplaySettings(stale_after_ms=700.0, stale_after_intervals=1.0, frozen_after_ms=1400.0)
 """A busy machine shows pictures late, and that is not what is tested here."""
 FEW_STEPS = ClockSettings(at_most_steps=4, rehearse_at_most=4)
-"""Of what is learned from it matters which frames it was, not how well."""
+"""Few steps per frame: the tests check the set of trained frames, not the quality."""
 
 
 @pytest.fixture

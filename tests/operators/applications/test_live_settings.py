@@ -1,4 +1,4 @@
-"""What a live run does where nothing is asked for: it differs by device, and what is asked for wins."""
+"""Defaults of a live run by device, and their override by explicit settings."""
 
 from __future__ import annotations
 

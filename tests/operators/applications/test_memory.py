@@ -1,4 +1,4 @@
-"""What cannot fit into memory is refused before anything is written, with how much it needs and how much there is."""
+"""Runs that exceed the memory are refused before any output, with the required and the available amount."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ def test_a_third_eye_is_refused(tiny, tmp_path):
 
 
 def test_the_next_frame_is_predicted_as_the_causal_protocol_does(settings):
-    """The same learner, evaluated by a protocol of its own that renders by another way."""
+    """Compare with the causal protocol, which renders through a separate path."""
     from gsplat_core.evaluation.protocols import PictureMaker, evaluate_causal
     from gsplat_core.io.recordings import open_recording
     from operators.applications.device import seeded

@@ -1,4 +1,4 @@
-"""From where a model is shown: orbit, two eyes, a path; and that what was never seen is marked."""
+"""Viewpoints for showing a model (orbit, stereo, path), and marking of tissue that was never seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is done once before a stream, so that no frame of it waits."""
+"""Warm-up before a stream, so that no frame waits for initialisation."""
 
 from __future__ import annotations
 

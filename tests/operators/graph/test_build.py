@@ -1,4 +1,4 @@
-"""What is refused when operators and graphs are built, before anything runs."""
+"""Invalid operators and graphs are refused at construction, before a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How runs end: finished, stopped or deadlocked, with a reason; the same on every engine and scheduler."""
+"""Ends of runs (finished, stopped, deadlocked) with their reason, on every engine and scheduler."""
 
 from __future__ import annotations
 

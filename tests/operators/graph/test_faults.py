@@ -1,4 +1,4 @@
-"""What happens when an operator raises: the same on every engine and scheduler."""
+"""Exceptions in operators, on every engine and scheduler."""
 
 from __future__ import annotations
 

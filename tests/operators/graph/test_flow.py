@@ -1,4 +1,4 @@
-"""What flows: every message, in order, by reference, with its metadata; the same on every engine and scheduler."""
+"""Delivery of every message in order, by reference, with metadata, on every engine and scheduler."""
 
 from __future__ import annotations
 

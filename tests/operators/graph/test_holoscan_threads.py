@@ -1,4 +1,4 @@
-"""What the SDK's event-based scheduler does badly between two threads, with the moment between them made long."""
+"""Race conditions of the SDK's event-based scheduler, with the window between two threads widened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an operator prepares in the thread that will compute: once, before anyone computes, and what it raises ends the run."""
+"""`prepare` runs once in the computing thread, before any compute, and its exceptions end the run."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""What each embedded scheduler promises by itself."""
+"""Guarantees of each embedded scheduler."""
 
 from __future__ import annotations
 

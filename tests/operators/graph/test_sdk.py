@@ -1,4 +1,4 @@
-"""What is said when the Holoscan SDK cannot be loaded."""
+"""Errors if the Holoscan SDK cannot be loaded."""
 
 from __future__ import annotations
 

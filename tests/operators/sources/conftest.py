@@ -1,4 +1,4 @@
-"""What the tests of several sources share."""
+"""Fixtures used by the tests of several sources."""
 
 from __future__ import annotations
 

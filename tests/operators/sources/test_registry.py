@@ -1,4 +1,4 @@
-"""Which source an address stands for."""
+"""Resolution of an address to its source."""
 
 from __future__ import annotations
 

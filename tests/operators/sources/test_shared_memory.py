@@ -1,4 +1,4 @@
-"""What comes through shared memory is checked before anything is read."""
+"""Data from shared memory is validated before it is read."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from operators.sources.url_address import UrlAddress, without_secrets
 
 SOON_S = 300.0
 HERE = SourceOptions(process=False)
-"""In the test's own process, where nothing has to be started."""
+"""Options for a source in the test's own process, without a child process."""
 
 
 def moving(index, width=160, height=120):

@@ -32,7 +32,7 @@ def bumpy(source: DepthSource | None) -> Model:
 
 
 def write(mesh: Mesh, path) -> None:
-    """In another program's way."""
+    """Write the mesh in the style of another program."""
     if path.suffix == ".ply":
         path.write_bytes(b"".join(mesh_ply_pieces(mesh, "millimetre", with_triangles=True)))
     elif path.suffix == ".obj":

@@ -1,4 +1,4 @@
-"""What doctor says about the GPU and the kernels for it, in each state that a machine can be in."""
+"""Output of `doctor` about the GPU and its kernels, for each state of a machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the user can change is one sentence and 2; everything else is a bug, with its traceback, and 1."""
+"""User errors print one sentence and exit with 2; all other errors print a traceback and exit with 1."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether there is a GPU to use, and what is in the way: what torch says counts, the driver's files give the reason."""
+"""Detection of a usable GPU by torch, and reasons for its absence from the driver's files."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ NAMES = {"--device": ("cpu",), "--engine": ("embedded", "holoscan"), "--field": 
 
 
 def may_work(option: str, value: str) -> bool:
-    """Whether the value could be a valid one: then the run may do as it likes, and the test looks at others."""
+    """Return true if the value could be valid. The test skips such values."""
     if option in NAMES:
         return value in NAMES[option]
     try:

@@ -49,7 +49,7 @@ class Plane:
         return self.client.request(method, path, headers=headers, **options)
 
     def events(self) -> list[tuple[str, str, str]]:
-        """What the audit log has, the oldest first."""
+        """Return the audit log's entries, oldest first."""
         return [(entry.event, entry.subject, entry.outcome) for entry in reversed(self.control.audit.newest(1000))]
 
 

@@ -16,11 +16,11 @@ from services.display.encoder import EncodedPicture
 
 
 class NotThere(Exception):
-    """As a registry's own."""
+    """Stand-in for a registry's not-found error."""
 
 
 class NotNow(Exception):
-    """As a registry's own."""
+    """Stand-in for a registry's temporary failure."""
 
 
 @dataclass(frozen=True)

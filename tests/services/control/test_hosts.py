@@ -1,4 +1,4 @@
-"""Which names a server goes by: addresses and localhost, and those that the settings list."""
+"""Accepted host names of a server: addresses, localhost and those listed in the settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the service writes to standard error."""
+"""Log output of the service on standard error."""
 
 from __future__ import annotations
 

@@ -219,7 +219,7 @@ def test_a_second_server_of_the_same_folder_is_refused(served, tmp_path):
 
 
 def test_what_cannot_be_served_is_a_sentence(served, tmp_path):
-    """As an exit code without a traceback: `test_a_second_server_of_the_same_folder_is_refused`."""
+    """The exit code without a traceback is covered by `test_a_second_server_of_the_same_folder_is_refused`."""
     _, port, _ = served
     for server, said in (
         ({"port": port}, "cannot listen on 127.0.0.1"),

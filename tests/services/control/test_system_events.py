@@ -1,4 +1,4 @@
-"""What a service does by itself is in the audit log, and nobody waits for that."""
+"""Actions of the service itself are written to the audit log without blocking their caller."""
 
 from __future__ import annotations
 

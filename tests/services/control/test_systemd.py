@@ -1,4 +1,4 @@
-"""What systemd hears: ready, alive as long as the loop turns, ending; and nothing where nobody listens."""
+"""Notifications to systemd: ready, watchdog while the event loop runs, stopping; none without a socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same attempts on a local Ray: made, killed, cancelled, published once."""
+"""Job attempts on a local Ray: run, killed, cancelled, published once."""
 
 from __future__ import annotations
 

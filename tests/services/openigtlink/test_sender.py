@@ -1,4 +1,4 @@
-"""What a client of OpenIGTLink receives: orientation, order of channels, spacing, pose, and what becomes of slow clients."""
+"""Messages received by an OpenIGTLink client (orientation, channel order, spacing, pose), and slow clients."""
 
 from __future__ import annotations
 

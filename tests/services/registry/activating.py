@@ -1,4 +1,4 @@
-"""What a process of its own does that activates versions beside another one; loads no torch."""
+"""Program of a process that activates versions concurrently with another process. Does not load torch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ ROUNDS = 5
 
 
 def activate_together(folder, database_url, version, gate, results):
-    """In a process of its own: in each round try to be the one that replaces version 1."""
+    """Compete in each round, as a separate process, to replace version 1."""
     with ModelRegistry(folder, database_url=database_url, check_program=ALWAYS_READY) as registry:
         for _ in range(ROUNDS):
             gate.wait()

@@ -18,7 +18,7 @@ SERVER_STARTS_S = 300.0
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where packed models lie that several tests upload."""
+    """Return the folder of packed models that several tests upload."""
     return tmp_path_factory.mktemp("uploads")
 
 

@@ -22,7 +22,7 @@ ACTIONS: dict[str, Callable[[ModelRegistry, Path], object]] = {
     "rollback": lambda registry, upload: registry.rollback("liver", "admin"),
     "delete": lambda registry, upload: registry.delete("liver", 3, "admin"),
 }
-"""On a model with versions 1, 2 and, but for an upload, 3."""
+"""Changes to a model with versions 1, 2 and, except for an upload, 3."""
 
 
 def swap_for_ever(registry: ModelRegistry) -> None:

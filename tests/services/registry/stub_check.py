@@ -6,7 +6,7 @@ import sys
 
 _STEPS = '{"stage": "validated", "gaussians": 5}\n{"stage": "ready", "render_ms": 1.0}\n'
 ALWAYS_READY = (sys.executable, "-S", "-c", f"import sys; sys.stdout.write({_STEPS!r})")
-"""In place of the real check, which loads torch and takes seconds."""
+"""Replacement of the real check, which loads torch and takes seconds."""
 
 
 def says(text: str) -> tuple[str, ...]:

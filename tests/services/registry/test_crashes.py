@@ -25,7 +25,7 @@ COMMITTED = {
     "rollback": "rollback committed",
     "delete": "row deleted",
 }
-"""From which step on each change has happened."""
+"""Step from which each change has taken effect."""
 STEPS = {
     "upload": ["upload staged", "blob stored", "row written", "upload committed"],
     "check": ["model unpacked", "version validated", "check ended"],

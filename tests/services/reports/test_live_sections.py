@@ -1,4 +1,4 @@
-"""What `report.html` says about a live run, and only about one."""
+"""Sections of `report.html` that appear for live runs only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What streams tell Prometheus."""
+"""Prometheus metrics of streams."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Collected(Collector):
 
 
 def samples(families: GraphFamilies) -> dict[str, float]:
-    """As Prometheus reads them."""
+    """Return the samples in Prometheus' text format, by name."""
     registry = CollectorRegistry()
     registry.register(Collected(families))
     lines = generate_latest(registry).decode().splitlines()

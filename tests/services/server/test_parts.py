@@ -1,4 +1,4 @@
-"""What the parts of a server tell each other."""
+"""Notifications between the parts of a server."""
 
 from __future__ import annotations
 

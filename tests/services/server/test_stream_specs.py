@@ -1,4 +1,4 @@
-"""From a stream of the API to the specification of its processes, and from its processes to its state."""
+"""Conversion of an API stream to the specification of its processes, and of its processes to its state."""
 
 from __future__ import annotations
 

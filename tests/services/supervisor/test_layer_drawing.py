@@ -1,4 +1,4 @@
-"""What depth, confidence and the virtual view show of a known scene: a red wall far away, a green post in front of it."""
+"""Depth, confidence and virtual-view layers of a known scene: a red wall far away, a green post in front of it."""
 
 from __future__ import annotations
 

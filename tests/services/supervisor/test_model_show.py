@@ -28,7 +28,7 @@ SOON_S = 300.0
 
 
 class Published:
-    """What goes out."""
+    """Publisher that records headers and images."""
 
     def __init__(self) -> None:
         self.headers: list[dict] = []

@@ -36,7 +36,7 @@ def bundles(tmp_path):
 
 
 async def watch(endpoint: str, seen: list[tuple[str, int, str]]) -> None:
-    """What is shown, which version it says, and what it looks like."""
+    """Append each displayed picture's kind, model version and digest to `seen`."""
     socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), endpoint, waiting=256)
     try:
         while True:

@@ -1,4 +1,4 @@
-"""What is said of a process: the reason of its end as one sentence, and a source that is lost or back."""
+"""Descriptions of process events: one sentence for an exit reason, and a source that is lost or recovered."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ async def until(what) -> None:
 
 
 class Headers:
-    """What is said about each picture of a socket, in the order in which they come."""
+    """Headers of a socket's pictures, in order of receipt."""
 
     def __init__(self, endpoint: str) -> None:
         self.seen: list[dict] = []
@@ -62,7 +62,7 @@ class Headers:
 
 
 def without_gaps(headers: list[dict]) -> bool:
-    """Whether each frame that one capture process has read was seen."""
+    """Return true if every frame of one capture process was received."""
     numbers = [header["seq"] for header in headers]
     return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 

@@ -46,7 +46,7 @@ def _read(path: Path) -> tuple[list[Frame], bool]:
 
 
 def _unseen(path: Path, intact: list[Frame]) -> bool | None:
-    """Whether a changed picture passes for whole without a word about the file; None where no picture changed."""
+    """Return true if a changed picture is accepted without a finding. None if no picture changed."""
     frames, whole = _read(path)
     changed = [
         frame

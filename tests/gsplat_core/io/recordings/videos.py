@@ -65,7 +65,7 @@ def name_of(codec: str) -> str:
 
 
 def payload(path: Path) -> list[tuple[int, int]]:
-    """Where the coded pictures lie in a file: begin and end of each, in the order of decoding."""
+    """Return begin and end of each coded picture in the file, in decoding order."""
     with av.open(str(path)) as container:
         return [
             (p.pos + _header(path, p), p.pos + _header(path, p) + p.size) for p in container.demux(video=0) if p.size

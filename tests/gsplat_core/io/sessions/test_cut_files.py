@@ -48,7 +48,7 @@ def plays(folder: Path, frames: list[Frame]) -> list[int]:
 
 
 def whole_before(path: Path, at: int) -> int:
-    """How many pictures or lines of a file end before a byte."""
+    """Return the number of pictures or lines of a file that end before a byte offset."""
     if path.suffix == ".jsonl":
         return path.read_bytes()[:at].count(b'"event":"frame"')
     with path.open("rb") as file:
