@@ -201,7 +201,7 @@ class Stream:
 
 
 def growth(minutes: list[dict[str, Any]]) -> dict[str, float]:
-    """The last minute beside the second one: memory and time in percent, quality in decibels."""
+    """Return the last minute relative to the second one: memory and time in percent, quality in decibels."""
     early, late = minutes[min(1, len(minutes) - 1)], minutes[-1]
     names = [name for name in ("process_mib", "device_mib", "allocated_mib", "p50_ms", "mean_ms") if name in early]
     grown = {f"{name}_growth_percent": round(100 * (late[name] / early[name] - 1), 2) for name in names}

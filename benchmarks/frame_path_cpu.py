@@ -89,7 +89,7 @@ class FramePath:
 
 
 class _Port:
-    """The inputs of an operator, and an output that nobody reads."""
+    """Inputs of an operator, and an output without a reader."""
 
     def __init__(self, messages: dict[str, list[object]]) -> None:
         self._messages = messages

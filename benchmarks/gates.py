@@ -70,7 +70,7 @@ MEASURES: dict[str, Callable[[Evidence], float]] = {
     "cool": lambda evidence: evidence.cool,
 }
 PAIRS = {"straight": (STRAIGHT, COOL_BESIDE_STRAIGHT), "light": (ROOM_LIGHT, COOL_BESIDE_LIGHT)}
-"""The gate's two kinds of evidence: the threshold of the measure, and that of `cool` beside it."""
+"""Thresholds of the gate's two kinds of evidence: the measure, and `cool` in addition to it."""
 
 
 def main() -> int:

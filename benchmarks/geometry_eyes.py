@@ -9,7 +9,7 @@ device: figures that do not depend on the machine's speed. With `--fps` steps ar
 until the next frame would come; scoring stops the clock. With `--fit` all frames are trained on offline, so many steps.
 
 A JSON line for each run. left_db: PSNR of the newest frame in the left eye, the mean over every tenth frame from the second second on, and over all of
-them (`left_all_db`). right_db: the same frames in the right eye by `gsplat_core.evaluation.views`, the trivial baselines beside it. depth_px: median
+them (`left_all_db`). right_db: the same frames in the right eye by `gsplat_core.evaluation.views`, next to its trivial baselines. depth_px: median
 error of the disparity against the depth that was given, where there is any. Two videos have no calibration: the focal length is 0.9 of the width, the distance
 between the eyes puts the typical disparity at 60 mm, `--below` says by how many pixels the right picture shows everything lower.
 """

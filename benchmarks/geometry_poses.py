@@ -9,7 +9,7 @@ rendered recording of so many frames, 320x256, with a moving scope before tissue
 still. `--way back` has the scope go sideways until it sees none of what it saw at first, and back again, `--way circle`
 round a circle as wide, and adds how far off the last pose is, which is the first one. `--causal` estimates frame by frame, as live and `replay` do, on one
 thread, and gives the processor's milliseconds a frame. `--depth` adds the error of depth maps of tissue that breathes (`moving_tissue`) with these poses, of every fifth frame, after one scale. `--assume 0.9` does without the calibration: the focal length is assumed to be 0.9 of the longer
-side, and what the pictures tell of it stands beside the true one, in the same unit.
+side, and the estimate is printed next to the true one, in the same unit.
 """
 
 from __future__ import annotations

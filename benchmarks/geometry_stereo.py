@@ -4,7 +4,7 @@
 
 One JSON line for each: `scared_pair` (disparity against its truth), `scared_raw` and `hamlyn_pair` (rectified from their calibrations: vertical residual of
 SIFT matches, and the surface), `heart` (its measure), synthetic pairs (depth against the truth) and the time of a frame on one thread. `--pictures` writes
-the left picture beside its depth: near is red, far is blue, black is not believed. The settings are the same for all of them.
+the left picture next to its depth: near is red, far is blue, black is not believed. The settings are the same for all of them.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def synthetic(asked: Asked) -> dict[str, Any]:
 
 
 def picture(folder: Path, path: Path) -> None:
-    """The left picture of the first frame beside its depth."""
+    """Write the first frame's left picture and its depth side by side."""
     recording = open_recording(folder, max_frames=1)
     ((frame, found, _),) = estimates(recording, recording.camera)
     seen = believed(found)

@@ -146,7 +146,7 @@ def report(work: str, **figures: Any) -> None:
 
 
 def compare(work: str, ours: Times, peers: Mapping[str, Times], asked_ms: float | None = None, **more: object) -> None:
-    """Our times beside each peer's, the ratios to the fastest peer, and whether the limit was met."""
+    """Print our times, each peer's times, the ratios to the fastest peer, and the verdict against the limit."""
     figures: dict[str, Any] = {"ours": ours, **peers}
     if peers:
         figures["ratio"] = min(peer.ms for peer in peers.values()) / ours.ms

@@ -1,4 +1,4 @@
-"""Measure the cost of recording a session: processor time and bytes per frame by part, and blocking of the graph thread.
+"""Measure the cost of recording a session: processor time and bytes per frame by part, and waits of the graph thread.
 
 A frame comes in with its masks and is handed on with another loss mask, then its picture is shown. First each part is written by itself in this
 thread, then all of it through `SessionRecorder` at the recording's rate, in its own thread.

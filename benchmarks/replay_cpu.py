@@ -20,7 +20,7 @@ from typing import Any
 
 
 def replay(recording: Path, field: str, engine: str, frames: int | None) -> dict[str, Any]:
-    """One `intrasplat replay` as a process of its own."""
+    """Run `intrasplat replay` once in a child process."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "services.cli", "replay", str(recording), "--out", f"{folder}/out"]
         command += ["--field", field, "--engine", engine, "--json"]

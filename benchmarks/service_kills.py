@@ -4,7 +4,7 @@
 
 A real `intrasplat serve` with one stream. Two viewers watch raw pictures and two the reconstruction, over WebSocket; when the control plane itself is
 killed two subscribers watch what capture and engine publish, and the clock stops when the next control plane has taken both over and shows
-pictures again. Beside it a model is activated and rolled back all the time; at the end every answered change has to be in the audit log and in the
+pictures again. Meanwhile a model is activated and rolled back all the time; at the end every answered change has to be in the audit log and in the
 registry, and the log has to be whole. Prints one JSON object.
 """
 
@@ -59,7 +59,7 @@ class Changes:
                 else:
                     service_models.roll_back(self._server)
                     self.answered["model.rollback"] += 1
-            except (OSError, RuntimeError, ValueError):  # nobody is there, or it was killed while it answered
+            except (OSError, RuntimeError, ValueError):  # no server is listening, or it was killed while it answered
                 self.unanswered += 1
 
     def kept(self) -> dict[str, Any]:

@@ -31,7 +31,7 @@ def cpu_s(pid: int) -> float:
 
 
 async def part(stream: StreamSupervisor, what: str, layers: tuple[str, ...], seconds: float) -> None:
-    """Watch the screen, and these layers beside it, for a while."""
+    """Watch the screen and these layers for a while."""
     shown = Watch(stream.folder.pictures("engine"))
     beside = {layer: Watch(stream.folder.endpoint(layer)) for layer in layers}
     await asyncio.sleep(2)

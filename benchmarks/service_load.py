@@ -1,4 +1,4 @@
-"""A crowd before a real `intrasplat serve`: what it takes from the stream, from the server's memory, and from those who watch and ask beside it.
+"""Measure a crowd's effect on a real `intrasplat serve`: stream rate, server memory, and other viewers and clients.
 
     python benchmarks/service_load.py --viewers 50 --slow 10 --requests 200
 

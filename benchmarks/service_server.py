@@ -21,7 +21,7 @@ UNLIMITED = {"requests_per_s": 1e6, "address_requests_per_s": 1e6}
 
 
 class Server:
-    """A server with one stream, in a folder of its own. Use as a context manager."""
+    """Server with one stream in a temporary folder. Use as a context manager."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ def cpu_s(pid: int) -> float:
 
 
 def machine_busy_s() -> float:
-    """Time of all cores in which they did something, whoever asked for it."""
+    """Return the busy time of all cores, for all processes of the machine."""
     user, nice, system, _, _, irq, softirq, *_ = map(int, Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:])
     return (user + nice + system + irq + softirq) / TICKS_PER_S
 

@@ -1,7 +1,7 @@
 """Reconstruct a recording while it plays, without a graph.
 
 Makes a small synthetic recording, then gives its frames one by one to a `Reconstructor`. Each frame gets a few optimiser steps
-and is shown right after them, beside what doing nothing (showing the previous frame) would have scored.
+and is shown right after them, next to the score of the trivial baseline (showing the previous frame).
 
 Usage: python examples/03_online_reconstruction.py [--frames 8]
 """

@@ -1,4 +1,4 @@
-"""Compiles gsplat out of its PyPI wheel, or out of a source archive, for the GPU at hand, to be timed beside this project.
+"""Compile gsplat from its PyPI wheel or a source archive for the local GPU, as a peer for timing.
 
     python -m pip download gsplat==1.5.3 --no-deps --only-binary :all: --dest build/peers
     python benchmarks/peers/build_gsplat.py build/peers/gsplat-1.5.3-py3-none-any.whl build/peers
@@ -8,7 +8,7 @@
 without a network, put the archive into build/peers, which git ignores, and carry that folder there.
 
 Needs nvcc, ninja, a torch with CUDA, and jaxtyping and rich, which gsplat imports. The sources and the flags (-O3 -use_fast_math)
-are the wheel's; only where the result lies differs from gsplat's own compilation when it is first used: beside its Python files,
+are the wheel's; only where the result lies differs from gsplat's own compilation when it is first used: next to its Python files,
 so that the folder can be carried to another machine of the same kind. TORCH_CUDA_ARCH_LIST names another GPU than the one at
 hand, MAX_JOBS how many compilers run at a time. After an interruption the same command goes on.
 """

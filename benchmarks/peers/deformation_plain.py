@@ -1,4 +1,4 @@
-"""Deformation fields as they are usually written, in plain PyTorch: what the fused ones are measured beside.
+"""Deformation fields in plain PyTorch, the peers of the fused ones.
 
 `PlainHexPlane` is HexPlane (Cao and Johnson 2023) with a small network as in 4D Gaussian Splatting (Wu et al. 2024) and G-SHARP: six
 `grid_sample`s per level, their product, the levels side by side, a trunk, heads. `PlainBasis` is bumps in time per Gaussian, shared

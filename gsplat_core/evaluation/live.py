@@ -74,7 +74,7 @@ class AgeHistogram:
 
 
 MOST_BEHIND = 8
-"""Largest lateness in frames with a counter of its own; later pictures are counted here too."""
+"""Largest lateness in frames with its own counter; later pictures are counted here too."""
 SETTLING_S = 1.0
 """Start-up time in seconds, excluded from `settled` but included in `score`."""
 NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"

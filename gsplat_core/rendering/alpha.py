@@ -33,7 +33,7 @@ class AlphaRenderer:
     """Renderer that deforms, projects, sorts and alpha-blends Gaussians (Kerbl et al. 2023).
 
     On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once
-    for the slot. A `Model` has a graph of its own, captured by `prepare`. On the CPU, and for
+    for the slot. A `Model` has its own graph, captured by `prepare`. On the CPU, and for
     fields without a fused frame path, the field's own function deforms the model and
     `gsplat_core.render` renders it. `Surface` outputs (`ray_depth`, `normals`, `median_depth`,
     `spread`, `confidence`) take much longer than a picture on any device.

@@ -48,7 +48,7 @@ def test_what_the_settings_list_is_let_through(rules, address):
         "rtsp://127.0.0.1?@10.1.2.3/s", "rtsp://127.0.0.1\\@10.1.2.3/s", "rtsp://127.0.0.1 @10.1.2.3/s", "rtsp://10.1.2.3\n/s",
         "rtsp:///s", "rtsp:10.1.2.3/s", "rtsp://", "rtsp://:554/s", "rtsp://10.1.2.3:99999/s", "rtsp://[10.1.2.3]/s",
         "rtsp://１０.1.2.3/s", "rtsp://10.1.2.3,127.0.0.1/s", "rtsp://[fe80::1%25eth0]/s",
-        # schemes that are not listed, or that nobody knows
+        # unlisted or unknown schemes
         "file:///etc/passwd", "gopher://10.1.2.3/", "concat:/etc/passwd|/etc/shadow", "udp://10.1.2.3:1", "RTSP://10.1.2.3/s",
         "exec:/bin/sh", "zmq+tcp://10.1.2.3:5", "pipe:-", "", "10.1.2.3", "/etc/passwd", "rtsp",
         # paths

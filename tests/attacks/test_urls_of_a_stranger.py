@@ -15,7 +15,7 @@ HERE = SourceOptions(process=False)
 
 @pytest.fixture(scope="module")
 def secret(tmp_path_factory):
-    """A video on this machine that nobody may reach through a URL."""
+    """Video on this machine that must not be reachable through a URL."""
     import av
     import numpy as np
 

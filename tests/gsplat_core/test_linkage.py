@@ -68,7 +68,7 @@ def test_our_sources_throw_by_our_own_check():
 
 
 def test_an_argument_is_refused_with_a_static_runtime():
-    """The objects of the CPU library, linked with the static libstdc++ and libgcc of this toolchain, in a process of its own."""
+    """Link the CPU library's objects with this toolchain's static libstdc++ and libgcc, in a separate process."""
     build = ROOT / "build" / "editable"
     if not (build / "CMakeCache.txt").exists():
         pytest.skip("the library was not built in this folder: there are no objects to link anew")

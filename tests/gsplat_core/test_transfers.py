@@ -1,4 +1,4 @@
-"""Between host and device: shared memory on the CPU, copies that wait for nobody on a GPU."""
+"""Transfers between host and device: shared memory on the CPU, non-blocking copies on a GPU."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def compute_queued() -> Callable[..., list[Any]]:
 
 
 class FakeTime:
-    """A monotonic clock that moves when it is told to."""
+    """Monotonic clock that only the test advances."""
 
     def __init__(self) -> None:
         self.ns = 1_000_000_000

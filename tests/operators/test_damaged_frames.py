@@ -1,4 +1,4 @@
-"""Damaged frames on their way through a replay: shown, neither trained on nor scored, and told."""
+"""Damaged frames in a replay are shown and reported, but neither trained on nor scored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth beside a live stream: the newest frame is next, nothing waits, and what was found is of the frame that it says."""
+"""Background depth of a live stream: newest frame first, no waiting, and depth assigned to the frame it belongs to."""
 
 from __future__ import annotations
 

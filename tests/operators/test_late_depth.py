@@ -1,4 +1,4 @@
-"""Depth that was found beside a stream is handed on once, and counted."""
+"""Depth estimated in the background is passed on once and counted."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class FakeReconstructor:
 
 
 class FakeDepth:
-    """Finds depth when it is told to."""
+    """Depth estimator that the test controls."""
 
     def __init__(self):
         self.offered, self.found = [], None
@@ -72,7 +72,7 @@ class FakeDepth:
 
 @pytest.fixture
 def live(model, camera, fake_time):
-    """The operator, its fake reconstructor, and the calls that its listener was told."""
+    """Return the operator, its fake reconstructor and the events received by its listener."""
     fake, told = FakeReconstructor(model, camera), []
     clock = FrameClock(ClockSettings(), 30.0, fake_time)
     clock.wait_until_shown = lambda: None

@@ -1,4 +1,4 @@
-"""A frame from outside goes on without its picture, and nobody is told what it showed."""
+"""A frame from outside the body passes on without its picture, and no message reveals the content."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from operators.outcome import OutcomeBuilder
 
 
 class FakeGate:
-    """Answers as told, and raises what it is given."""
+    """Gate with prepared verdicts and exceptions."""
 
     def __init__(self, *answers):
         self.answers = list(answers)

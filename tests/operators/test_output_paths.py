@@ -175,7 +175,7 @@ def test_a_folder_among_a_recordings_pictures_is_refused(tmp_path):
         (tmp_path / name).mkdir()
         check_folder_path(tmp_path / name / "run")
     (tmp_path / "frame.png").write_text("")
-    check_folder_path(tmp_path / "views" / "run")  # beside pictures an unspecific name means nothing
+    check_folder_path(tmp_path / "views" / "run")  # next to pictures an unspecific name means nothing
     with pytest.raises(OutputError, match="masks, which belongs to the recording"):
         check_folder_path(tmp_path / "masks" / "run")
     (tmp_path / "recording.json").write_text("")

@@ -20,7 +20,7 @@ COUNT = 8
 
 @pytest.fixture(scope="module")
 def frames():
-    """Pictures of a scope that moves sideways; nobody has said where it is."""
+    """Return pictures of a scope that moves sideways, without poses."""
     return [frame.with_fields(seq=number, pose=None) for number, frame in enumerate(video(COUNT, SIDEWAYS)[0])]
 
 

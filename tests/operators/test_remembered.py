@@ -1,4 +1,4 @@
-"""Tissue that nobody sees at this moment is marked, and nothing else is touched."""
+"""Tissue outside the current view is marked, and all other pixels stay unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Threads beside the graph take what it leaves."""
+"""Background threads use only the resources that the graph leaves."""
 
 from __future__ import annotations
 

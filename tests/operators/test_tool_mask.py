@@ -174,7 +174,7 @@ def test_what_a_network_could_not_say_is_stated(frame, compute, tmp_path):
 
 
 class Says:
-    """Finds masks whose share of tissue it is told, one after another."""
+    """Tool finder whose masks have prepared tissue shares, one per frame."""
 
     def __init__(self, *shares):
         self.shares = list(shares)

@@ -107,7 +107,7 @@ def scored() -> ScoredFrame:
 
 @pytest.fixture(scope="session")
 def postgresql() -> Iterator[str]:
-    """A PostgreSQL server without a port of its own: the folder of its socket."""
+    """Start a PostgreSQL server without a TCP port and return the folder of its socket."""
     programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
     if not programs:
         missing("PostgreSQL is not installed (apt-get install postgresql)")

@@ -1,4 +1,4 @@
-"""Whatever the umask of the user, nobody else reads what the service keeps."""
+"""Other users cannot read the service's files, whatever the user's umask."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ CHECKS = (
 )  # fmt: skip
 """All but those that take it for an error when a request that fits its schema is refused for what it says."""
 ENDLESS = "/v1/streams/{name}/mjpeg"
-"""Has no end while a stream runs, so that nobody could wait for it: it is called while none does. `tests/services/control/test_display.py` has
+"""Endless response while a stream runs, so it is called without one. `tests/services/control/test_display.py` has
 the pictures."""
 ANSWER_S = 300.0
 

@@ -111,7 +111,7 @@ class FirefoxPage(Page):
 
 @contextmanager
 def page(browser: str, profile: Path) -> Iterator[Page]:
-    """A page of a browser that runs with a profile of its own and ends with the context."""
+    """Open a page of a browser with a temporary profile; the browser ends with the context."""
     program = find(browser)
     assert program is not None
     profile.mkdir(parents=True, exist_ok=True)

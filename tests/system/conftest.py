@@ -1,4 +1,4 @@
-"""The whole program on small recordings: in this process where that is enough, in one of its own where it is not."""
+"""The whole program on small recordings, in this process where possible and otherwise in a child process."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def intrasplat(capfd) -> Callable[..., Done]:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Start a command line in a process of its own, which does not outlive the test."""
+    """Start a command line in a child process that does not outlive the test."""
     started = []
 
     def call(*arguments: object) -> subprocess.Popen[str]:

@@ -81,7 +81,7 @@ def test_what_the_server_refuses_can_be_read(page):
 
 
 def test_text_stands_out_from_what_is_behind_it(page):
-    """Every state's colour, which axe-core sees only while the state lasts, and the badges' beside the pictures."""
+    """Check the colour of every state, also of those that axe-core never sees, and of the badges by the pictures."""
     page, _ = page
     page.click("#tab-live")
     for state in STATES:

@@ -45,7 +45,7 @@ def test_a_layer_is_drawn_while_somebody_watches_and_not_longer(served, kind):
         time.sleep(0.6)
         return layers_of(client)[kind]["drawn"] == before > 0
 
-    until(rests, log)  # one may be drawn while the figures say that nobody watches any more
+    until(rests, log)  # one may be drawn while the figures already report no viewer
 
 
 def test_the_virtual_camera_turns(served):

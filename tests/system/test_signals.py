@@ -87,7 +87,7 @@ def catches_interrupts(pid):
         with open(f"/proc/{pid}/status") as file:
             caught = next(line for line in file if line.startswith("SigCgt"))
         with open(f"/proc/{pid}/maps") as file:
-            # Python has a handler of its own before: wait until ours can be there.
+            # Python has its own handler before: wait until ours can be there.
             return bool(int(caught.split()[1], 16) & (1 << (signal.SIGINT - 1))) and "select" in file.read()
     except (FileNotFoundError, StopIteration):
         return False

@@ -33,7 +33,7 @@ _H265_PICTURES = range(32)
 class Ticket:
     """Packet number that FFmpeg passes on to the decoded picture.
 
-    PyAV identifies opaque values by object identity, so each packet needs an object of its own.
+    PyAV identifies opaque values by object identity, so each packet needs its own object.
     Equal integers of two packets in flight would be confused.
     """
 

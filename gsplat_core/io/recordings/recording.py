@@ -68,7 +68,7 @@ class FileRecording:
         self, contents: Contents | SessionContents, scale: float, max_frames: int | None, notes: tuple[str, ...]
     ) -> None:
         self._contents = contents
-        # A relative path such as `.` has no name of its own.
+        # A relative path such as `.` has no name.
         self.name = printable(contents.root.name or contents.root.resolve().name)
         self.camera = contents.calibration.camera.scaled(scale)
         self.camera_is_assumed = contents.calibration.assumed

@@ -1,6 +1,6 @@
 """Tracks of a session segment: pictures of one size in a Matroska file with checksums.
 
-Each picture has a cluster of its own. Pictures are coded losslessly with FFV1 (RFC 9043), or with
+Each picture has its own cluster. Pictures are coded losslessly with FFV1 (RFC 9043), or with
 VP9 for viewing. The reader indexes the complete pictures, then decodes requested ones in order.
 """
 
@@ -137,7 +137,7 @@ MOST_MS_AHEAD = 3_600_000
 """Largest timestamp step in ms; later clock jumps are clamped. The log has the true times."""
 _MS = Fraction(1, 1000)
 _MUXER = {
-    # Each packet is written as a cluster of its own with a CRC-32, so a truncated file loses only
+    # Each packet is written as a separate cluster with a CRC-32, so a truncated file loses only
     # the data after the cut. FFmpeg writes a cluster when the next one begins, so one picture is
     # always pending.
     "flush_packets": "1",

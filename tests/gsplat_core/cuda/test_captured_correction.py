@@ -1,4 +1,4 @@
-"""A scene that a frame's depth corrects in one launch, beside the same launch by launch."""
+"""Depth correction of a scene in one graph launch, compared with separate launches."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> N
     s.means[:, :2] = 0.1 * torch.randn(count, 2, generator=g)
     s.means[:, 2] = 2 + torch.randint(0, 40, (count,), generator=g) * 2.0**-22
     s.log_scales[:] = 3.0  # over the whole tile, so that no pixel is near the cut-off of 1/255
-    if far:  # beside this one, the depths of the others fall into one bucket
+    if far:  # relative to this one, the depths of the others fall into one bucket
         s.means[-1] = torch.tensor([0.0, 0.0, 1e8])
         s.log_scales[-1] = math.log(1e9)
     s.logit_opacities[:] = -4.6

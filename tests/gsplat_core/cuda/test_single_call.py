@@ -1,4 +1,4 @@
-"""`rasterization` in one native call per pass beside the chain of operations: the same pictures, gradients and meta."""
+"""`rasterization` in one native call per pass has the pictures, gradients and meta of the chain of operations."""
 
 from __future__ import annotations
 
@@ -176,7 +176,10 @@ def test_the_tile_size_and_subclasses_are_left_to_the_chain(make_scene, calls):
 def test_other_constants_are_left_to_the_chain(make_scene, calls, packed):
     scene = make_scene(60)
     scene.opacities[::2] = 1.0
-    scene.means[0], scene.scales[0] = torch.tensor([0.1, 0.2, 2.0]), 1.0  # before all others, and large beside the blur
+    scene.means[0], scene.scales[0] = (
+        torch.tensor([0.1, 0.2, 2.0]),
+        1.0,
+    )  # before all others, and large compared with the blur
     options = {"packed": packed, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
     leaves, shape = inputs(scene), {"width": scene.width, "height": scene.height, "sh_degree": 3}
     alphas = {}

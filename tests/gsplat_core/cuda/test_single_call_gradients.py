@@ -1,4 +1,4 @@
-"""Gradients of `rasterization` in one native call beside those of the chain: of every input, through `meta`, and asked for in part."""
+"""Gradients of `rasterization` in one native call against those of the chain: all inputs, `meta`, and subsets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A basis field that forgets its past in place, beside one that keeps everything."""
+"""A basis field that discards its past in place, compared with one that keeps everything."""
 
 from __future__ import annotations
 
@@ -100,7 +100,9 @@ def test_no_tensor_moves_and_centres_stay_exact_in_a_stream_of_ten_thousand_colu
     for frame in range(10_000):
         time_s = frame * SPACING_S
         field.cover(time_s, newest)
-        field.adam_step(time_s, torch.zeros(3, 13), RATES)  # nobody is trained: every centre is where it was laid out
+        field.adam_step(
+            time_s, torch.zeros(3, 13), RATES
+        )  # no Gaussian is trained: every centre is where it was laid out
         newest = time_s
     assert addresses(field) == at
     assert torch.equal(field.columns.in_order(field.centers.data)[0], torch.arange(float(field.bumps)))

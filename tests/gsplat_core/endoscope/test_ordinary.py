@@ -1,4 +1,4 @@
-"""Ordinary pictures are told from others by a few numbers, and nothing that a closer look would find passes as ordinary."""
+"""Fast detection of ordinary pictures by a few numbers, without passing any picture that the full check rejects."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def _changed(gaussians: Gaussians, name: str, time_s: float) -> Gaussians:
 
 
 def _shares(of_world: tuple[str, ...], of_model: tuple[str, ...]) -> PartShares | None:
-    """A world in which some tensors change, and a model that changes some of its own in the same way."""
+    """Scene in which some tensors change, and a model that changes some of its tensors in the same way."""
 
     def at(names: tuple[str, ...], time_s: float) -> Gaussians:
         changed = _scene()

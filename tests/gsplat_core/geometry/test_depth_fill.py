@@ -63,7 +63,7 @@ def test_it_does_not_run_away_from_what_is_known():
 
 
 def test_one_known_cell_is_believed_by_its_share_of_the_window():
-    """In the middle of a window of 2 cells it has 1 / (2 pi 2²) = 0.0398 of the weight, twice the half-confidence weight."""
+    """The middle of a window of 2 cells weighs 1 / (2 pi 2²) = 0.0398, twice the weight of half confidence."""
     values, weight = np.zeros((21, 21), np.float32), np.zeros((21, 21), np.float32)
     values[10, 10], weight[10, 10] = 0.6, 1.0
     share = 1 / (2 * np.pi * 4)

@@ -1,4 +1,4 @@
-"""A focal length is told by a scope that turns around a scene with relief, and said to be unknown by one that only slides along it."""
+"""Focal length is estimated if the scope turns around a scene with relief, and unknown if it only slides."""
 
 from __future__ import annotations
 

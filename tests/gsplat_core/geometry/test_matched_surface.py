@@ -1,4 +1,4 @@
-"""Matched depth as a surface: noise goes, planes and edges stay, and what is unknown or beside tissue tells nothing."""
+"""Matched depth as a surface: noise is removed, planes and edges stay, and pixels without tissue have no influence."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def test_a_step_that_nothing_holds_back_goes_down_the_slope(with_prior):
     step = _step(far, 1.0, 1e-9, way)
     begin, end = _cost(far, 1.0, way), _cost(step, 1.0, way)
     assert end < begin
-    # The quadratic model of nearly quadratic costs: a second step gains next to nothing beside the first.
+    # The quadratic model of nearly quadratic costs: a second step gains almost nothing over the first.
     again = _cost(_step(step, 1.0, 1e-9, way), 1.0, way)
     assert end - again < 0.05 * (begin - end)
 

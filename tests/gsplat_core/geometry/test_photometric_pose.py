@@ -50,7 +50,7 @@ def seen(scene: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def off_px(scene: Gaussians, camera: Camera) -> float:
-    """Return the median pixel offset of the Gaussians from their places in `CAMERA`. A wall hardly separates pan from shift."""
+    """Return the median pixel offset of the Gaussians from their places in `CAMERA`."""
     return float((seen(scene, camera) - seen(scene, CAMERA)).norm(dim=1).median())
 
 

@@ -1,4 +1,4 @@
-"""Breathing is taken from a trajectory only where the scope's own way can be told from it."""
+"""Breathing is taken from a trajectory only if it can be separated from the scope's own motion."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_other_frequencies_stay_where_they_are():
 
 
 def test_a_way_that_swings_nearly_as_fast_shows_on_both_sides():
-    """A slower way alone raises the side below the breathing's frequency: breathing is still told."""
+    """Slow scope motion raises only the side below the breathing frequency, so breathing is still separable."""
     way, breathing = sways(0.27), (0.33, 0.03, 0)
     told, mistaken = is_told(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, (0.33,))
     assert told and mistaken < 0.005

@@ -1,4 +1,4 @@
-"""Files and folders appear whole, under names that nobody can plant a link at, or not at all."""
+"""Files and folders appear complete or not at all, under temporary names that cannot be predicted for a link attack."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ CASES = [
     ("texture", 12, 150, -5, 128),
     ("texture", 15, 66, -130, 256),
     ("texture", 70, 65, 0, 32),  # more rows than one band, more columns than one block
-    ("texture", 20, 30, 300, 16),  # all of it beside the right picture
+    ("texture", 20, 30, 300, 16),  # all of it outside the right picture
     ("noise", 40, 50, -8, 32),
     ("flat", 30, 45, -4, 16),
     ("black", 13, 20, 0, 16),

@@ -45,7 +45,7 @@ def plane_depth(camera: Camera, tilt_deg: float, distance: float = 40.0) -> torc
 
 
 def along_one_ray(gaussians: Gaussians, camera: Camera, column: int, row: int) -> tuple[float, float, float]:
-    """Expected and median depth and spread at a pixel, splat by splat in float64, with a projection of its own."""
+    """Return expected depth, median depth and spread at a pixel, splat by splat in float64."""
     g = gaussians.to(dtype=torch.float64)
     covariances, _ = reference.quat_scale_to_covar_preci(g.quats, g.scales, compute_preci=False)
     pixel = np.array([column + 0.5, row + 0.5])

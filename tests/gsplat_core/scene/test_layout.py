@@ -46,7 +46,7 @@ def test_the_hexplane_head_has_log_scales_before_the_rotation():
 
 
 def test_kernels_spell_no_column_of_the_layout_themselves():
-    """Sources that move raw rows include the header; nobody declares the numbers a second time."""
+    """Sources that move raw rows include the header and do not declare the numbers again."""
     native = Path(gsplat_core.__file__).parent
     for path in [*native.rglob("*.h"), *native.rglob("*.cu"), *native.rglob("*.cuh"), *native.rglob("*.cpp")]:
         if path != HEADER:

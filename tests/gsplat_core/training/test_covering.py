@@ -1,4 +1,4 @@
-"""New Gaussians join where a scene covers nothing: at once, or with the next look where they are made beside training."""
+"""New Gaussians for uncovered tissue: added at once, or with the next frame if another thread creates them."""
 
 from __future__ import annotations
 

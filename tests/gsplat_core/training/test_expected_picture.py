@@ -81,7 +81,7 @@ def test_without_a_motion_it_begins_anew_and_keeps_what_it_learned() -> None:
 
 
 def test_where_one_of_two_motions_comes_their_mean_is_learned_to_be_expected() -> None:
-    """Nobody knows which: the mean of both pictures is nearer to what comes than either of them."""
+    """The continuation is ambiguous: the mean of both pictures is closer to the next frame than either of them."""
     expected, chance, errors = ExpectedPicture(), np.random.default_rng(0), []
     ahead, back = STILL + np.float32([3, 0]), STILL - np.float32([3, 0])
     for _ in range(40):

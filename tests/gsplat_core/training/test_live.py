@@ -1,4 +1,4 @@
-"""Training beside a live stream: repeatable by its numbers of steps, steps only on what it says, another scene at any time."""
+"""Training during a live stream: repeatable for given step counts, steps only on given frames, reset at any time."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def test_they_are_found_place_by_place() -> None:
 
 
 def test_whole_is_the_least_squares_fit_of_the_weighted_sums() -> None:
-    """Against `lstsq` over all pixels, earlier ones weighted less, with the pull to the first shares as rows of its own."""
+    """Compare with `lstsq` over all pixels: earlier pixels weigh less, and the pull to the first shares adds rows."""
     shares, rows, right = LocalShares(SETTINGS), [], []
     weight = np.random.default_rng(9).uniform(0, 1, (20, 30)).astype(np.float32)
     for seed, factor in enumerate((SETTINGS.decay, 1.0)):

@@ -41,7 +41,7 @@ def test_a_periodic_motion_is_forecast(period: float, frames: int) -> None:
 
 
 def test_how_unlike_two_moments_are_is_summed_over_what_came_before() -> None:
-    """Two moments whose last motion is the same are told apart by the motions before it."""
+    """Two moments with the same last motion are distinguished by the motions before it."""
     up, down, same = (np.full((8, 8, 2), value, np.float32) for value in (1.0, -1.0, 0.25))
     rest = [np.zeros((8, 8, 2), np.float32)] * 8
     moments = SimilarMoments()

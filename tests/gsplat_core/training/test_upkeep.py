@@ -75,7 +75,7 @@ def test_only_what_the_picture_shows_falls_back_to_usual_values(make_frame, came
     shown = inside & (pixels[:, 0] < 24)
     assert 50 < int(shown.sum()) < 250
     colours = scene.sh.clone()
-    step._adam.second_moments["logit_opacities"].fill_(1.0)  # nobody leaves
+    step._adam.second_moments["logit_opacities"].fill_(1.0)  # no Gaussian is removed
     round_of(step, observation, camera, Upkeep(camera, with_room(scene.count)))
     assert bool((scene.logit_opacities[shown] < 4).all()) and bool((scene.logit_opacities[~shown] == 4).all())
     assert bool((scene.sh[shown].abs() <= colours[shown].abs()).all()) and torch.equal(
@@ -245,7 +245,7 @@ def test_depths_come_back_to_a_surface_that_keeps_its_slope_and_its_picture(make
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
     step, observation = trained(make_frame, camera, mask=mask)
-    step._adam.second_moments["logit_opacities"].fill_(1.0)  # nobody leaves
+    step._adam.second_moments["logit_opacities"].fill_(1.0)  # no Gaussian is removed
     pixels, inside = pixels_of(step.at(observation.time_s).means, camera)
     shown = inside & (pixels[:, 0] < 24)
     random = torch.Generator().manual_seed(3)

@@ -1,4 +1,4 @@
-"""A moving scope whose poses nobody has given, run as a user runs it."""
+"""A moving scope without given poses, run as a user runs it."""
 
 from __future__ import annotations
 

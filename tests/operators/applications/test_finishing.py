@@ -15,7 +15,7 @@ from operators.sources.source import SourceState
 
 
 class Scripted:
-    """Gives what it was told to, None where no frame came in time; its state is that after the last read."""
+    """Source with prepared results; None stands for a timeout. Its state is that after the last read."""
 
     def __init__(self, given, digest="d"):
         self.given, self.calls = given, []

@@ -69,7 +69,7 @@ def eventful(frame: Frame) -> Frame:
 
 
 def of_two_eyes(frame: Frame) -> Frame:
-    """Nobody has measured depth; a cut, and at the end another size."""
+    """Return the frame without measured depth, with a cut at frame 6 and a smaller size from frame 11 on."""
     frame = frame.with_fields(depth=None, depth_origin=None, new_scene="cut" if frame.seq == 6 else None)
     if frame.seq < 11:
         return frame

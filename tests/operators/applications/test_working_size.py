@@ -109,7 +109,7 @@ def test_where_nothing_fits_the_smallest_size_is_taken_and_the_sentence_says_tha
 
 
 def test_times_that_contradict_each_other_end_with_a_size_that_was_measured_to_fit():
-    """Beside other load a smaller picture may take longer."""
+    """Under other load a smaller picture may take longer."""
     times = iter([0.040, 0.060, 0.020, 0.035])
     asked = []
 

@@ -26,7 +26,7 @@ def test_percentiles_are_at_most_one_bucket_above(durations):
 
 
 def test_a_share_of_the_durations_is_never_one_too_many():
-    # Up to 63 every duration has a bucket of its own; in floats 0.07 * 100 and 0.55 * 20 are above 7 and 11.
+    # Up to 63 every duration has its own bucket; in floats 0.07 * 100 and 0.55 * 20 are above 7 and 11.
     for count in (20, 25, 50):
         histogram = Histogram()
         for duration in range(1, count + 1):

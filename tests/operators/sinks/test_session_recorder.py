@@ -1,4 +1,4 @@
-"""Recording beside a graph: nobody waits for the disk, what is lost is counted and stated in the recording, a full disk ends it with a sentence."""
+"""Recording next to a graph: the graph never waits for the disk, losses are counted, a full disk ends the recording."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def test_a_disk_that_fails_ends_the_recording_with_one_sentence(tmp_path, monkey
 
 @pytest.mark.slow
 def test_a_file_that_may_not_grow_any_more_ends_the_recording(tmp_path):
-    """A real limit of the system, in a process of its own."""
+    """Apply a real system limit in a separate process."""
     program = f"""
 import resource, signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

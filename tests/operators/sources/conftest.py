@@ -17,7 +17,7 @@ _HAS_SERVER = "import gi; gi.require_version('GstRtspServer', '1.0'); gi.require
 
 
 def a_free_port(kind: int = socket.SOCK_STREAM) -> int:
-    """A port of this machine that nobody listens on."""
+    """Return a local port without a listener."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -25,12 +25,12 @@ def a_free_port(kind: int = socket.SOCK_STREAM) -> int:
 
 @pytest.fixture
 def free_port():
-    """Ports of this machine that nobody listens on."""
+    """Return local ports without a listener."""
     return a_free_port
 
 
 class RtspServer:
-    """GStreamer's RTSP server in a process of its own, which may be killed and started again on the same port."""
+    """GStreamer's RTSP server in a child process, which may be killed and restarted on the same port."""
 
     def __init__(self, python: str) -> None:
         self.python, self.port = python, a_free_port()

@@ -20,7 +20,7 @@ class Sender:
         self.frame, self.order, self.now_ns = frame, FrameOrder(), 1_000 * MS
 
     def send(self, seq, pts_ms, *, after_ms=40.0, picture=None):
-        """Pass a frame through the order check and return (seq, pts in ms), or None if it is held back."""
+        """Pass a frame to the order check and return (seq, pts in ms), or None if it is dropped."""
         self.now_ns += round(after_ms * MS)
         shown = self.frame(seq if picture is None else picture)
         out = self.order.take(self.frame(seq, pts_ns=round(pts_ms * MS), image=shown.image), self.now_ns)

@@ -52,7 +52,7 @@ class Writer:
 
 @pytest.fixture
 def written():
-    """Writes to a pipe from a thread, so that a full one blocks nobody."""
+    """Return a function that writes to a pipe in a thread, so that a full pipe does not block the test."""
     threads = []
 
     def begin(path, *parts):

@@ -1,4 +1,4 @@
-"""A source in a process of its own: frames, crashes, hangs, endings, nothing left behind."""
+"""A source in a child process: frames, crashes, hangs, endings, clean-up."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def test_packed_pictures_keep_their_values(name, rng):
     picture = RawFormat(name, WIDTH, HEIGHT).picture(values.tobytes())
     order = {"bgr24": [2, 1, 0], "bgra": [2, 1, 0], "gray": [0, 0, 0]}.get(name, [0, 1, 2])
     np.testing.assert_array_equal(picture, values[..., order])
-    picture[:] = 0  # in memory of its own
+    picture[:] = 0  # a separate copy
 
 
 @pytest.mark.parametrize(

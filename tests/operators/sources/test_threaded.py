@@ -1,4 +1,4 @@
-"""A source in a thread of its own: order, errors, waiting, closing, states."""
+"""A source in a separate thread: order, errors, waiting, closing, states."""
 
 from __future__ import annotations
 

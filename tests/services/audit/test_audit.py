@@ -1,4 +1,4 @@
-"""The audit log: what was done to it is found, and a crash is told apart from it."""
+"""The audit log detects tampering and distinguishes it from a crash."""
 
 from __future__ import annotations
 

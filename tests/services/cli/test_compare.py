@@ -1,4 +1,4 @@
-"""`intrasplat compare`: a model beside a mesh of its own surface, in every format, and what is refused."""
+"""`intrasplat compare` with a mesh of the model's own surface in every format, and refused inputs."""
 
 from __future__ import annotations
 

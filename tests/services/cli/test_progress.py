@@ -1,4 +1,4 @@
-"""Progress: plain lines when nobody watches, none when JSON is asked for; stdout stays clean."""
+"""Progress output: plain lines without a terminal, none with JSON; stdout stays clean."""
 
 from __future__ import annotations
 

@@ -262,7 +262,7 @@ HANDSHAKE = (
 
 
 def test_a_handshake_that_cannot_be_taken_is_answered_and_closed(served):
-    """Refusal by the HTTP parser, the WebSocket parser or the application leaves no connection open without an answer."""
+    """Refusal by the HTTP parser, WebSocket parser or application leaves no connection open without an answer."""
     _, bound, port, _ = served()
     line = b"X-Long: " + 20_000 * b"a" + b"\r\n"
     lines = b"".join(b"X-%d: a\r\n" % number for number in range(300))

@@ -120,7 +120,7 @@ DELETIONS = [
 @pytest.mark.parametrize(("what", "named", "left"), DELETIONS, ids=[what[0] for what, _, _ in DELETIONS])
 def test_nothing_is_deleted_unasked(ctl, service, tmp_path, monkeypatch, what, named, left):
     uploaded(service, tmp_path)
-    code, out, err = ctl("delete", *what)  # nobody can be asked
+    code, out, err = ctl("delete", *what)  # no terminal to ask on
     assert code == BAD_INPUT and "--yes" in err and named in err and left(service)
     monkeypatch.setattr("sys.stdin", Terminal("n\n"))
     code, out, err = ctl("delete", *what)

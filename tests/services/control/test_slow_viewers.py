@@ -84,7 +84,7 @@ def test_a_viewer_that_takes_nothing_is_dropped_and_others_go_on(served, path, m
             received = len(healthy.recv(1 << 20))
             assert received
             taken += received
-        # The system cuts the connection off; nobody has to read what waits in it.
+        # The system cuts the connection off; the client need not read the queued data.
         until(lambda: len(server.server_state.connections) == 1)
     until(lambda: display.open == 0)
 

@@ -1,4 +1,4 @@
-"""Unknown parameters, slow uploads beside others, versions that are deleted while they are checked, and a log of one format."""
+"""Unknown parameters, concurrent slow uploads, versions deleted during their check, and one log format."""
 
 from __future__ import annotations
 

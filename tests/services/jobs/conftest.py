@@ -1,4 +1,4 @@
-"""Stores of jobs on either database, a small recording, and a runner that does as it is told."""
+"""Job stores on either database, a small recording, and a runner that the test controls."""
 
 from __future__ import annotations
 

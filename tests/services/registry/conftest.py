@@ -52,7 +52,7 @@ def sqlite_registry(tmp_path: Path) -> Iterator[ModelRegistry]:
 
 @pytest.fixture(scope="session")
 def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """A server that speaks S3, in a process of its own: the options of a registry that keeps its files there."""
+    """Start an S3 server in a child process and return the registry options that use it."""
     pytest.importorskip("moto", reason="moto is not installed (extra `dev`)")
     pytest.importorskip("s3fs", reason="s3fs is not installed (extra `s3`)")
     log = tmp_path_factory.mktemp("s3") / "log"

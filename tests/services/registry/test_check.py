@@ -29,7 +29,7 @@ IN_A_SECOND = RegistryLimits(check_passed_s=1.0)
 
 @pytest.fixture
 def checked(monkeypatch, capsys):
-    """The verdicts of the program, in this process and so without limits on it: its start alone takes two seconds, and has tests of its own."""
+    """Return the check program's verdicts in this process, without resource limits. Its start takes two seconds."""
     monkeypatch.setattr(check, "_limit_resources", lambda options: None)
 
     def verdicts(folder, *options):

@@ -1,4 +1,4 @@
-"""Several threads and processes at one registry: one wins, the others are told, and numbers are given once."""
+"""Concurrent threads and processes at one registry: one wins, the others get a conflict, and numbers are unique."""
 
 import multiprocessing
 import threading
@@ -82,7 +82,7 @@ def test_checks_wait_for_each_other(tmp_path, files):
 
 @pytest.mark.slow
 def test_readers_always_see_one_active_version(registry, files):
-    """Activations and rollbacks go on beside them."""
+    """Activations and rollbacks run concurrently with the readers."""
     for seed in range(2):
         add_ready(registry, files, seed)
     registry.activate("liver", 1, None, "admin")

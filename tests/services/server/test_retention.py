@@ -34,7 +34,7 @@ class FakeStore:
 
 
 class FakeEvents:
-    """Notes what it is told."""
+    """Audit log that records its events in memory."""
 
     def __init__(self):
         self.told = []

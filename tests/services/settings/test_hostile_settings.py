@@ -1,4 +1,4 @@
-"""Settings files that nobody meant: refused in one sentence, without a hang and without a conversion that nobody asked for."""
+"""Malformed settings files are refused in one sentence, without a hang and without implicit conversion."""
 
 from __future__ import annotations
 

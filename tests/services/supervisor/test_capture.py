@@ -23,7 +23,7 @@ from services.supervisor.specs import SourceSpec
 
 
 class FakeWorker:
-    """Stops once it was told so."""
+    """Worker that records reported states and stops on request."""
 
     def __init__(self):
         self.stop, self.said = threading.Event(), []
@@ -90,7 +90,7 @@ os._exit(0)  # without waiting for the timer
 """.replace("{STARTS}", "('subprocess.Popen', 'os.fork', 'os.forkpty', 'os.posix_spawn', 'os.exec', 'os.system')")
 """Captures until a frame comes and prints the number of frames and the calls that started a process.
 
-It runs in an interpreter of its own: other tests of this one may start processes meanwhile.
+It runs in a separate interpreter: other tests of this one may start processes meanwhile.
 """
 
 
@@ -108,7 +108,7 @@ def test_no_source_is_read_in_a_process_of_its_own(kind, video_url, tmp_path):
 
 
 def test_the_options_of_every_scheme_say_so(monkeypatch):
-    """Sources that block, such as cameras, have a process of their own unless they are told otherwise."""
+    """Blocking sources such as cameras run in a child process unless configured otherwise."""
     opened = []
 
     def opens(rest, options):

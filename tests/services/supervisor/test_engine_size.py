@@ -1,4 +1,4 @@
-"""An engine on a CPU works at the size that the machine keeps up with beside viewers, and measures it once."""
+"""An engine on a CPU measures once, and then keeps, the size that the machine sustains while serving viewers."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def test_an_engine_gets_its_gpu_alone(runtime):
 
 
 class Identity:
-    """A process that ends when it is told to by one of some signals."""
+    """Process identity that records signals and ends on some of them."""
 
     pid = 7
 

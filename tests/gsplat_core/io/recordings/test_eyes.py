@@ -1,4 +1,4 @@
-"""Files of two eyes beside each other are read as a pair."""
+"""Neighbouring files of two eyes are read as a stereo pair."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`poses.npy` beside a recording: what is written is read back, and what is none is refused."""
+"""`poses.npy` next to a recording: written poses are read back, and invalid files are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks, depth and poses beside the images: what is accepted, and what each mistake is called."""
+"""Masks, depth and poses next to the images: accepted layouts, and the message for each mistake."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Video files and what lies beside them."""
+"""Video files and their sidecar files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Earlier sessions give way when the bounds of a recording are those of all recordings beside it."""
+"""Earlier sessions are deleted if a recording's limits apply to all recordings of the folder."""
 
 from __future__ import annotations
 
