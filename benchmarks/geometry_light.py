@@ -1,4 +1,6 @@
-"""Compare depth from the scope's own light with planes, and measure its cost: benchmarks/geometry_light.py [--pictures DIR]
+"""Compare depth from the scope's own light with planes, and measure its cost.
+
+Usage: python benchmarks/geometry_light.py [--pictures DIR]
 
 A line of JSON for each recording. `error` is the root mean square after one factor per frame, in shares of the median depth. `level` and `plane` are those of the level
 plane and of the best-fit plane (`gsplat_core.evaluation.depth`). `believed` is the share of the pixels with a confidence of at least 0.5. `doubted` is the share of the

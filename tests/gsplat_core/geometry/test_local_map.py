@@ -27,7 +27,7 @@ def known(places):
 def test_forty_key_frames_are_kept_and_the_one_nearest_to_another_leaves_with_its_points():
     made = known([[0.0, 0, 50 + n] for n in range(41)])
     at = [10.0 * n for n in range(41)]
-    at[20] = 192.0  # 2 px from another; the first one and the newest are nearer to each other still, but stay
+    at[20] = 192.0  # 2 units from another; the first one and the newest are nearer to each other still, but stay
     at[39], at[40] = 371.0, 372.0
     for n, x in enumerate(at[:40]):
         made.add_key(key(x, [n]))
