@@ -120,13 +120,13 @@ class RunRecording:
             return None
         recorder = self.recorder
 
-        def told(event: ScheduleEvent) -> None:
+        def record_event(event: ScheduleEvent) -> None:
             if event.frame is not None:
                 recorder.depth(event.frame)
             else:
                 recorder.line(_line(event))
 
-        return told
+        return record_event
 
     def made_by(self, make: Callable[[], LiveReconstructor]) -> Callable[[], LiveReconstructor]:
         """Return a factory that calls `make` and records the settings of the new reconstructor."""

@@ -114,8 +114,8 @@ class LockedEdge(Edge):
     def __init__(self, name: str, capacity: int, policy: QueuePolicy, lock: Any) -> None:
         super().__init__(name, capacity, policy)
         self._lock = lock
-        self.wake_producer: Callable[[], None] = _nobody
-        self.wake_consumer: Callable[[], None] = _nobody
+        self.wake_producer: Callable[[], None] = _do_nothing
+        self.wake_consumer: Callable[[], None] = _do_nothing
 
     def push(self, message: Message) -> None:
         """See `Edge.push`."""
@@ -166,5 +166,5 @@ class CarriedEdge(LockedEdge):
         return message
 
 
-def _nobody() -> None:
+def _do_nothing() -> None:
     """Placeholder until the scheduler sets the wake functions."""

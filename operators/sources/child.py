@@ -64,11 +64,11 @@ class Served:
         """
         try:
             while True:
-                told = parsed(self._connection.recv_bytes(1 << 12))
+                received = parsed(self._connection.recv_bytes(1 << 12))
                 with self._changed:
-                    if told["kind"] == "free":
-                        self._free.append(told["slot"])
-                    self._wanted = self._wanted or told["kind"] == "open"
+                    if received["kind"] == "free":
+                        self._free.append(received["slot"])
+                    self._wanted = self._wanted or received["kind"] == "open"
                     self._changed.notify_all()
         except (EOFError, OSError):
             self._let_go()

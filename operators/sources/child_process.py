@@ -94,13 +94,13 @@ class ChildProcess:
         try:
             if not self.connection.poll(timeout_s):
                 return None
-            told = parsed(self.connection.recv_bytes(MOST_BYTES))
+            received = parsed(self.connection.recv_bytes(MOST_BYTES))
         except (EOFError, OSError) as error:
             raise ChildLost(self._how_it_ended()) from error
         except BadHeader as error:
             raise ChildLost(f"it says what makes no sense: {error}") from error
         self.heard_s = time.monotonic()
-        return told
+        return received
 
     def end(self) -> None:
         """Close the connection, wait for the process to exit, kill it if necessary, and free its

@@ -93,19 +93,19 @@ class ProcessSource(LiveSource):
         """State of the source. The state reported by the process applies while the process
         responds.
         """
-        state, told, child = super().state, self._child_state, self._child
+        state, reported, child = super().state, self._child_state, self._child
         if state is not SourceState.LIVE or self._ready:
             return state
         if child is not None and time.monotonic() - child.heard_s > STALLED_AFTER_S:
             return SourceState.STALLED
-        return told[0] if told is not None and told[0] is not SourceState.ENDED else state
+        return reported[0] if reported is not None and reported[0] is not SourceState.ENDED else state
 
     @property
     def state_sentence(self) -> str:
         """See `LiveSource`."""
-        told, state = self._child_state, self.state
-        if told is not None and state is told[0] and told[1]:
-            return told[1]
+        reported, state = self._child_state, self.state
+        if reported is not None and state is reported[0] and reported[1]:
+            return reported[1]
         if state is SourceState.STALLED:
             return f"the process that reads {self.description.name} says nothing"
         return super().state_sentence
@@ -169,45 +169,45 @@ class ProcessSource(LiveSource):
         child.say("open")
         last_s = time.monotonic()
         while not self.wait(0):
-            told = child.hear(LOOK_S)
-            if told is None:
+            message = child.hear(LOOK_S)
+            if message is None:
                 if time.monotonic() - child.heard_s > self._hung_after_s:
                     raise ChildLost(f"it has said nothing for {self._hung_after_s:g} s")
                 continue
-            if told["kind"] == "frame":
+            if message["kind"] == "frame":
                 last_s = child.heard_s
-                yield self._frame(child, told)
-            elif told["kind"] == "ended":
+                yield self._frame(child, message)
+            elif message["kind"] == "ended":
                 return
             else:
-                self._note(told)
+                self._note(message)
                 stalls = self._child_state is not None and self._child_state[0] is SourceState.STALLED
                 if stalls and child.heard_s - last_s > self._stuck_after_s:
                     raise ChildLost(f"it has given no frame for {self._stuck_after_s:g} s")
 
-    def _frame(self, child: ChildProcess, told: dict[str, Any]) -> Frame:
+    def _frame(self, child: ChildProcess, message: dict[str, Any]) -> Frame:
         try:
-            frame = frame_from(told, child.frames.read(told.get("planes")))
+            frame = frame_from(message, child.frames.read(message.get("planes")))
         except (BadHeader, TypeError, ValueError) as error:
             raise ChildLost(f"its frame cannot be read: {error}") from error
-        child.say("free", slot=told.get("slot"))
+        child.say("free", slot=message.get("slot"))
         self._child_state = None  # the last reported state is older than this frame
         return frame
 
-    def _note(self, told: dict[str, Any]) -> None:
+    def _note(self, message: dict[str, Any]) -> None:
         """Process a message other than a frame."""
-        kind = told["kind"]
+        kind = message["kind"]
         if kind == "state":
             try:
-                self._child_state = SourceState(told.get("state")), str(told.get("sentence", ""))
+                self._child_state = SourceState(message.get("state")), str(message.get("sentence", ""))
             except ValueError as error:
-                raise ChildLost(f"its state is {told.get('state')!r:.40}") from error
-            self._child_counts = finite_counts(told.get("counts"))
+                raise ChildLost(f"its state is {message.get('state')!r:.40}") from error
+            self._child_counts = finite_counts(message.get("counts"))
         elif kind == "log":
-            level = told.get("level")
-            log.log(level if isinstance(level, int) else logging.INFO, "%s", told.get("text"))
+            level = message.get("level")
+            log.log(level if isinstance(level, int) else logging.INFO, "%s", message.get("text"))
         elif kind in ("refused", "failed"):
-            raise ChildLost(str(told.get("error")))
+            raise ChildLost(str(message.get("error")))
 
     def _start(self) -> SourceDescription:
         """Start a process and wait until it has opened its source.
@@ -228,20 +228,20 @@ class ProcessSource(LiveSource):
     def _described(self, child: ChildProcess) -> SourceDescription:
         until_s = time.monotonic() + self._open_timeout_s
         while not self.wait(0):
-            told = child.hear(LOOK_S)
-            if told is None:
+            message = child.hear(LOOK_S)
+            if message is None:
                 if time.monotonic() > until_s:
                     raise ChildLost(f"it has not opened the source within {self._open_timeout_s:g} s")
-            elif told["kind"] == "described":
-                self._drops = told.get("drops") is not False
+            elif message["kind"] == "described":
+                self._drops = message.get("drops") is not False
                 try:
-                    return description_from(told.get("description", {}))
+                    return description_from(message.get("description", {}))
                 except BadHeader as error:
                     raise ChildLost(str(error)) from error
-            elif told["kind"] == "refused":
-                raise SourceUnavailable(str(told.get("error")))
+            elif message["kind"] == "refused":
+                raise SourceUnavailable(str(message.get("error")))
             else:
-                self._note(told)
+                self._note(message)
         raise ChildLost("it was no longer wanted")
 
     def _end(self, *, kill: bool = False) -> None:

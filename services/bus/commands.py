@@ -112,11 +112,11 @@ class CommandServer:
 
     def _answer(self, data: bytes) -> bytes:
         try:
-            told = parsed_json(data)
-            name = told.pop("command", None)
+            request = parsed_json(data)
+            name = request.pop("command", None)
             if name not in self._handlers:
                 raise CommandRefused(f"there is no command {str(name)[:60]!r}; there are {', '.join(self._handlers)}")
-            return packed_json({"ok": True, **(self._handlers[name](told) or {})})
+            return packed_json({"ok": True, **(self._handlers[name](request) or {})})
         except (UserError, BusError) as error:
             return _refusal(str(error))
         except Exception as error:  # the client gets the error, and the process continues

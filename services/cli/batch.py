@@ -96,8 +96,13 @@ def _print(summary: Summary, out: Path, as_json: bool) -> None:
     failed = [{"recording": job.recording, "reason": job.reason} for job in summary.failed]
     failed += [{"recording": name, "reason": reason} for name, reason in summary.unusable]
     if as_json:
-        told = {**summary.counts, "already": summary.already, "seconds": round(summary.seconds, 1), "failures": failed}
-        typer.echo(json.dumps(told, indent=2))
+        content = {
+            **summary.counts,
+            "already": summary.already,
+            "seconds": round(summary.seconds, 1),
+            "failures": failed,
+        }
+        typer.echo(json.dumps(content, indent=2))
         return
     for each in failed:
         typer.echo(f"failed: {printable(str(each['recording']))}: {printable(str(each['reason']))}", err=True)

@@ -371,15 +371,15 @@ def stream_row(stream: StreamView) -> dict[str, Any]:
     capture, engine = (stream.processes.get(role) or {} for role in ("capture", "engine"))
     figures = engine.get("figures")
     picture = figures.get("picture") if isinstance(figures, Mapping) else None
-    told = picture if isinstance(picture, Mapping) else {}
+    shown = picture if isinstance(picture, Mapping) else {}
     restarts = [each["restarts"] for each in (capture, engine) if isinstance(each.get("restarts"), int)]
     return {
         **stream.model_dump(include={"name", "state", "show", "source", "reason"}),
         "capture_hz": _figure(capture.get("rate_hz")),
         "shown_hz": _figure(engine.get("rate_hz")),
-        "age_ms": _figure(told.get("age_ms")),
-        "psnr_db": _figure(told.get("psnr_db")),
-        "previous_psnr_db": _figure(told.get("previous_frame_psnr_db", told.get("previous_frame_psnr"))),
+        "age_ms": _figure(shown.get("age_ms")),
+        "psnr_db": _figure(shown.get("psnr_db")),
+        "previous_psnr_db": _figure(shown.get("previous_frame_psnr_db", shown.get("previous_frame_psnr"))),
         "restarts": sum(restarts) if restarts else None,
         "displays": ", ".join(f"{count} {kind}" for kind, count in stream.viewers.items() if count),
     }

@@ -29,9 +29,9 @@ class ServiceManager:
         if not self._address:
             return
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as told:
-                told.setblocking(False)  # never block the event loop
-                told.sendto("\n".join(lines).encode(), self._address)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+                sender.setblocking(False)  # never block the event loop
+                sender.sendto("\n".join(lines).encode(), self._address)
         except OSError as error:
             log.warning("systemd was not told %s: %s", lines[0], error)
 

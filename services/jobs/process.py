@@ -78,16 +78,16 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stopped.append(True))
     stopped: list[bool] = []
-    told = PoolProcess.of_line(sys.stdin.readline(MOST_LINE))
+    settings = PoolProcess.of_line(sys.stdin.readline(MOST_LINE))
     try:
-        runner = new_runner(told.ray)
-        pool = JobPool(Database(told.database, SCHEMA), Results(Path(told.results)), runner, told.pool)
+        runner = new_runner(settings.ray)
+        pool = JobPool(Database(settings.database, SCHEMA), Results(Path(settings.results)), runner, settings.pool)
     except StoreUnavailable as error:
         logging.error("%s", error)
         return 2
 
     def is_over() -> bool:
-        return bool(stopped) or pool.idle_s > told.idle_s or bool(select.select([sys.stdin], [], [], 0)[0])
+        return bool(stopped) or pool.idle_s > settings.idle_s or bool(select.select([sys.stdin], [], [], 0)[0])
 
     pool.run(is_over)
     return 0

@@ -27,7 +27,17 @@ from services.recordings.unpack import unpack
 from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
 
 UPLOAD = "upload"
-TOLD = ("layout", "frames", "frames_damaged", "width_px", "height_px", "fps", "duration_s", "fields", "calibration")
+_REPORTED_FACTS = (
+    "layout",
+    "frames",
+    "frames_damaged",
+    "width_px",
+    "height_px",
+    "fps",
+    "duration_s",
+    "fields",
+    "calibration",
+)
 MOST_PROBLEMS = 3
 
 
@@ -89,8 +99,8 @@ def _put(options: argparse.Namespace, path: Path, limits: RecordingLimits) -> No
 def _verdict(path: Path, folder: Path) -> dict[str, Any]:
     report = validate_recording(path)
     if report.ok:
-        told = {name: report.facts[name] for name in TOLD if name in report.facts}
-        return {"stage": "ready", **told, "warnings": len(report.warnings)}
+        facts = {name: report.facts[name] for name in _REPORTED_FACTS if name in report.facts}
+        return {"stage": "ready", **facts, "warnings": len(report.warnings)}
     said = "; ".join(str(problem) for problem in report.problems[:MOST_PROBLEMS])
     more = len(report.problems) - MOST_PROBLEMS
     reason = said.replace(f"{folder}/", "") + (f"; and {more} more" if more > 0 else "")

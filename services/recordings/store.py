@@ -34,7 +34,7 @@ GONE = "its files are not on the disk; restore them from a backup, or delete the
 log = logging.getLogger(__name__)
 
 
-def _nobody(_: sa.Connection, __: str) -> bool:
+def _never_in_use(_: sa.Connection, __: str) -> bool:
     return False
 
 
@@ -52,7 +52,7 @@ class RecordingStore:
         database_url: str,
         *,
         limits: RecordingLimits = RecordingLimits(),
-        in_use: Callable[[sa.Connection, str], bool] = _nobody,
+        in_use: Callable[[sa.Connection, str], bool] = _never_in_use,
         check_program: tuple[str, ...] = PROGRAM,
     ) -> None:
         """Open the store, creating its folder.
@@ -247,19 +247,19 @@ class RecordingStore:
             ) from error
 
     def _verdict(self, row: sa.RowMapping) -> dict[str, Any]:
-        told: list[dict[str, Any]] = []
+        reports: list[dict[str, Any]] = []
         folder, limits = self._folder / row["folder"], json.dumps(asdict(self._limits))
         arguments = ["--kind", row["kind"], "--name", row["name"], "--limits", limits]
         command = [*self._program, str(folder), *arguments]
         try:
-            words = run_program(command, self._limits.check_passed_s, told.append, running=self._running)
+            words = run_program(command, self._limits.check_passed_s, reports.append, running=self._running)
         except BroughtDown as error:
             return {"stage": "rejected", "reason": str(error)}
-        if not told:
+        if not reports:
             raise CheckFailed(
                 f"the check of {row['name']} ended without a verdict: {words}; repair that and check again"
             )
-        return told[-1]
+        return reports[-1]
 
     def _after_check(self, row: sa.RowMapping, verdict: dict[str, Any]) -> RecordingRecord:
         ready = verdict.pop("stage", None) == "ready"

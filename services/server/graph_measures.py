@@ -61,12 +61,12 @@ class GraphFamilies:
         if (ages := cumulative(measures.get("ages"))) is not None:
             self._age.add_metric([stream], *ages)
         for family, name in ((self._path, "paths"), (self._operator, "operators")):
-            for label, told in _items(measures.get(name)):
-                if (found := cumulative(told)) is not None:
+            for label, value in _items(measures.get(name)):
+                if (found := cumulative(value)) is not None:
                     family.add_metric([stream, label], *found)
-        for queue, told in _items(measures.get("queues")):
-            self._queue.add_metric([stream, queue], told["queued"])
-            for reason, count in _items(told["dropped"]):
+        for queue, value in _items(measures.get("queues")):
+            self._queue.add_metric([stream, queue], value["queued"])
+            for reason, count in _items(value["dropped"]):
                 self._dropped.add_metric([stream, f"{queue}: {reason}"], count)
 
     def families(self) -> Iterable[Metric]:
@@ -104,7 +104,7 @@ class GraphFamilies:
             self._model.add_metric([stream, "live", "", ""], 1)
 
 
-def _items(told: Any) -> Iterator[tuple[str, Any]]:
+def _items(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the items of a heartbeat object; nothing if the value is no mapping."""
-    if isinstance(told, Mapping):
-        yield from told.items()
+    if isinstance(value, Mapping):
+        yield from value.items()

@@ -59,7 +59,7 @@ class CapturedSource(LiveSource):
         """
         super().__init__(waiting=WAITING, order=FrameOrder(trusted=True))
         self._folder = folder
-        self._told: tuple[SourceState, str] | None = None
+        self._reported: tuple[SourceState, str] | None = None
         self._heard_s = time.monotonic()
         about = self._described(stop_requested)
         self._scale = scale_for(about)
@@ -68,16 +68,16 @@ class CapturedSource(LiveSource):
     @property
     def state(self) -> SourceState:
         """See `FrameSource`."""
-        state, told = super().state, self._told
-        if state is SourceState.LIVE and told is not None and not self._ready:
-            return told[0]
+        state, reported = super().state, self._reported
+        if state is SourceState.LIVE and reported is not None and not self._ready:
+            return reported[0]
         return state
 
     @property
     def state_sentence(self) -> str:
         """See `LiveSource`."""
-        told = self._told
-        return told[1] if told is not None and self.state is told[0] else super().state_sentence
+        reported = self._reported
+        return reported[1] if reported is not None and self.state is reported[0] else super().state_sentence
 
     def frames(self) -> Iterator[Frame]:
         """See `LiveSource`."""
@@ -109,7 +109,7 @@ class CapturedSource(LiveSource):
                 if run is not None and header.get("run") != run:
                     self._begin_anew()
                 run = header.get("run")
-                self._told = None
+                self._reported = None
                 yield frame
         finally:
             pictures.disable_monitor()
@@ -143,14 +143,14 @@ class CapturedSource(LiveSource):
         self._heard_s = time.monotonic()
         state, reason = said.get("state"), str(said.get("reason", ""))
         if state == "live":
-            self._told = None
+            self._reported = None
         elif state == SourceState.ENDED.value:
             # reported as stalled, because a played recording may start again
-            self._told = SourceState.STALLED, reason
+            self._reported = SourceState.STALLED, reason
         elif state == SourceState.STALLED.value:
-            self._told = SourceState.STALLED, reason
+            self._reported = SourceState.STALLED, reason
         else:
-            self._told = SourceState.RECONNECTING, reason
+            self._reported = SourceState.RECONNECTING, reason
 
     def _described(self, stop_requested: Callable[[], bool]) -> SourceDescription:
         while True:

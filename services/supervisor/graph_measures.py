@@ -15,12 +15,12 @@ def graph_measures(graph: Application) -> dict[str, Any]:
     """Return path latencies, operator durations, and queue lengths and drops of a graph."""
     tracker = graph.track()
     return {
-        "paths": {name: _told(histogram) for name, histogram in tracker.paths().items()},
-        "operators": {name: _told(histogram) for name, histogram in tracker.operators().items()},
+        "paths": {name: _serialised(histogram) for name, histogram in tracker.paths().items()},
+        "operators": {name: _serialised(histogram) for name, histogram in tracker.operators().items()},
         "queues": {stats.edge: {"queued": stats.queued, "dropped": stats.dropped} for stats in graph.edge_stats()},
     }
 
 
-def _told(histogram: Histogram) -> dict[str, Any]:
+def _serialised(histogram: Histogram) -> dict[str, Any]:
     """Return a histogram in the format of `services.bus.durations.Durations`."""
     return {"counts": histogram.between(BOUNDS_NS), "sum_s": round(histogram.sum_ns * 1e-9, 6)}

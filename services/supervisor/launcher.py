@@ -93,27 +93,27 @@ class Launcher:
 
     def _answer(self, connection: socket.socket) -> dict[str, Any]:
         try:
-            told = parsed_json(connection.recv(MOST_BYTES))
+            request = parsed_json(connection.recv(MOST_BYTES))
             self._heard_s = time.monotonic()
-            command = told.get("command")
+            command = request.get("command")
             if command == "start":
-                return {"ok": True, "pid": self._start(told, connection)}
+                return {"ok": True, "pid": self._start(request, connection)}
             if command == "status":
                 self._reap()
-                return {"ok": True, "status": self._ends.get(int(told["pid"]))}
+                return {"ok": True, "status": self._ends.get(int(request["pid"]))}
             if command == "stop":
                 self.stop()
             return {"ok": command in ("stop", "ping")}
         except (BadMessage, KeyError, TypeError, ValueError, OSError) as error:
             return {"ok": False, "error": f"{type(error).__name__}: {error}"}
 
-    def _start(self, told: Mapping[str, Any], connection: socket.socket) -> int:
-        arguments = [str(argument) for argument in told["arguments"]]
-        module = str(told["module"])
+    def _start(self, request: Mapping[str, Any], connection: socket.socket) -> int:
+        arguments = [str(argument) for argument in request["arguments"]]
+        module = str(request["module"])
         if module not in FORKED:
             raise ValueError(f"{module[:60]!r} is not forked, only {', '.join(FORKED)}")
-        environment = {str(name): str(value) for name, value in dict(told["environment"]).items()}
-        output = os.open(str(told["log"]), os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        environment = {str(name): str(value) for name, value in dict(request["environment"]).items()}
+        output = os.open(str(request["log"]), os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC, 0o600)
         try:
             pid = os.fork()
             if pid == 0:

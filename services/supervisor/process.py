@@ -85,27 +85,27 @@ class Rate:
 
     def __init__(self, over_s: float = RATE_S) -> None:
         self._over_s = over_s
-        self._told: deque[tuple[float, int]] = deque()
+        self._samples: deque[tuple[float, int]] = deque()
 
     def tell(self, count: int, now_s: float) -> None:
         """Add a sample. A smaller count than before is from a new process and restarts the
         measurement."""
-        if self._told and count < self._told[-1][1]:
-            self._told.clear()
-        self._told.append((now_s, count))
-        while len(self._told) > 2 and now_s - self._told[1][0] >= self._over_s:
-            self._told.popleft()
+        if self._samples and count < self._samples[-1][1]:
+            self._samples.clear()
+        self._samples.append((now_s, count))
+        while len(self._samples) > 2 and now_s - self._samples[1][0] >= self._over_s:
+            self._samples.popleft()
 
     def clear(self) -> None:
         """Discard all samples."""
-        self._told.clear()
+        self._samples.clear()
 
     @property
     def hz(self) -> float | None:
         """Return counts per second, or None until the samples span half a second."""
-        if not self._told:
+        if not self._samples:
             return None
-        (first_s, first), (last_s, last) = self._told[0], self._told[-1]
+        (first_s, first), (last_s, last) = self._samples[0], self._samples[-1]
         return round((last - first) / (last_s - first_s), 2) if last_s - first_s >= 0.5 else None
 
 
@@ -168,8 +168,8 @@ class ManagedProcess:
     def measures(self) -> Mapping[str, Any]:
         """Return the Prometheus measures of the newest heartbeat."""
         heartbeat = self._heartbeat
-        told = None if heartbeat is None else heartbeat.get("measures")
-        return told if isinstance(told, dict) else {}
+        measures = None if heartbeat is None else heartbeat.get("measures")
+        return measures if isinstance(measures, dict) else {}
 
     def open(self) -> None:
         """Adopt the running process or start one, and keep it running."""

@@ -37,7 +37,7 @@ MOST_STREAMS = 100
 """Most streams that one key may be limited to."""
 SAVE_USED_S = 60.0
 """Minimum seconds between two writes of the last-use file."""
-_NOBODY = 64 * "0"
+_NO_DIGEST = 64 * "0"
 _SHA256 = re.compile("[0-9a-f]{64}")
 MOST_BYTES = 1 << 24
 MOST_TOKEN_BYTES = 4096
@@ -239,7 +239,7 @@ class KeyStore:
         prefix, _, rest = token.partition("_")
         key_id, _, secret = rest.partition("_")
         key = self._current().get(key_id)
-        same = hmac.compare_digest(_digest(secret), key.sha256 if key is not None else _NOBODY)
+        same = hmac.compare_digest(_digest(secret), key.sha256 if key is not None else _NO_DIGEST)
         return key if same and key is not None and prefix == PREFIX else None
 
     @property
