@@ -68,7 +68,7 @@ class Kills:
     between_s: tuple[float, float] = (0.5, 2.0)
     """Shortest and longest time between two kills."""
     batch_share: float = 0.1
-    """So many of them hit the batch itself, the others an attempt."""
+    """Share of the kills that hit the batch itself; the others hit an attempt."""
     most: int = 1_000_000
     seed: int = 0
 
@@ -132,8 +132,10 @@ def main() -> None:
     parser.add_argument("--recordings", type=int, default=200)
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--between-s", type=float, nargs=2, default=(0.5, 2.0), help="time between two kills")
-    parser.add_argument("--batch-share", type=float, default=0.1, help="so many kills hit the batch itself")
+    parser.add_argument(
+        "--between-s", type=float, nargs=2, default=(0.5, 2.0), help="shortest and longest time between two kills"
+    )
+    parser.add_argument("--batch-share", type=float, default=0.1, help="share of the kills that hit the batch itself")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="batch-") as folder:

@@ -85,7 +85,7 @@ def frames_in_pairs(frames: list[Frame]) -> Iterator[tuple[Frame | None, Frame]]
 
 
 def measure(path: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """One recording's line."""
+    """Return the JSON line of one recording."""
     recording = open_recording(path, scale=arguments.scale, max_frames=arguments.frames)
     frames, camera = list(recording), recording.camera_at(0)
     config = with_settings(ReconstructorConfig(motion_prior=arguments.prior), arguments.set)

@@ -236,9 +236,7 @@ def main() -> None:
     parser.add_argument("--rehearse", type=int, default=4)
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--places", action="store_true")
-    parser.add_argument(
-        "--clock", action="store_true", help="play at the recording's rate, with the steps that there is time for"
-    )
+    parser.add_argument("--clock", action="store_true", help="play at the recording's rate, with as many steps as fit")
     parser.add_argument("--once", action="store_true", help="play the recording once")
     parser.add_argument("--fps", type=float)
     parser.add_argument("--out", type=Path)

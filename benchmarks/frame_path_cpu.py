@@ -56,7 +56,7 @@ class FramePath:
         self.spent: dict[str, list[float]] = defaultdict(list)
 
     def take(self, frame: Frame) -> None:
-        """All that is done for a frame."""
+        """Run and time the host's work for one frame."""
         analysis, start = self._analysis, time.thread_time()
         with self._timed("out-of-body gate"):
             gated = through(analysis.gate, frame)

@@ -49,7 +49,7 @@ SHOW_AFTER, SHOW_AFTER_S = 0.6, 0.017
 
 
 def frames_of(asked: Asked) -> tuple[list[Frame], Camera]:
-    """All frames with both eyes, and with the depth that was asked for."""
+    """Return all frames with both eyes and with the requested depth."""
     recording = open_recording(asked.recording, scale=asked.scale)
     camera = recording.camera
     frames = list(islice(recording, asked.frames))
@@ -153,7 +153,7 @@ def by_clock(learning: LiveReconstructor, frame: Frame, fps: float, first: bool,
 
 
 def online(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps: int | None) -> dict[str, Any]:
-    """One run frame by frame."""
+    """Train and score one run frame by frame."""
     learning, scores, made = live(asked, eyes, camera), Scores(camera, asked.left_out), list[int]()
     for frame in frames:
         shown = (
@@ -169,7 +169,7 @@ def online(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps: 
 
 
 def offline(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps: int) -> dict[str, Any]:
-    """One run on all frames."""
+    """Train and score one run on all frames."""
     settings = ReplaySettings(recording="", out=Path(), device=asked.device, eyes=eyes)  # type: ignore[arg-type]
     config = replace(settings.reconstructor_config(camera.width_px * camera.height_px, offline=True), **asked.set)
     learning, scores = Reconstructor(config, camera, device=asked.device), Scores(camera, asked.left_out)

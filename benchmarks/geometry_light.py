@@ -40,7 +40,7 @@ def error(found: NDArray[np.float32], true: NDArray[np.float32], kept: NDArray[n
 
 
 def bare(frame: Frame) -> Frame:
-    """Without its depth."""
+    """Return the frame without its depth."""
     return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
 
 
@@ -64,7 +64,7 @@ def whole(frames: Sequence[Frame], camera: Camera) -> float | None:
 
 
 def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path | None) -> dict[str, object]:
-    """All frames of a recording in order; the estimator is not shown their depth."""
+    """Return the figures of a recording, with its frames in order; the estimator does not get their depth."""
     estimator = LightDepth()
     errors, levels, planes, believed, doubted, spent = [], [], [], [], [], []
     for frame in frames:

@@ -27,7 +27,7 @@ from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 
 
 def measured(asked: Asked) -> dict[str, Any]:
-    """One recording's figures."""
+    """Return the figures of one recording."""
     recording = render_recording(asked)
     frames = [frame.with_fields(depth=None, depth_origin=None) for frame in recording]
     began = time.process_time()

@@ -46,7 +46,7 @@ FARTHEST_MM = 110.0
 def measured(
     name: str, frames: Sequence[Frame], camera: Camera, assumed: float | None
 ) -> tuple[dict[str, Any], Trajectory]:
-    """One recording's figures. assumed: focal length in units of the longer side; None: the camera's own."""
+    """Return one recording's figures. `assumed`: focal length per longer side, or None for the camera's own."""
     began_s = time.process_time()
     focal, side_px = None, max(camera.width_px, camera.height_px)
     if assumed is None:
@@ -87,7 +87,7 @@ def measured(
 
 
 def measured_causally(name: str, frames: Sequence[Frame], camera: Camera) -> dict[str, Any]:
-    """One recording's figures, each frame placed by those before it."""
+    """Return one recording's figures, with each frame placed by the earlier ones."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     odometry, poses, spent_ms = LiveOdometry(camera, measured=False), [], []

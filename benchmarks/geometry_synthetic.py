@@ -96,9 +96,11 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--width", type=int, default=160)
     parser.add_argument("--height", type=int, default=128)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--depth", default="auto", help="as --depth of replay and reconstruct: light for one fixed eye")
+    parser.add_argument(
+        "--depth", default="auto", help="depth source as in replay and reconstruct; light needs one fixed eye"
+    )
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--work", type=Path, help="keep recordings and runs here, and take recordings from here")
+    parser.add_argument("--work", type=Path, help="folder in which recordings and runs are kept and reused")
     parser.add_argument("--depth-noise", type=float, default=0.0)
     parser.add_argument("--smoke", type=float, default=0.0)
     parser.add_argument("--exposure-changes", action="store_true")
@@ -182,7 +184,7 @@ HEADER = (
 
 
 def line(name: str, geometry: Geometry, seconds: float) -> str:
-    """One case's figures: shares of the median depth, degrees, dB, median mm, median px, seconds."""
+    """Return one case's figures: shares of the median depth, degrees, dB, median mm, median px, seconds."""
     depth, normals, tracking = geometry.depth, geometry.normals, geometry.tracking
     parts = geometry.parts
     assert depth is not None and normals is not None and tracking is not None and parts is not None

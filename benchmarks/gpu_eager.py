@@ -25,7 +25,7 @@ ASKED_MS = {"surgical50k_640x512": (0.35, 1.2), "volume1m_1080p": (0.9, 2.8)}
 
 
 def run(name: str, repetitions: int, packed: bool) -> None:
-    """All figures of one scene."""
+    """Measure all figures of one scene."""
     scene = SCENES[name]()
     scene.arguments["packed"] = packed
     width, height = scene.size_px
@@ -53,7 +53,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--repetitions", type=int, default=50)
-    parser.add_argument("--packed", action="store_true", help="as gsplat's default has it; otherwise packed=False")
+    parser.add_argument("--packed", action="store_true", help="packed=True, gsplat's default; otherwise packed=False")
     options = parser.parse_args()
     report_machine()
     for name in options.scenes:

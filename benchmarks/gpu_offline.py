@@ -115,7 +115,7 @@ def steps_within(seconds: float, frames: list[Frame], camera: Camera, settings: 
 def trained(
     frames: list[Frame], camera: Camera, settings: Settings, steps: int, device: torch.device, line: dict
 ) -> None:
-    """One `fit`, evaluated on the way; `line` says what it is."""
+    """Run and evaluate one `fit`; `line` describes it."""
     learning = Reconstructor(settings.config, camera, device=device)
     seen, held = split(frames)
     moments = {max(1, round(steps * share)) for share in MOMENTS}

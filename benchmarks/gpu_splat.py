@@ -154,7 +154,7 @@ def psnr_db(a: Tensor, b: Tensor) -> float:
 
 
 def run(name: str, repetitions: int) -> None:
-    """All figures of one scene."""
+    """Measure all figures of one scene."""
     scene = SCENES[name]()
     width, height = scene.size_px
     target = torch.rand(height, width, 4, generator=torch.Generator().manual_seed(2)).cuda()

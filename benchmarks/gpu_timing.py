@@ -42,7 +42,7 @@ class Times:
 
 
 def measure(work: Work, repetitions: int = 50, warm_up: int = 5) -> Times:
-    """All times of `work`, which is called some three times as often as `repetitions` says."""
+    """Measure all times of `work`, with about three times `repetitions` calls."""
     for _ in range(warm_up):
         work()
     kernel_ms, kernels = _on_the_gpu(work, max(3, repetitions // 5))
@@ -135,7 +135,7 @@ def gsplat() -> ModuleType | None:
 
 
 def report(work: str, **figures: Any) -> None:
-    """One JSON object on one line; times as they are in `Times`, prefixed by their name."""
+    """Print one JSON object on one line, with the fields of `Times` prefixed by their name."""
     flat: dict[str, Any] = {"work": work}
     for name, value in figures.items():
         if isinstance(value, Times):

@@ -34,7 +34,7 @@ BUMPS = 26
 
 @dataclass(frozen=True)
 class Case:
-    """One kind of field with what it is trained on."""
+    """Kind of deformation field with its training scene."""
 
     gaussians: int
     degree: int

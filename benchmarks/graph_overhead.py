@@ -35,7 +35,7 @@ class Source(Operator):
     """Counts."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """One output."""
+        """Operator with one output."""
         spec.output("out")
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
@@ -47,7 +47,7 @@ class Pass(Operator):
     """Passes on."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """One input, one output."""
+        """Operator with one input and one output."""
         spec.input("in")
         spec.output("out")
 
@@ -60,7 +60,7 @@ class Sink(Operator):
     """Takes."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """One input."""
+        """Operator with one input."""
         spec.input("in")
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
@@ -112,7 +112,7 @@ class Woken(Operator):
 
 
 class WakeApp(Application):
-    """One operator that waits for events."""
+    """Application with one operator that waits for events."""
 
     def compose(self) -> None:
         """Add it."""

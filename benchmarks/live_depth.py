@@ -58,7 +58,7 @@ class DepthErrors:
 
 
 def run(asked: Asked, recording: FileRecording, points: SparsePoints | None, late: int | None) -> dict[str, Any]:
-    """One run; late: how many frames depth comes late, None: there is none."""
+    """Measure one run. `late`: delay of the depth in frames, or None for no depth."""
     settings = LiveSettings(source="", out=Path())
     config = settings.reconstructor_config(recording.width_px * recording.height_px)
     learning = LiveReconstructor(config, recording.camera, live=settings.chosen_training)

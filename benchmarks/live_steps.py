@@ -123,7 +123,7 @@ def frames_of(path: str, arguments: argparse.Namespace) -> tuple[list[Frame], Ca
 
 
 class Run:
-    """One recording in one reconstructor, frame by frame."""
+    """Train one recording in one reconstructor, frame by frame."""
 
     def __init__(self, path: str, arguments: argparse.Namespace) -> None:
         self.arguments = arguments
@@ -240,7 +240,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+")
     parser.add_argument("--engine", choices=("live", "replay"), default="live")
-    parser.add_argument("--like", choices=("cpu", "cuda"), default="cuda", help="whose settings are taken")
+    parser.add_argument(
+        "--like", choices=("cpu", "cuda"), default="cuda", help="device whose default settings are used"
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--field", default="auto")
     parser.add_argument("--steps", type=int, default=60)
@@ -248,7 +250,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--fps", type=float)
-    parser.add_argument("--retained", type=float, default=5.0, help="seconds at the end that retention is measured on")
+    parser.add_argument(
+        "--retained", type=float, default=5.0, help="seconds at the end over which retention is measured"
+    )
     parser.add_argument("--analysed", action="store_true", help="look for tools, blur and cuts first")
     parser.add_argument("--series", action="store_true", help="add the PSNR of every frame")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")

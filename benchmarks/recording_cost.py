@@ -68,7 +68,7 @@ def by_itself(
     write: Callable[[SessionWriter, Frame], None],
     options: WriterOptions | None = None,
 ) -> None:
-    """One part of a recording, in this thread."""
+    """Measure one part of a recording in this thread."""
     with tempfile.TemporaryDirectory() as folder:
         writer = SessionWriter(Path(folder) / "session", info, options)
         begin = time.process_time()
@@ -81,7 +81,7 @@ def by_itself(
 
 
 def beside_a_graph(shown: Literal["vp9", "digest"], info: SessionInfo, frames: list[Frame], fps: float) -> None:
-    """All of it, at the stream's rate; `handed_over_us` is what the threads of the graph spend."""
+    """Measure the whole recording at the stream's rate; `handed_over_us` is the time spent by the graph's threads."""
     handed: list[float] = []
     given = [with_loss_mask(frame) for frame in frames]
     with tempfile.TemporaryDirectory() as folder:
@@ -121,7 +121,7 @@ def with_loss_mask(frame: Frame) -> Frame:
 
 
 def report(**values: object) -> None:
-    """One line of JSON."""
+    """Print one line of JSON."""
     print(json.dumps(values), flush=True)
 
 

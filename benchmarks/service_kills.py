@@ -163,12 +163,12 @@ def main() -> None:
     parser.add_argument("what", choices=["engine", "capture", "control"])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument(
-        "--every", type=float, nargs=2, default=(0.1, 4.0), help="seconds from being back to the next kill"
+        "--every", type=float, nargs=2, default=(0.1, 4.0), help="seconds between recovery and the next kill"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--source", default=SOURCE)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--options", type=json.loads, default={}, help="of the stream, as JSON")
+    parser.add_argument("--options", type=json.loads, default={}, help="stream options as JSON")
     options = parser.parse_args()
     with Server(options.source, device=options.device, options=options.options) as server:
         live_s = server.until_live()

@@ -96,7 +96,7 @@ async def memory(pid: int, found: list[float]) -> None:
 
 
 async def measured(server: Server, options: argparse.Namespace) -> dict[str, Any]:
-    """All phases."""
+    """Run all phases."""
     pids = await asyncio.to_thread(server.pids)
     await asyncio.sleep(options.settle)
     result: dict[str, Any] = {"without": await phase(server, pids, options.seconds)}
@@ -155,13 +155,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default=SOURCE)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--options", type=json.loads, default={}, help="of the stream, as JSON")
+    parser.add_argument("--options", type=json.loads, default={}, help="stream options as JSON")
     parser.add_argument("--viewers", type=int, default=50)
-    parser.add_argument("--slow", type=int, default=10, help="of them read a byte a second")
+    parser.add_argument("--slow", type=int, default=10, help="number of viewers that read one byte per second")
     parser.add_argument("--kind", choices=["raw", "shown", "both"], default="raw")
     parser.add_argument("--quality", type=int, default=75)
-    parser.add_argument("--requests", type=float, default=200.0, help="of the API in a second")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each phase")
+    parser.add_argument("--requests", type=float, default=200.0, help="API requests per second")
+    parser.add_argument("--seconds", type=float, default=20.0, help="seconds per phase")
     parser.add_argument("--settle", type=float, default=3.0)
     options = parser.parse_args()
     with Server(options.source, device=options.device, options=options.options) as server:

@@ -103,7 +103,7 @@ def served(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _window(server: Server, pids: dict[str, int], options: argparse.Namespace, engine: Watch | None = None) -> dict:
-    """One stretch of time; `engine` tells ages, and costs something itself."""
+    """Measure one stretch of time; `engine` adds ages, at some cost of its own."""
     if engine is not None:
         engine.begin()
     before, began_s, pictures = {name: cpu_s(pid) for name, pid in pids.items()}, time.monotonic(), shown_so_far(server)
@@ -139,13 +139,13 @@ def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default=SOURCE)
-    parser.add_argument("--fps", type=float, default=30.0, help="the source's")
+    parser.add_argument("--fps", type=float, default=30.0, help="frame rate of the source")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--budget-ms", type=float)
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--settle", type=float, default=3.0)
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--bare", action="store_true", help="only `live`, in this process")
+    parser.add_argument("--bare", action="store_true", help="measure only `live`, in this process")
     options = parser.parse_args()
     if options.bare:
         print(json.dumps(bare(options)))

@@ -41,7 +41,7 @@ class Shown:
 
 
 class Pictures:
-    """All pictures of the engine, in a thread."""
+    """Recorder of all pictures of the engine, in a thread."""
 
     def __init__(self, endpoint: str) -> None:
         self.seen: list[Shown] = []

@@ -17,9 +17,9 @@ class Watch:
 
     def __init__(self, endpoint: str) -> None:
         self.gaps_ms: list[float] = []
-        """Between two pictures, when they came here."""
+        """Time between two pictures by their receipt here."""
         self.sent_gaps_ms: list[float] = []
-        """Between the same two, when they came in at the capture process."""
+        """Time between the same two pictures by their arrival at the capture process."""
         self.ages_ms: list[float] = []
         self.shown_ms: list[float] = []
         """Ages when they were shown, as their headers say."""

@@ -75,7 +75,7 @@ def forward(rasterization: Callable[..., Any], scene: dict[str, Any]) -> Tensor:
 
 
 def forward_backward(rasterization: Callable[..., Any], scene: dict[str, Any], target: Tensor) -> None:
-    """One training step's rendering: L1 to a target, gradients to all five parameters."""
+    """Run one training step's rendering: L1 to a target, gradients to all five parameters."""
     leaves = {n: scene[n].detach().requires_grad_() for n in ("means", "quats", "scales", "opacities", "colors")}
     image, _, _ = rasterization(**(scene | leaves))
     (image - target).abs().mean().backward()

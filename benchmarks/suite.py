@@ -222,9 +222,9 @@ def run_all(chosen: list[Benchmark], folder: Path, seconds: float, runs: int | N
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    parser.add_argument("--only", nargs="*", metavar="NAME", help="these benchmarks alone")
-    parser.add_argument("--runs", type=int, help="runs of each, in place of its own number")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after this time")
+    parser.add_argument("--only", nargs="*", metavar="NAME", help="run only these benchmarks")
+    parser.add_argument("--runs", type=int, help="number of runs of each benchmark, in place of its default")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no run after this time in minutes")
     parser.add_argument("--out", type=Path, help="folder of the logs (default: benchmarks/logs/DEVICE)")
     parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
     options = parser.parse_args()

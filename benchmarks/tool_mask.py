@@ -132,7 +132,7 @@ def gamma(image: Image, exponent: float) -> Image:
 
 
 def hue(image: Image, steps: int) -> Image:
-    """All hues turned by so many times two degrees."""
+    """Shift all hues, in units of two degrees."""
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV).astype(np.int16)
     hsv[..., 0] = (hsv[..., 0] + steps) % 180
     return np.asarray(cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB), np.uint8)
@@ -144,7 +144,7 @@ def resized(image: Image, factor: float) -> Image:
 
 
 def report(recording: str, figures: dict[str, object]) -> None:
-    """One line."""
+    """Print one line."""
     print(json.dumps({"recording": recording, **figures}), flush=True)
 
 

@@ -118,7 +118,7 @@ WITHOUT_TORCH = [
 
 
 def test_the_control_plane_loads_neither_torch_nor_opencv():
-    """All in one process, and after each it is looked whether they are there now."""
+    """Import all modules in one process and check for torch and OpenCV after each."""
     program = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\n    assert not {'torch', 'cv2'} & set(sys.modules), name"
     done = subprocess.run([sys.executable, "-c", program, *WITHOUT_TORCH], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -17,7 +17,7 @@ Raw = tuple[Tensor, ...]
 
 
 class GsplatStep:
-    """One step per call, each at the time it is given."""
+    """Training step on gsplat; each call trains at the given time."""
 
     def __init__(
         self,

@@ -152,7 +152,7 @@ def test_further_repeated_and_swapped_files_are_refused(refused):
 
 
 def test_pax_and_long_name_headers_are_refused(refused):
-    """They would give a file another name or size than its header says."""
+    """Such headers would give a file another name or size than its plain header."""
     renamed = {"pax_headers": {"path": "../../evil", "size": "9"}}
     assert "as plain files" in refused(
         archive((MANIFEST, b"{}", renamed), (TENSORS, b"x", {}), style=tarfile.PAX_FORMAT)

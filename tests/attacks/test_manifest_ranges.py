@@ -1,4 +1,4 @@
-"""Everything that a manifest says has a range, and what is out of it is refused in one sentence that names it."""
+"""Every value of a manifest has a range; a value out of range is refused in one sentence that names it."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def places(value: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def loaded_or_refused(load: Callable[[], Any]) -> None:
-    """Whatever was changed: a model, or one sentence."""
+    """Any change gives either a model or one sentence."""
     try:
         load()
     except UserError as error:

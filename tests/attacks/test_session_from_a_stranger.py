@@ -201,7 +201,7 @@ def test_another_video_under_the_name_of_a_track(session, codec, pixels, size):
 
 
 def test_bits_that_flip_anywhere_raise_nothing(session, whole, rng):
-    """And of an image that is not called damaged every byte is as it was recorded."""
+    """An image that is not reported as damaged equals the recorded one byte for byte."""
     names = [str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file()]
     for k in range(120):
         name = names[k % len(names)]

@@ -46,7 +46,7 @@ class QueuedInput:
 
 
 def run_queued(operator: Any, **queues: Any) -> list[Any]:
-    """One compute with these queues of messages at the inputs; what it emitted."""
+    """Run one compute with these queues of messages at the inputs and return the emitted messages."""
     output = FakeOutput()
     operator.compute(QueuedInput(**queues), output, None)
     return [value for _, value in output.emitted]
@@ -86,7 +86,7 @@ class FakeOutput:
 
 
 def run_once(operator: Any, **messages: Any) -> list[Any]:
-    """One compute with these messages; what it emitted, without port names."""
+    """Run one compute with these messages and return the emitted ones without port names."""
     output = FakeOutput()
     operator.compute(FakeInput(messages), output, None)
     assert {name for name, _ in output.emitted} <= set(operator.spec.outputs)

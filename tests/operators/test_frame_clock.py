@@ -1,4 +1,4 @@
-"""When a live frame is to be shown, what that leaves for training, and which frames are passed over."""
+"""Display deadlines of live frames, remaining time for training, and skipped frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nothing that is not ours is ever written over, and what one run has made is never mixed with another's."""
+"""Foreign files are never overwritten, and outputs of different runs are never mixed."""
 
 from __future__ import annotations
 

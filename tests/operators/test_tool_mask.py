@@ -145,7 +145,7 @@ def network(path: Path, *nodes: Any) -> Path:
 
 
 def test_a_users_network_is_named_by_its_path(frame, compute, tmp_path):
-    """It takes for a tool what is brightest in blue."""
+    """The network marks the pixels that are brightest in blue as tool."""
     path = network(tmp_path / "my:net.onnx", helper.make_node("Softmax", ["image"], ["mask"], axis=1))
     check_tool_mask(f"onnx:{path}")
     operator = new_tool_mask(None, f"onnx:{path}")

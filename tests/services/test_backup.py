@@ -148,7 +148,7 @@ def test_folders_elsewhere_are_in_it_and_are_restored_elsewhere(tmp_path):
 
 
 def test_a_service_that_writes_meanwhile_gives_a_backup_that_fits(service, tmp_path, monkeypatch):
-    """While files are copied an upload is checked, another one ends, and audit entries are written."""
+    """During the copy an upload is checked, another one ends, and audit entries are written."""
     real, calls = backups._copy_files, []
     database, files = service.archive.files._database, service.archive.files._files
 

@@ -48,14 +48,14 @@ def chromium_by_playwright() -> Iterator[Any]:
 
 
 class Page:
-    """One page of a running browser."""
+    """Page of a running browser."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
         self._number = 0
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """One command of the browser's protocol; its result."""
+        """Send one command of the browser's protocol and return its result."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:

@@ -25,7 +25,7 @@ def drapes(tmp_path):
 
 
 def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
-    """One test: a live run takes seconds."""
+    """A single test, because a live run takes seconds."""
     assert (
         run(["live", str(drapes), "--out", str(tmp_path / "out"), "--record", "--max-frames", "6", "--fps", "20"])
         == NOTHING_SHOWN

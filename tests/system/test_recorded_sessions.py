@@ -91,7 +91,7 @@ def test_without_a_folder_that_stays_nothing_is_recorded(scope, intrasplat):
 
 
 def test_a_session_is_evaluated_at_its_own_size_and_times(scope, tmp_path, intrasplat):
-    """It was recorded at the run's scale, in the run's time: neither is applied to it again, however often the source was looped."""
+    """Scale and time are those of the recorded run and are not applied again, even after loops of the source."""
     out = tmp_path / "out"
     arguments = ("--loop", "--seconds", "2", "--scale", "0.5", "--fps", "60", "--record", "--json")
     assert intrasplat("live", scope, *arguments, "--out", out).code == 0

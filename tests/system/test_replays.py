@@ -212,7 +212,7 @@ def test_a_recording_is_uploaded_and_replayed_from_the_page(server, page):
 
 
 def test_the_chosen_recording_is_chosen_before_the_list_comes_and_stays_so(server, page):
-    """Whatever order the answers come in: one that was asked for before the choice does not know the recording."""
+    """Answers may arrive in any order: one that was requested before the choice does not know the recording."""
     held: list = []
     page.click("#tab-recordings")
     row = page.locator("#recording-rows tr", has_text="by-hand")

@@ -96,7 +96,7 @@ def assert_near(frame: Frame, exact: tuple[Tensor, Tensor]) -> None:
 
 
 def check(s: Scene, capacity: int = 1 << 16) -> Frame:
-    """All modes against the reference; returns the training one."""
+    """Check all modes against the reference and return the training frame."""
     frame = s.render(capacity)
     needed, longest, overflow = frame.status.tolist()[:3]
     assert needed <= capacity and not overflow and longest <= needed

@@ -164,7 +164,7 @@ def test_splats_without_a_least_size(eps2d: float) -> None:
 
 
 def test_colours_end_at_the_largest_half() -> None:
-    """Such a colour is seen where its splat is drawn, finite, and changes no other pixel."""
+    """Such a colour is finite within its splat and changes no other pixel."""
     scene = frame_scene(300, deltas=True, seed=12)
     scene.deltas[0, COLOUR] = 1e9
     bright = rendered(scene)

@@ -149,7 +149,7 @@ def test_lists_of_a_capacity_are_made_in_a_graph_and_say_when_it_is_too_small() 
 
 
 def test_large_splats_are_written_by_their_warp_as_small_ones_by_a_thread() -> None:
-    """All sizes next to each other, from one tile to the whole image, and none: 256 rows of tiles, 40 columns."""
+    """Cover sizes from one tile to the whole image, and none, next to each other: 256 rows of tiles, 40 columns."""
     random = torch.Generator().manual_seed(4)
     where = [torch.rand(1, 300, n, generator=random) for n in (2, 2)]
     means2d = where[0] * torch.tensor([160.0, 1024.0])

@@ -18,7 +18,7 @@ RATES = BasisRates(position=0.02, centers=5e-3, widths=5e-3)
 SPACING_S = 0.2
 HISTORY_S = 2.0
 FRAME_S = 0.0613
-"""Not a fraction of the spacing: at a distance of exactly 4 widths rounding decides whether a bump is active."""
+"""Unrelated to the spacing: at exactly 4 widths, rounding decides if a bump is active."""
 
 
 def online(count: int, history_s: float | None = HISTORY_S, start_s: float = 0.0) -> BasisField:

@@ -121,7 +121,7 @@ def test_fields_that_cannot_follow_say_so():
 
 @pytest.mark.parametrize("shape", [(1, 2, 3), (5, 1, 3), (6, 4, 3)])
 def test_others_are_taken_as_they_were_before(shape):
-    """All rows at once: against the same by whole matrices."""
+    """Smooth all rows at once and compare with whole matrices."""
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(shape, generator=generator)
     others = torch.randint(0, shape[0], (shape[0], 4), generator=generator)

@@ -204,7 +204,7 @@ def test_a_broken_file_of_settings_is_refused(tmp_path, text):
 
 
 def test_a_network_that_fails_on_a_picture_says_so(tmp_path):
-    """It takes any size by what it declares, and one only in truth."""
+    """The model declares any input size but accepts only one."""
     shape = numpy_helper.from_array(np.array([1, 3, 64, 64], np.int64), "shape")
     node = helper.make_node("Reshape", ["image", "shape"], ["mask"])
     assert "failed on a picture of 256x320" in refused(write(tmp_path / "net.onnx", [node], [shape], size=("h", "w")))

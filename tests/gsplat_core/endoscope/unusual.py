@@ -22,7 +22,7 @@ def gains(*factors: float) -> Change:
 
 
 def hue(degrees: int) -> Change:
-    """All hues turned."""
+    """Rotate all hues."""
 
     def change(image: Image, rng: np.random.Generator) -> Image:
         hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
@@ -107,7 +107,7 @@ def particles(image: Image, rng: np.random.Generator) -> Image:
 
 
 def bleached(image: Image, rng: np.random.Generator) -> Image:
-    """So near to the tissue that its middle is overexposed."""
+    """Overexpose the middle, as in a picture taken close to the tissue."""
     return _bytes(image * (1 + 3 * _middle(image, 0.45)))
 
 

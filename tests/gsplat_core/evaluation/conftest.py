@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 16, 20
 
 
 def make_frame(seq: int, level: int = 100, **fields: Any) -> Frame:
-    """One grey level all over; 25 frames a second."""
+    """Return a frame of one uniform grey level, at 25 frames per second."""
     return Frame(seq, seq * 40_000_000, np.full((HEIGHT, WIDTH, 3), level, np.uint8), **fields)
 
 

@@ -41,7 +41,7 @@ def rigid(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np
 
 
 def bundle_of(sightings: Sightings, waves: torch.Tensor, most_nodes: int = 30) -> MovingBundle:
-    """All of it in one bundle, without any motion."""
+    """Return one bundle of all sightings, without motion."""
     field = SurfaceField.over(sightings.points, most_nodes)
     amplitudes = torch.zeros(len(field.nodes), 3, waves.shape[1], dtype=torch.float64)
     influence = field.influence(sightings.points)

@@ -32,7 +32,7 @@ def rigid() -> RenderedRecording:
 
 
 def blind(frames) -> list[Frame]:
-    """Without anything but pictures and masks."""
+    """Return the frames with pictures and masks only."""
     return [
         replace(frame, pose=None, depth=None, depth_origin=None, right_image=None, right_camera=None)
         for frame in frames

@@ -9,7 +9,7 @@ from gsplat_core.geometry.local_planes import at_middles, terms_of
 
 
 def summed(x, y, values, weight) -> tuple[np.ndarray, ...]:
-    """All of it as one window."""
+    """Return the terms of `terms_of`, each summed over one window."""
     return tuple(np.array([[term.sum()]]) for term in terms_of(weight, x, y, values))
 
 

@@ -23,7 +23,7 @@ def recording() -> RenderedRecording:
 
 
 def given(frames: slice = slice(None)) -> tuple[list[Frame], list[Camera]]:
-    """Without what is not known."""
+    """Return the chosen frames without depth, and their cameras."""
     whole = recording()
     chosen = list(whole)[frames]
     return [each.with_fields(depth=None, depth_origin=None) for each in chosen], [

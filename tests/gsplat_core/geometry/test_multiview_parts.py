@@ -36,7 +36,7 @@ def test_views_that_look_elsewhere_are_left_out(cosine, is_taken):
 
 @pytest.mark.parametrize(("parallax_px", "count"), [(1.0, 24), (30.0, 66), (500.0, 96)])
 def test_distances_are_three_quarters_of_a_pixel_apart(parallax_px, count):
-    """Between corners at 1 / 50 and 1 / 100, 1.6 times farther and nearer: 0.032 - 0.00625 = 0.02575."""
+    """Expected value between corners at 1/50 and 1/100, 1.6 times farther and nearer: 0.032 - 0.00625 = 0.02575."""
     found = SimpleNamespace(inverse_depths=np.repeat([0.01, 0.02], 50), parallax_px=parallax_px, plane=0.0156)
     inverse = multiview._distances(found)
     assert (inverse[0], inverse[-1]) == pytest.approx((0.01 / 1.6, 0.02 * 1.6))

@@ -233,7 +233,7 @@ def test_the_width_of_a_prior_is_that_of_what_was_found_and_of_a_hundred_expecte
 
 
 def test_a_prior_pulls_a_relief_towards_none():
-    """Without evidence a step takes the own unknowns back to what is expected."""
+    """Without evidence a step returns the own unknowns to their prior mean."""
     none = Equations(np.zeros((3, 1)), np.zeros((3, 2)), np.zeros(3), np.ones(3), np.array([4.0]), np.array([0.5]))
     np.testing.assert_allclose(none.own_step(np.zeros(2)), [-0.5])
     assert not none.information.any() and not none.pull.any()

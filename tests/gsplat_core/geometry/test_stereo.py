@@ -58,7 +58,7 @@ def test_a_known_surface_comes_out_in_millimetres(left, right):
 @pytest.mark.cuda
 @pytest.mark.parametrize("times", [1, 3])
 def test_on_a_gpu_it_is_as_on_the_cpu(left, right, gpu, times):
-    """At full size, and where pictures are shrunk to be matched."""
+    """Cover full-size matching and matching of reduced pictures."""
     size = WIDTH * times, HEIGHT * times
     wide = replace(camera(), K=camera().K * np.array([[times], [times], [1]]), width_px=size[0], height_px=size[1])
     eyes = [cv2.resize(each, size, interpolation=cv2.INTER_CUBIC) for each in (left, right)]

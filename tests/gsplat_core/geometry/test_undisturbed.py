@@ -75,7 +75,7 @@ def test_how_far_neighbours_are_off_together() -> None:
 
 @pytest.mark.slow
 def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
-    """All points there move otherwise than breathing does: there is nothing else to know them by."""
+    """All points in that area move unlike breathing, so no undisturbed neighbour exists."""
     points = places(TIMES_S)
     points[:, points[0, :, 0] > 20] += np.linspace(0, 9, len(TIMES_S))[:, None, None] ** 1.5 * [0.0, 1.0, 0.0]
     tracks = tracks_of(points, swaying(TIMES_S), TIMES_S)

@@ -174,7 +174,7 @@ def test_a_full_disk_leaves_the_previous_bundle(fails_at, make_gaussians, tmp_pa
 
 @pytest.mark.parametrize("renames", [0, 1])
 def test_a_crash_between_the_renames_leaves_a_whole_bundle(renames, make_gaussians, tmp_path, monkeypatch):
-    """Without any rename the old model is there; with the tensors renamed and the manifest not, the new one is."""
+    """Without a rename the old model loads. With only the tensors renamed, the new one loads."""
     old, new = make_model(make_gaussians(6)), make_model(make_gaussians(6, seed=4))
     save_bundle(old, tmp_path)
     done = []

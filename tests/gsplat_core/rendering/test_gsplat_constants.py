@@ -89,7 +89,7 @@ def test_a_floor_that_is_no_factor_of_an_opacity_is_refused(make_scene):
 
 
 def centred_ball(opacity, scale=0.5):
-    """One Gaussian on the centre of pixel (15, 20) of 40 x 30."""
+    """Return one Gaussian at the centre of pixel (15, 20) of 40x30."""
     return dict(
         means=torch.tensor([[0.0, 0, 5]]), quats=torch.tensor([[1.0, 0, 0, 0]]), scales=torch.full((1, 3), scale),
         opacities=torch.tensor([opacity]), colors=torch.ones(1, 3), viewmats=torch.eye(4)[None],

@@ -116,7 +116,7 @@ CAMERA = Camera(np.array([[60.0, 0, 20.5], [0, 60, 15.5], [0, 0, 1]]), 40, 30)
 
 
 def ball(opacity_logit=8.0, z=5.0, dtype=torch.float32):
-    """One red Gaussian on the axis."""
+    """Return one red Gaussian on the axis."""
     red = torch.tensor([[[0.5, -0.5, -0.5]]]) / 0.28209479177387814
     tensors = (
         torch.tensor([[0, 0, z]]),

@@ -251,7 +251,7 @@ def test_two_budgets_at_once_are_refused(make_frame, camera):
 
 
 def turns(budget, clock, step_s, slow_from=99):
-    """Whose turn each step was, of steps that take so long, and three times as long from one of them on."""
+    """Return the turn of each step. Steps take `step_s`, and three times as long from step `slow_from` on."""
     spending, taken = Spending(budget, step_s), []
     while spending.allows_step(by_turns=True):
         taken.append(spending.turn)

@@ -56,7 +56,7 @@ def test_the_scene_comes_to_look_like_the_picture(device: str, degree: int) -> N
 
 
 def test_a_first_step_is_the_weighted_mean_of_what_pixels_lack() -> None:
-    """Against the blending weights, found one Gaussian after the other."""
+    """Compare with the blending weights, computed one Gaussian at a time."""
     gaussians = scene(12)
     change = torch.rand(32, 48, 3, generator=torch.Generator().manual_seed(1))
     before = picture_of(gaussians)

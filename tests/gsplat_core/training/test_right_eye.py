@@ -153,7 +153,7 @@ def trained(eyes, frames=2, **fields):
 
 
 def test_both_eyes_meet_in_one_surface():
-    """Nothing says how far away the surface is but that two eyes see it: the third view, and depth, are better with both."""
+    """Stereo is the only cue to the surface distance: the third view and depth improve with both eyes."""
     views, depths = {}, {}
     for eyes in ("left", "both"):
         learning = trained(eyes, frames=4)

@@ -1,4 +1,4 @@
-"""One training step: what it improves, what it leaves alone, how Gaussians join."""
+"""A single training step: improved tensors, unchanged tensors, and addition of Gaussians."""
 
 import dataclasses
 

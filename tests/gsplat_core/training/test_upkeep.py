@@ -186,7 +186,7 @@ def test_a_stream_that_has_gone_on_for_days_learns_what_one_that_begins_learns(m
 
 @pytest.mark.parametrize("every", [RELAX_EVERY, 3 * RELAX_EVERY])
 def test_within_3600_steps_shown_gaussians_relax_by_1_minus_1_over_e_and_hidden_ones_do_not(make_frame, camera, every):
-    """Whatever the interval between two rounds. Mutants of the rate, or upkeep that is switched off, fail here."""
+    """Independent of the interval between rounds. Mutants of the rate and disabled upkeep fail here."""
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
     step, observation = trained(make_frame, camera, frames=1, mask=mask)

@@ -38,7 +38,7 @@ TISSUE = tissue()
 
 @dataclass(frozen=True)
 class Scripted:
-    """One frame of a stream that is made up here."""
+    """Scripted frame of a stream."""
 
     frame: Frame
     good: bool

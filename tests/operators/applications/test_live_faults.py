@@ -227,7 +227,7 @@ def test_a_source_that_is_gone_for_five_seconds(watched):
 
 @pytest.mark.slow
 def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
-    """Nothing is learned or shown of a picture from outside, and the stream is believed again after ten from inside."""
+    """No out-of-body picture is trained on or shown, and the stream is trusted again after ten frames from inside."""
     room = np.full((HEIGHT, WIDTH, 3), (90, 140, 200), np.uint8) + np.arange(WIDTH, dtype=np.uint8)[:, None] // 2
     script = Script()
     script.good(25)

@@ -1,4 +1,4 @@
-"""When conditions let an operator compute, by the clock."""
+"""Conditions that let an operator compute, by the clock."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def test_run_async_gives_the_result_and_can_be_stopped_at_once(kit):
 
 
 def test_an_event_during_a_long_appointment_wakes_greedy(kit):
-    """One operator waits an hour, the other for an event: the event must not wait an hour."""
+    """An event wakes its operator although another operator waits for an hour."""
     asleep, woken = threading.Event(), threading.Event()
 
     class Driven(Operator):

@@ -1,4 +1,4 @@
-"""One frame as one message: every way in which a message can be none is refused before it is read."""
+"""Frames as ZeroMQ messages: every kind of invalid message is refused before it is read."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ class FakeRecording:
 
 
 def fake_parts(**other: Any) -> Parts:
-    """All that the routes need."""
+    """Return the services that the routes need."""
     given: dict[str, Any] = {
         "streams": FakeStreams(),
         "models": FakeModels(),

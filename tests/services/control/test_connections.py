@@ -1,4 +1,4 @@
-"""One address cannot take every connection, and the probe listener answers whatever the server's own port does."""
+"""One address cannot take every connection, and the probe listener answers independently of the server's port."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def served():
 
 
 def answer(family_and_address, data: bytes) -> bytes:
-    """Everything that comes back for some bytes; nothing where the connection is reset."""
+    """Return the whole response to some bytes; empty if the connection is reset."""
     family, address = family_and_address
     with socket.socket(family) as client:
         client.settimeout(20)

@@ -84,7 +84,7 @@ def ask(port: int, path: str, key: str | None = None, method: str = "GET", **hea
 
 
 def raw(port: int, data: bytes, timeout_s: float = 10.0) -> bytes:
-    """Everything that comes back until the server closes the connection."""
+    """Return the whole response until the server closes the connection."""
     with socket.create_connection(("127.0.0.1", port), timeout=timeout_s) as client:
         client.sendall(data)
         answer = b""

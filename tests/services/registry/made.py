@@ -50,7 +50,7 @@ def add_ready(registry: ModelRegistry, files: Path, seed: int = 0, name: str = "
 
 
 def assert_whole(registry: ModelRegistry, name: str = "liver") -> None:
-    """At most one version is active, the model points to it, every version has its files, and nothing else lies about."""
+    """Check that at most one version is active and current, that versions have their files, and nothing else exists."""
     (model,) = [each for each in registry.models() if each.name == name]
     versions = registry.versions(name)
     assert [each.version for each in versions if each.state == "active"] == [model.active] * (model.active is not None)

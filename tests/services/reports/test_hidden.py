@@ -29,7 +29,7 @@ TRUTH = TruthFacts(
 
 @pytest.fixture
 def model() -> Model:
-    """One small red Gaussian in front of a camera of 24x16 px."""
+    """Return one small red Gaussian in front of a camera of 24x16 px."""
     gaussians = Gaussians(
         means=torch.tensor([[0.0, 0.0, 60.0]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),

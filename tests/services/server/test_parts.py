@@ -36,7 +36,7 @@ def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
     ("state", "ready"), [("live", "ready"), ("stopped", "ready"), ("source lost", "degraded"), ("failed", "degraded")]
 )
 def test_a_lost_camera_is_degraded(tmp_path, monkeypatch, state, ready):
-    """Without the reason: /readyz is asked without a key, and a reason may name a source."""
+    """The reason is left out: /readyz needs no key, and a reason may name a source."""
     facts = StreamFacts("theatre", "rtsp://10.0.0.5/x", "live", "cpu", {}, state, "rtsp://10.0.0.5/x is gone", {})
     monkeypatch.setattr(SupervisedStreams, "now", lambda self: [facts])
     with tempfile.TemporaryDirectory(prefix="isp-") as runtime:

@@ -13,7 +13,7 @@ from services.server.shown_models import ShownModels
 
 
 class Registry:
-    """One model with versions 1 and 2."""
+    """Registry with one model and its versions 1 and 2."""
 
     def __init__(self) -> None:
         self.current: int | None = 1

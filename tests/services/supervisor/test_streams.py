@@ -180,7 +180,7 @@ asyncio.run(run())
 
 
 def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
-    """One long story, since an engine takes seconds to start."""
+    """A single long scenario, because an engine takes seconds to start."""
 
     async def scenario() -> None:
         wanted = spec()
