@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
+from operators.settings import check_option
 
 INTERVAL_DECAY = 0.1
 """Weight of the newest frame in the moving average of the frame interval."""
@@ -69,8 +70,7 @@ class ClockSettings:
     """Maximum number of rehearsal steps between two frames, also while no frame arrives."""
 
     def __post_init__(self) -> None:
-        if self.budget_ms is not None and not 0 < self.budget_ms <= 10_000:
-            raise InvalidSetting(f"budget-ms is {self.budget_ms}; it must be auto, or between 0 and 10000 milliseconds")
+        check_option("budget_ms", self.budget_ms)
         for name in ("auto_share", "least_share"):
             value = getattr(self, name)
             if value is not None and not 0 < value <= 1:

@@ -235,7 +235,8 @@ class Declared:
         try:
             return _adapter(self.hint).validate_python(value)
         except ValidationError as error:
-            raise InvalidSetting(f"{self.name} is {value!r:.60}; {self._expected(error)}") from None
+            given = f"{value!r:.60}" if self.option.commands else "not valid"  # an address may hold a password
+            raise InvalidSetting(f"{self.name} is {given}; {self._expected(error)}") from None
 
     def _expected(self, error: ValidationError) -> str:
         first = error.errors(include_input=False)[0]

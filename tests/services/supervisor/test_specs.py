@@ -61,6 +61,12 @@ def test_streams_are_spread_over_gpus():
     assert assigned(streams, 0) == streams
 
 
+def test_an_address_that_is_refused_is_not_repeated():
+    with pytest.raises(InvalidSetting, match=r"^address is not valid; ") as refused:
+        SourceSpec(address="rtsp://user:swordfish@camera/" + 5000 * "x")
+    assert "swordfish" not in str(refused.value)
+
+
 def test_a_file_of_an_earlier_version_loads(runtime):
     engine = {
         "device": "cuda", "gpu": 1, "engine_scale": None, "field": "auto", "renderer": "alpha", "seed": 7, "budget_ms": 20.0,
