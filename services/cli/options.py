@@ -12,7 +12,8 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from operators.settings import Command, Declared, ReplayOptions, Section, options_for, options_of
+from operators.options import Command, Declared, Section, options_for, options_of
+from operators.settings import ReplayOptions
 
 
 def _path(text: str) -> Path:

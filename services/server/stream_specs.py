@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from operators.settings import Section, check_stream_options, options_for
+from operators.options import Section, options_for
+from operators.settings import check_stream_options
 from operators.sources.registry import check_address
 from services.control.parts import NewStream
 from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from gsplat_core.errors import InvalidSetting
-from operators.settings import CallerCaptureOptions, CallerEngineOptions, Option
+from operators.options import Option
+from operators.settings import CallerCaptureOptions, CallerEngineOptions
 from services.bus.runtime import Role, StreamFolder, read_json, write_json
 
 StreamName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]

@@ -15,17 +15,16 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from gsplat_core.errors import InvalidSetting
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
+from operators.options import Command, options_of
 from operators.settings import (
     CallerCaptureOptions,
     CallerEngineOptions,
     CallerJobOptions,
-    Command,
     JobOptions,
     LiveOptions,
     ReconstructOptions,
     ReplayOptions,
     check_stream_options,
-    options_of,
     stream_options_schema,
 )
 

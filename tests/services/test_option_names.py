@@ -11,7 +11,8 @@ from pydantic import BaseModel, ValidationError
 from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, RENDERERS
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS
-from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions, options_for
+from operators.options import options_for
+from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
 from operators.sources.registry import SOURCES
 from services.cli import app as command_line
 from services.control import sources

@@ -1,0 +1,375 @@
+"""Declaration of options by annotations of dataclass fields.
+
+A field `name: Annotated[type, Option(...)] = default` of a `Section` is an option. Its values are checked by pydantic when
+an object is created. `options_of` returns the declarations of a class, from which interfaces are derived. Importing this
+module loads neither torch, NumPy nor pydantic.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType, NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.registry import Registry
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, ValidationError
+    from pydantic_core import CoreSchema
+
+Command = Literal["replay", "batch", "reconstruct", "live", "job", "stream"]
+"""Uses of options: commands of `intrasplat`, replay jobs of the service, and streams of the service."""
+EVERYWHERE: tuple[Command, ...] = get_args(Command)
+MAX_TEXT = 4096
+"""Maximum length of a text, in characters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Names:
+    """Annotation of a text that names an entry of a registry. Entries added at run time are accepted.
+
+    Args:
+        registry: the entries.
+        addresses: entries that are followed by a colon and an address, with an example of the syntax.
+        more: accepted names that are not in the registry.
+    """
+
+    registry: Registry[Any]
+    addresses: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    more: tuple[str, ...] = ()
+
+    @property
+    def choices(self) -> list[str]:
+        """Return the accepted texts; an entry with an address as in `addresses`."""
+        return [*self.more, *(self.addresses.get(name, name) for name in self.registry)]
+
+    def check(self, value: str) -> str:
+        """Return the value.
+
+        Raises:
+            ValueError: for an unknown name, a missing address or a superfluous one; the message continues "NAME is VALUE; ".
+        """
+        name, colon, address = value.partition(":")
+        if name in self.addresses and name in self.registry and not address:
+            raise ValueError(f"it needs an address: {self.addresses[name]}")
+        if (name in self.registry or name in self.more) and colon and name not in self.addresses:
+            raise ValueError(f"nothing follows {name}, write {name!r}")
+        if name not in self.registry and value not in self.more:
+            raise ValueError(f"choose {_either(self.choices)}")
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        made = {name: value for name, value in handler(schema).items() if name != "type"}
+        plain = [*self.more, *(name for name in self.registry if name not in self.addresses)]
+        addressed = [f"^{name}:.+" for name in self.addresses if name in self.registry]
+        words = {"type": "string", "enum": plain}
+        if not addressed:
+            return {**made, **words}
+        return {**made, "anyOf": [words, *({"type": "string", "pattern": each} for each in addressed)]}
+
+
+@dataclass(frozen=True)
+class Option:
+    """Annotation that declares a field as an option.
+
+    Args:
+        description: one plain sentence without a full stop, for help texts, the OpenAPI document and the console.
+        commands: uses that the option applies to; empty for a value that the service sets itself.
+        unit: unit of the value.
+        null: meaning of None, such as "its own".
+        word: word of the command line for None, if a value may also be given as a word.
+        flag: spelling of a yes-or-no option on the command line; None for `--name`.
+        gt, ge, lt, le: range of a number.
+        least_length: minimum length of a text.
+        callers_le: upper limit for callers of the REST API, if it is lower than `le`.
+    """
+
+    description: str
+    commands: tuple[Command, ...] = EVERYWHERE
+    unit: str | None = None
+    null: str | None = None
+    word: str | None = None
+    flag: str | None = None
+    gt: float | None = None
+    ge: float | None = None
+    lt: float | None = None
+    le: float | None = None
+    callers_le: float | None = None
+    least_length: int | None = None
+
+    @property
+    def range(self) -> str:
+        """Return the range in words, such as "from 1 to 10"; empty without limits."""
+        low, high = ("above", self.gt) if self.gt is not None else ("at least", self.ge), self.lt
+        limits = [f"{low[0]} {_number(low[1])}"] if low[1] is not None else []
+        if high is not None:
+            limits.append(f"below {_number(high)}")
+        elif self.le is not None:
+            if self.ge is not None and self.gt is None:
+                return f"from {_number(self.ge)} to {_number(self.le)}"
+            limits.append(f"at most {_number(self.le)}")
+        return " and ".join(limits)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        limits = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le") if getattr(self, name) is not None}
+        return handler.generate_schema(_strict(source, limits, self.least_length))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        made = {
+            **handler(schema),
+            "description": f"{self.description}{'' if self.null is None else f'; null: {self.null}'}.",
+        }
+        return made if self.unit is None else {**made, "x-unit": self.unit}
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def _either(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def _strict(kind: Any, limits: Mapping[str, Any], least_length: int | None) -> Any:
+    """Return a type that pydantic accepts without conversions, such as true for the number 1, and with limits for its
+    numbers."""
+    from pydantic import BeforeValidator, Field
+
+    if get_origin(kind) in (Union, UnionType):
+        return Union[tuple(_strict(each, limits, least_length) for each in get_args(kind))]  # noqa: UP007 - of a computed tuple
+    if kind is float:
+        return Annotated[float, Field(strict=True, allow_inf_nan=False, **limits)]
+    if kind is int:
+        return Annotated[int, Field(strict=True, **limits)]
+    if kind is str:
+        return Annotated[str, Field(min_length=least_length, max_length=MAX_TEXT)]
+    if get_origin(kind) is tuple:
+        return Annotated[kind, BeforeValidator(_listed)]
+    return Annotated[bool, Field(strict=True)] if kind is bool else kind
+
+
+def _listed(value: Any) -> Any:
+    """Return the words of a text such as "video,keyframes", of which "none" means no word."""
+    if isinstance(value, str):
+        return () if value == "none" else tuple(value.split(","))
+    return value
+
+
+@dataclass(frozen=True)
+class Declared:
+    """Declaration of one option in a class: its annotation, type and default."""
+
+    name: str
+    option: Option
+    hint: Any
+    kind: Any
+    """Type without `Option` and None."""
+    default: Any
+
+    @property
+    def choices(self) -> list[str]:
+        """Return the texts that the option accepts; empty if they are not limited to a list."""
+        if get_origin(self.kind) is Literal:
+            return [str(each) for each in get_args(self.kind)]
+        kind = get_args(self.kind)[0] if get_origin(self.kind) is tuple else self.kind
+        return next((each.choices for each in _metadata(kind) if isinstance(each, Names)), [])
+
+    @property
+    def plain(self) -> type:
+        """Return the type of the value on the command line: int, float, bool or str."""
+        return self.kind if self.kind in (int, float, bool) else str
+
+    @property
+    def addresses(self) -> Mapping[str, str]:
+        """Return the names that are followed by an address, which is a file."""
+        return next((each.addresses for each in _metadata(self.kind) if isinstance(each, Names)), {})
+
+    def checked(self, value: Any) -> Any:
+        """Return the value as the option has it.
+
+        Raises:
+            InvalidSetting: if the value has another type or is out of range.
+        """
+        from pydantic import ValidationError
+
+        try:
+            return _adapter(self.hint).validate_python(value)
+        except ValidationError as error:
+            given = f"{value!r:.60}" if self.option.commands else "not valid"  # an address may hold a password
+            raise InvalidSetting(f"{self.name} is {given}; {self._expected(error)}") from None
+
+    def json_schema(self) -> dict[str, Any]:
+        """Return the JSON schema of the values, with the description."""
+        return _adapter(self.hint).json_schema()
+
+    def _expected(self, error: ValidationError) -> str:
+        first = error.errors(include_input=False)[0]
+        if first["type"] == "value_error":
+            return str(first["ctx"]["error"])
+        if get_origin(self.kind) is tuple:
+            return f"it must be a list of {_either(self.choices)}"
+        if self.choices:
+            return f"choose {_either(self.choices)}"
+        kind = {int: "a whole number", float: "a number", bool: "true or false"}.get(self.kind)
+        if kind is None or first["type"] in _OUT_OF_RANGE:
+            return f"it must be {self.option.range}" if self.option.range else str(first["msg"])
+        return f"it must be {kind}{f' {self.option.range}' if self.option.range else ''}"
+
+
+_OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number"}
+
+
+def _metadata(kind: Any) -> tuple[Any, ...]:
+    return getattr(kind, "__metadata__", ())
+
+
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(hint)
+
+
+def options_of(kind: type[Section]) -> Mapping[str, Declared]:
+    """Return the options of a class by name: those of its sections in order, then those of combined classes."""
+    return _options_of(cast(Any, kind))
+
+
+@cache
+def _options_of(kind: Any) -> Mapping[str, Declared]:
+    hints = get_type_hints(kind, include_extras=True)
+    defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+    classes = sorted(kind.__mro__, key=lambda each: each.__bases__ != (Section,))
+    names = dict.fromkeys(name for each in classes for name in inspect.get_annotations(each))
+    found = {}
+    for name in names:
+        option = next((each for each in _metadata(hints[name]) if isinstance(each, Option)), None)
+        if option is not None:
+            found[name] = Declared(name, option, hints[name], _without_option(hints[name]), defaults[name])
+    return MappingProxyType(found)
+
+
+def _without_option(hint: Any) -> Any:
+    """Return the type of an option without its `Option` and without None; a name keeps its `Names`."""
+    kind = get_args(hint)[0]
+    if get_origin(kind) in (Union, UnionType):
+        kinds = [each for each in get_args(kind) if each is not NoneType]
+        kind = kinds[0]
+    names = [each for each in _metadata(hint) if isinstance(each, Names)]
+    return Annotated[kind, names[0]] if names else kind
+
+
+def options_for(kind: type[Section], command: Command) -> Mapping[str, Declared]:
+    """Return the options of a class that apply to a command."""
+    return {name: each for name, each in options_of(kind).items() if command in each.option.commands}
+
+
+Config = TypeVar("Config", bound="DataclassInstance")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """Base of the sections and of their combinations.
+
+    Raises:
+        InvalidSetting: if an option has another type or is out of range.
+    """
+
+    __pydantic_config__: ClassVar[Any] = {"extra": "forbid"}
+
+    def __post_init__(self) -> None:
+        for name, each in options_of(type(self)).items():
+            object.__setattr__(self, name, each.checked(getattr(self, name)))
+
+    def chosen(self) -> dict[str, Any]:
+        """Return the options that differ from their defaults, as values of JSON."""
+        values = {name: getattr(self, name) for name in options_of(type(self))}
+        changed = {name: value for name, value in values.items() if value != options_of(type(self))[name].default}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in changed.items()}
+
+    def applied_to(self, config: Config) -> Config:
+        """Return a dataclass of the core with the values of options that it has fields of the same name for.
+
+        None keeps the value of the field.
+        """
+        shared = {field.name for field in dataclasses.fields(config)} & options_of(type(self)).keys()
+        given = {name: getattr(self, name) for name in shared if getattr(self, name) is not None}
+        return dataclasses.replace(config, **given)
+
+    def options(self, kind: type[Section] | None = None) -> dict[str, Any]:
+        """Return the options by name; those of the class `kind` alone if one is given."""
+        return {name: getattr(self, name) for name in options_of(kind or type(self))}
+
+
+Kind = TypeVar("Kind", bound=type[Section])
+
+
+def for_callers(kind: Kind) -> Kind:
+    """Decorate a class below `@dataclass`: its options have the limits of callers of the REST API.
+
+    Numbers have the limit `Option.callers_le`. A file of an option such as `depth` must be an ONNX file of this machine,
+    named by its absolute path.
+    """
+    (base,) = kind.__bases__
+    for name, each in options_of(base).items():
+        annotations: list[Any] = []
+        if each.option.callers_le is not None:
+            annotations.append(dataclasses.replace(each.option, le=each.option.callers_le))
+        if each.addresses:
+            annotations += [each.option, ServerFile(each)]
+        if annotations:
+            kept = [note for note in _metadata(each.hint) if not isinstance(note, Option)]
+            kind.__annotations__[name] = Annotated[(get_args(each.hint)[0], *annotations[:1], *kept, *annotations[1:])]
+            setattr(kind, name, each.default)
+    return kind
+
+
+@dataclass(frozen=True)
+class ServerFile:
+    """Annotation of an option of a caller that may name a file of the server."""
+
+    declared: Declared
+
+    def check(self, value: str) -> str:
+        """Return the value.
+
+        Raises:
+            ValueError: if it names no ONNX file by an absolute path.
+        """
+        name, _, file = value.partition(":")
+        if name not in self.declared.addresses:
+            return value
+        if not Path(file).is_absolute():
+            raise ValueError(f"give the absolute path of a file, as {name}:/models/{self.declared.name}.onnx")
+        if not (Path(file).suffix == ".onnx" and Path(file).is_file()):
+            raise ValueError(f"{file!r:.200} is no file of the server that ends in .onnx; check the path")
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
