@@ -91,8 +91,8 @@ def test_a_signal_ends_it_and_leaves_nothing_half_made(start, recordings, tmp_pa
         (("recordings", "--out", "."), "in, or around"),
         (("recordings", "--out", "other"), "no earlier batch's"),
         (("recordings", "--out", "file"), "is a file"),
-        (("recordings", "--scale", "9"), "--scale"),
-        (("recordings", "--device", "tpu"), "--device"),
+        (("recordings", "--scale", "99"), "scale is 99.0; it must be above 0 and at most 64"),
+        (("recordings", "--device", "tpu"), "device is 'tpu'; choose cpu or cuda"),
     ],
 )
 def test_what_makes_no_sense_is_refused_and_nothing_is_written(
