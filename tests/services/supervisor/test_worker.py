@@ -1,0 +1,174 @@
+"""Runtime of a stream process: role, heartbeats, commands, stop requests and self-termination."""
+
+from __future__ import annotations
+
+import os
+import signal
+from types import SimpleNamespace
+
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from services.bus.commands import ask
+from services.bus.errors import AlreadyRunning
+from services.supervisor import worker as workers
+from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
+from services.supervisor.worker import MEASURED_EVERY_S, SIGNALS, Worker, stream_folder_of
+
+
+@pytest.fixture
+def new_worker(runtime):
+    def make(handlers=None, **limits) -> Worker:
+        spec = StreamSpec(name="a", source=SourceSpec(address="synthetic:"), limits=ProcessLimits(**limits))
+        folder, own = stream_folder_of(spec.write("capture", runtime.stream("a")), "capture")
+        return Worker(folder, own, handlers)
+
+    return make
+
+
+def test_a_running_process_answers_holds_its_role_and_leaves_no_trace(new_worker, runtime):
+    before = [signal.getsignal(number) for number in SIGNALS]
+    with new_worker({"extra": lambda told: {"twice": 2 * told["value"]}}) as worker:
+        endpoint = worker.folder.commands("capture")
+        assert ask(endpoint, "ping")["pid"] == os.getpid()
+        assert ask(endpoint, "extra", value=4)["twice"] == 8
+        worker.take({"later": lambda told: {"seen": True}})
+        assert ask(endpoint, "later")["seen"]
+        assert worker.folder.record("capture") is not None
+        with pytest.raises(AlreadyRunning):
+            new_worker().__enter__()
+        assert not worker.stop_requested() and not worker.wait(0)
+        ask(endpoint, "stop", reason="r" * 300)
+        assert worker.stop_requested() and worker.wait(0)
+        assert worker.stop_reason == "r" * 200
+        worker.request_stop("a later reason")
+        assert worker.stop_reason == "r" * 200
+    assert not worker._watch.is_alive() and not worker._commands._thread.is_alive()
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+    assert worker._said == {"state": "ended", "reason": "r" * 200}
+    assert worker.folder.record("capture") is None
+    with new_worker():
+        pass
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_requests_a_stop(new_worker, number):
+    with new_worker() as worker:
+        signal.raise_signal(number)
+        assert worker.stop_requested() and worker.stop_reason == f"it got {number.name}"
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "reason"),
+    [
+        (None, "ended", "it has nothing more to do"),
+        (RuntimeError("broken"), "failed", "broken"),
+        (KeyError(), "failed", "KeyError"),
+    ],
+)
+def test_the_last_state_is_how_the_process_ended(new_worker, error, state, reason):
+    worker = new_worker()
+    try:
+        with worker:
+            if error is not None:
+                raise error
+    except (RuntimeError, KeyError):
+        assert error is not None
+    assert worker._said == {"state": state, "reason": reason}
+
+
+def test_a_change_of_state_is_sent_at_once(new_worker):
+    worker, sent = new_worker(), []
+    worker._heartbeats = SimpleNamespace(say_now=lambda: sent.append(worker._said["reason"]))
+    for state, reason in (
+        ("starting", "loads"), ("starting", "loads"), ("running", "one"), ("running", "two"), ("starting", "two"),
+    ):  # fmt: skip
+        worker.say(state, reason)
+    assert sent == ["loads", "one", "two"]
+    worker.say("running", "x" * 3000)
+    assert worker._said["reason"] == "x" * 2000
+
+
+def test_figures_are_new_in_every_heartbeat_and_measures_once_per_second(new_worker, monkeypatch):
+    now = SimpleNamespace(s=50.0)
+    monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: now.s))
+    worker, counts = new_worker(), {"figures": 0, "measures": 0}
+
+    def count(name: str) -> dict[str, int]:
+        counts[name] += 1
+        return {name: counts[name]}
+
+    worker.tell_figures("part", lambda: count("figures"))
+    worker.tell_measures("part", lambda: count("measures"))
+    worker.tell_figures("other", lambda: {"more": 1})
+    told = []
+    for after_s in (0.0, 0.5, MEASURED_EVERY_S - 0.5, MEASURED_EVERY_S - 0.25):
+        now.s += after_s
+        told.append(worker._report())
+    assert [each["figures"] for each in told] == [{"figures": k, "more": 1} for k in (1, 2, 3, 4)]
+    assert [each["measures"] for each in told] == [{"measures": k} for k in (1, 1, 2, 2)]
+    assert told[0]["role"] == "capture" and told[0]["state"] == "starting"
+
+
+class Exited(Exception):
+    pass
+
+
+@pytest.fixture
+def watch(monkeypatch):
+    """Run the watch thread's loop in this thread at given times; the supervisor last asked at 0 s."""
+
+    def run(worker: Worker, *times: float, then=lambda now_s: None) -> float | None:
+        """Return the time at which the process ended itself, or None."""
+        looks = iter(times)
+        now = SimpleNamespace(s=0.0)
+
+        def wait(seconds: float) -> bool:
+            now.s = next(looks, -1.0)
+            then(now.s)
+            return now.s < 0
+
+        def leave(code: int) -> None:
+            assert code == 1
+            raise Exited
+
+        worker._over = SimpleNamespace(wait=wait)
+        worker._commands = SimpleNamespace(heard_s=0.0)
+        monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: now.s))
+        monkeypatch.setattr(workers.os, "_exit", leave)
+        try:
+            worker._look_after()
+        except Exited:
+            return now.s
+        return None
+
+    return run
+
+
+def test_a_process_without_a_supervisor_stops(new_worker, watch):
+    worker = new_worker(orphan_after_s=30.0)
+    assert watch(worker, 10.0, 30.0) is None and not worker.stop_requested()
+    watch(worker, 30.5)
+    assert worker.stop_reason == "no supervisor has asked for anything in 30 s"
+
+
+def test_a_process_that_does_not_finish_in_time_ends_itself(new_worker, watch):
+    worker = new_worker(drain_s=5.0)
+    assert watch(worker, 1.0, 90.0) is None
+    socket_file = runtime_file = worker.folder.path / "left"
+    runtime_file.touch()
+    stop = lambda now_s: worker.request_stop("told") if now_s >= 100 else None
+    assert watch(worker, 99.0, 100.0, 103.0, 105.0, then=stop) is None
+    cleaned = []
+    object.__setattr__(worker, "folder", SimpleNamespace(clean=cleaned.append))
+    assert watch(worker, 200.0, 204.0, 205.1, 300.0) == 205.1
+    assert cleaned == ["capture"] and socket_file.exists()
+
+
+def test_a_specification_for_another_role_is_refused(runtime):
+    spec = StreamSpec(name="a", source=SourceSpec(address="synthetic:"))
+    path = spec.write("engine", runtime.stream("a"))
+    with pytest.raises(InvalidSetting, match="is for the engine process, and this is the capture process"):
+        stream_folder_of(path, "capture")
+    folder, read = stream_folder_of(os.path.relpath(path), "engine")
+    assert folder.path == path.parent and read.role == "engine"
