@@ -9,8 +9,9 @@ from typing import overload
 from urllib.parse import parse_qsl
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.plain_numbers import plain_float
 
-_SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
+_SIZE = re.compile(r"(\d{1,5})x(\d{1,5})", re.ASCII)
 _FLAGS = {"1": True, "true": True, "yes": True, "": True, "0": False, "false": False, "no": False}
 MAX_SIDE_PX = 8192
 
@@ -67,7 +68,7 @@ class Address:
         if text is None:
             return default
         try:
-            value = float(text)
+            value = plain_float(text)
         except ValueError:
             value = math.nan
         if not least <= value <= most:

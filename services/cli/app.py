@@ -24,6 +24,7 @@ from services.cli.options import (
     RecordKeepOption,
     SourceArgument,
     SynthesizeOptions,
+    require_plain_numbers,
     takes_options,
     takes_run_options,
 )
@@ -56,7 +57,9 @@ def run(arguments: list[str]) -> int:
         typer.echo(f"error: {sentence(empty[0])} is empty; a variable of the shell may be unset", err=True)
         return BAD_INPUT
     try:
-        code = typer.main.get_command(app).main(arguments, prog_name="intrasplat", standalone_mode=False)
+        command = typer.main.get_command(app)
+        require_plain_numbers(command)
+        code = command.main(arguments, prog_name="intrasplat", standalone_mode=False)
     except typer.Abort:
         return INTERRUPTED
     except _USAGE_ERRORS as error:

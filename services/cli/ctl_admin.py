@@ -34,7 +34,7 @@ WATCHED: Columns = {
     "psnr_db": "TRAINING PSNR DB", "previous_psnr_db": "PREVIOUS FRAME DB", "restarts": "RESTARTS", "displays": "DISPLAYS", "reason": "REASON",
 }  # fmt: skip
 CLEAR = "\x1b[H\x1b[2J"
-SPAN = re.compile(r"(\d{1,6})([smhd])")
+SPAN = re.compile(r"(\d{1,6})([smhd])", re.ASCII)
 UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
 delete = typer.Typer(help="Delete something, after asking.", no_args_is_help=True)

@@ -10,6 +10,7 @@ import typer
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.protocols import Visits
+from gsplat_core.plain_numbers import plain_float
 from operators.applications.evaluate import evaluate
 from operators.applications.evaluation import EvaluationSettings
 from operators.output_folder import OutputFolder
@@ -52,7 +53,7 @@ def _place(text: str) -> Visits:
         InvalidSetting: if the text is malformed.
     """
     try:
-        first, again = ([float(end) for end in stay.split(":")] for stay in text.split(","))
+        first, again = ([plain_float(end) for end in stay.split(":")] for stay in text.split(","))
         if len(first) != 2 or len(again) != 2 or not all(math.isfinite(end) for end in (*first, *again)):
             raise ValueError
         return Visits((first[0], first[1]), (again[0], again[1]))

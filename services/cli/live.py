@@ -30,7 +30,7 @@ from services.reports.build import write_reports
 from services.reports.nothing_shown import require_shown
 from services.reports.schema import LiveFacts, RunReport
 
-_KEPT = re.compile(r"(\d+(?:\.\d+)?) *([A-Za-z]+)")
+_KEPT = re.compile(r"(\d+(?:\.\d+)?) *([A-Za-z]+)", re.ASCII)
 _UNITS = {
     "mib": ("bytes", 2.0**20), "gib": ("bytes", 2.0**30), "tib": ("bytes", 2.0**40),
     "min": ("seconds", 60.0), "h": ("seconds", 3600.0), "d": ("seconds", 86400.0),

@@ -14,7 +14,7 @@ from gsplat_core.geometry.measure import Length, Measurement, SurfacePoint
 from gsplat_core.io.model_sources import load_model
 from services.cli.exit_codes import OK
 
-PIXEL = re.compile(r"\s*(\d+(?:\.\d+)?)\s*,\s*(\d+(?:\.\d+)?)\s*")
+PIXEL = re.compile(r"\s*(\d+(?:\.\d+)?)\s*,\s*(\d+(?:\.\d+)?)\s*", re.ASCII)
 
 
 def measure_command(model: Path, time_s: float | None, start: str, end: str | None, *, as_json: bool) -> int:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.plain_numbers import is_plain
 from operators.options import Command, Declared, Section, options_for, options_of
 from operators.settings import ReplayOptions
 
@@ -258,3 +259,28 @@ def _with_parameters(
     call.__annotations__ = {each.name: each.annotation for each in both}
     del call.__dict__["__wrapped__"]  # otherwise typer inspects the wrapped command's signature
     return call
+
+
+def require_plain_numbers(command: Any) -> None:
+    """Make the numeric options and arguments of a command and its subcommands refuse `1_0` and digits of other scripts.
+
+    Args:
+        command: a command or group that typer built; its parameters are modified.
+    """
+    for parameter in command.params:
+        parameter.process_value = functools.partial(_processed, parameter, parameter.process_value)
+    for each in getattr(command, "commands", {}).values():
+        require_plain_numbers(each)
+
+
+def _processed(parameter: Any, process: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
+    """Process a parameter's value, and refuse a text that became a number without being written as one."""
+    found = process(context, value)
+    is_number = isinstance(found, int | float) and not isinstance(found, bool)
+    if is_number and isinstance(value, str) and not is_plain(value):
+        raise typer.BadParameter(
+            f"{value!r} is not a plain number; write it with the digits 0 to 9, such as 10 or 0.5",
+            ctx=context,
+            param_hint=parameter.opts[-1],
+        )
+    return found

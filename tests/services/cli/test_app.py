@@ -58,7 +58,8 @@ def commands(group, path=()):
             yield (*path, name), command.params
 
 
-EVERY_COMMAND = dict(commands(typer.main.get_command(app)))
+CONTEXT = typer.Context(typer.main.get_command(app))
+EVERY_COMMAND = dict(commands(CONTEXT.command))
 
 
 @pytest.mark.parametrize("words", EVERY_COMMAND, ids=" ".join)
@@ -73,3 +74,68 @@ def test_an_empty_argument_or_option_of_any_command_is_refused(words, capsys, mo
         shown = capsys.readouterr()
         assert shown.out == "" and "is empty; a variable of the shell may be unset" in shown.err, line
     assert list(tmp_path.iterdir()) == []
+
+
+def is_numeric(parameter) -> bool:
+    """Find out by values of which at least one is in the option's range."""
+    for text in ("9", "200", "0.5"):
+        try:
+            found = parameter.process_value(CONTEXT, text)
+        except Exception:  # noqa: BLE001 - an option of another kind, or out of the range of this one
+            continue
+        return type(found) in (int, float)
+    return False
+
+
+def test_options_with_numbers_are_recognised():
+    numeric = {
+        (words[0], each.opts[-1]) for words, every in EVERY_COMMAND.items() for each in every if is_numeric(each)
+    }
+    wanted = {
+        ("replay", "--seed"),
+        ("live", "--fps"),
+        ("synthesize", "--smoke"),
+        ("batch", "--workers"),
+        ("igtl", "--port"),
+    }
+    assert wanted <= numeric and not {("replay", "--device"), ("replay", "--heldout")} & numeric
+
+
+@pytest.mark.parametrize("words", EVERY_COMMAND, ids=" ".join)
+def test_numbers_with_underscores_or_digits_of_other_scripts_are_refused(words, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    takes = [each for each in EVERY_COMMAND[words] if each.opts[-1].startswith("--") and not each.is_flag]
+    for option in (each.opts[-1] for each in takes if is_numeric(each)):
+        for number in ("1_0", "９") if option == "--seed" else ("1_0",):
+            assert run([*words, option, number]) == BAD_INPUT, (option, number)
+            shown = capsys.readouterr()
+            assert shown.out == "" and shown.err.count("\n") == 1
+            assert shown.err.startswith("error: Invalid value for ") and option in shown.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", ["1_0", "１０", " 10"])
+def test_numbers_inside_texts_are_plain_too(number):
+    from datetime import datetime
+
+    from gsplat_core.errors import InvalidSetting
+    from operators.sources.address import Address
+    from services.cli.ctl_admin import moment
+    from services.cli.evaluate import _place
+    from services.cli.live import live_settings, recording_kept
+    from services.cli.measure import pixel_of
+
+    assert isinstance(moment("10m"), datetime)
+    assert pixel_of("10,10") == (10, 10) and _place("0:2,10:12").again == (10, 12)
+    with pytest.raises(InvalidSetting, match="place is"):
+        _place(f"0:2,{number}:12")
+    with pytest.raises(InvalidSetting, match="budget-ms is"), live_settings("x", None, number):
+        pass
+    with pytest.raises(InvalidSetting):
+        Address.parse("x", f"//place?fps={number}").number("fps", None, 1, 100)
+    with pytest.raises(InvalidSetting):
+        Address.parse("x", f"//place?size={number}x10").size()
+    if number != " 10":  # blanks around these are allowed
+        for read, text in ((pixel_of, f"{number},10"), (recording_kept, [f"{number}GiB"]), (moment, f"{number}m")):
+            with pytest.raises(InvalidSetting):
+                read(text)
