@@ -106,3 +106,33 @@ def test_what_was_never_seen_is_hatched_and_the_rest_is_the_picture(tmp_path):
     assert render_model(tmp_path / "model", tmp_path / "pair.mp4", fps=2, view=ViewWish("stereo", 5.0)) == 3
     video = cv2.VideoCapture(str(tmp_path / "pair.mp4"))
     assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 40)
+
+
+def test_depths_of_half_covered_pixels_count_and_fainter_ones_do_not():
+    from types import SimpleNamespace
+
+    output = SimpleNamespace(
+        depth=torch.tensor([[10.0, 20.0, 30.0, -5.0, 900.0]]), alpha=torch.tensor([[0.5, 1.0, 0.8, 1.0, 0.49]])
+    )
+    model = SimpleNamespace(time_window_s=WINDOW_S, render=lambda time_s, camera: output)
+    assert typical_depth(model, CAMERA) == 20.0
+
+
+def test_a_path_may_cover_the_model_s_time_exactly_and_begin_no_earlier(tmp_path):
+    def path(first_s, last_s):
+        file = tmp_path / "path.json"
+        cameras = [{"time_s": time_s, "camera_to_world": np.eye(4).tolist()} for time_s in (first_s, last_s)]
+        file.write_text(json.dumps({"cameras": cameras}))
+        return ViewWish(str(file))
+
+    view = view_of(wall(), CAMERA, path(*WINDOW_S))
+    assert view.window_s == WINDOW_S and view.cameras(1.0)[0].width_px == CAMERA.width_px
+    for first_s, last_s in ((0.99, 2.0), (1.0, 2.01)):
+        with pytest.raises(InvalidSetting, match="the model has seen 1 to 2 s"):
+            view_of(wall(), CAMERA, path(first_s, last_s))
+
+
+def test_files_that_a_view_is_read_from():
+    assert ViewWish().inputs == ViewWish("stereo").inputs == () and [p.name for p in ViewWish("a.json").inputs] == [
+        "a.json"
+    ]

@@ -355,3 +355,14 @@ def test_a_client_that_leaves_while_it_sends_is_no_bug(served, caplog, method, p
         entry["outcome"] for entry in map(json.loads, (settings.data_dir / "audit.jsonl").read_text().splitlines())
     }
     assert "failed" not in outcomes
+
+
+def test_addresses_without_connections_are_forgotten_and_those_with_some_are_not():
+    from services.control.connections import AddressBound
+
+    bound = AddressBound(3)
+    keys = [bound.enter("192.0.2.1") for _ in range(2)]
+    bound.leave(keys[0])
+    assert bound.open("192.0.2.1") == 1
+    bound.leave(keys[1])
+    assert bound.open("192.0.2.1") == 0 and not bound._open

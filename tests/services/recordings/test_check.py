@@ -71,7 +71,9 @@ def test_what_cannot_be_read_is_a_verdict_and_not_a_crash(checked, monkeypatch, 
     monkeypatch.setattr(check, "_put", fail)
     verdict = checked(b"x", check_memory_bytes=1234)
     assert verdict["stage"] == "rejected"
-    assert verdict["reason"] == ("no" if isinstance(error, ArchiveInvalid) else "it needs more than 1234 bytes of memory to read")
+    assert verdict["reason"] == (
+        "no" if isinstance(error, ArchiveInvalid) else "it needs more than 1234 bytes of memory to read"
+    )
 
 
 def test_the_check_is_limited_as_the_settings_say(monkeypatch):

@@ -21,7 +21,9 @@ def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch
         archive.writestr("images/0001.png", "0123456789")
         archive.writestr("images/0002.png", "")
     unpacking.unpack(tmp_path / "upload", tmp_path / "case", RecordingLimits())
-    found = {str(p.relative_to(tmp_path / "case")): p.read_text() for p in (tmp_path / "case").rglob("*") if p.is_file()}
+    found = {
+        str(p.relative_to(tmp_path / "case")): p.read_text() for p in (tmp_path / "case").rglob("*") if p.is_file()
+    }
     assert found == {"session.json": "{}", "images/0001.png": "0123456789", "images/0002.png": ""}
     modes = {stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "case").rglob("*") if path.is_file()}
     assert modes == {0o600} and stat.S_IMODE((tmp_path / "case").stat().st_mode) == 0o700

@@ -139,3 +139,15 @@ def test_every_reason_of_a_gate_has_a_remedy():
             }
     assert {"black", "torn", "no tissue"} <= words
     assert words - set(REMEDIES) <= {"depth repaired", "depth not usable", "depth at another scale"}
+
+
+@pytest.mark.parametrize(
+    ("command", "hint"), [("live", "give more --seconds"), ("replay", "check that it holds frames")]
+)
+def test_a_run_that_ended_before_its_source_was_read(command, hint):
+    said = sentence(ended(command, stop_reason="a failure"))
+    assert said.startswith("nothing was shown: no frame came from the source in 3.0 s (a failure)") and hint in said
+    assert hint not in sentence(ended("replay", source(2))) and "check the recording" in sentence(
+        ended("replay", source(2))
+    )
+    assert "give more --seconds, or a smaller --scale" in sentence(ended("live", source(2), withheld()))

@@ -116,7 +116,9 @@ def test_lines_of_the_pool_are_logged_at_their_level(caplog):
 
     async def run() -> None:
         reader = asyncio.StreamReader(limit=64)
-        reader.feed_data(b"INFO one\n\nERROR two\nCRITICAL three\nTraceback (most)\nwords\n" + b"x" * 200 + b"\nWARNING \xff\n")
+        reader.feed_data(
+            b"INFO one\n\nERROR two\nCRITICAL three\nTraceback (most)\nwords\n" + b"x" * 200 + b"\nWARNING \xff\n"
+        )
         reader.feed_eof()
         await relayed(reader)
 

@@ -34,7 +34,9 @@ def taking(tmp_path, monkeypatch):
 
     refusal: list[str] = []
     streams = SimpleNamespace(with_engine=lambda stream: SimpleNamespace(command=command))
-    store = SimpleNamespace(new=new, keep=lambda *kept: calls.append(("keep", *kept)), delete=lambda *a: calls.append(a))
+    store = SimpleNamespace(
+        new=new, keep=lambda *kept: calls.append(("keep", *kept)), delete=lambda *a: calls.append(a)
+    )
     registry = SimpleNamespace(upload=lambda *given: calls.append(("upload", *given)) or "version")
     monkeypatch.setattr(parts, "described", lambda folder, stream, by, said: (folder, stream, by, said))
     monkeypatch.setattr(parts, "pack", lambda folder, file: calls.append(("pack", folder, file)))

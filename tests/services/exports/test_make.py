@@ -1,0 +1,59 @@
+"""Export program: formats, refusals, and the limits under which it runs."""
+
+from __future__ import annotations
+
+import resource
+
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from services.exports import make
+from services.exports.formats import ALL
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Run the program with fakes in place of the writers; `calls` has what it did."""
+    calls: dict[str, tuple] = {}
+    monkeypatch.setattr(make, "keep_files_private", lambda: calls.update(private=()))
+    monkeypatch.setattr(make.os, "nice", lambda by: calls.update(nice=(by,)))
+    monkeypatch.setattr(make.resource, "setrlimit", lambda *limit: calls.update(limit=limit))
+    monkeypatch.setattr(make, "pack", lambda *paths: calls.update(pack=paths))
+    monkeypatch.setattr(make, "export", lambda *wanted: calls.update(export=wanted))
+    return calls
+
+
+def test_a_packed_model_and_other_formats_have_their_own_writers(ran, tmp_path):
+    folder, file = tmp_path / "model", tmp_path / "file"
+    assert make.main([str(folder), str(file), "--format", "isplat"]) == 0
+    assert ran.pop("pack") == (folder, file) and "export" not in ran
+    assert make.main([str(folder), str(file), "--format", "ply", "--time", "1.5"]) == 0
+    assert "pack" not in ran
+    asked_folder, asked_file, wish = ran["export"]
+    assert (asked_folder, asked_file) == (folder, file)
+    assert (wish.format, wish.time_s, wish.times) == (ALL["ply"], 1.5, None)
+
+
+def test_it_gives_way_to_streams_and_writes_no_core_file(ran, tmp_path):
+    make.main([str(tmp_path), "file", "--format", "isplat"])
+    assert "private" in ran and ran["limit"] == (resource.RLIMIT_CORE, (0, 0)) and ran["nice"][0] > 0
+
+
+def test_a_refusal_is_a_sentence_without_the_folder(ran, tmp_path, monkeypatch, capsys):
+    def refuse(*wanted):
+        raise InvalidSetting(f"{tmp_path}/model.safetensors is damaged")
+
+    monkeypatch.setattr(make, "export", refuse)
+    assert make.main([str(tmp_path), "file", "--format", "ply"]) == make.REFUSED
+    assert capsys.readouterr().err == "model.safetensors is damaged\n"
+
+
+def test_a_model_is_loaded_and_exported(monkeypatch, tmp_path):
+    from gsplat_core.io import bundle
+    from gsplat_core.io.exports import export
+
+    made = []
+    monkeypatch.setattr(bundle, "load_bundle", lambda folder: ("model of", folder))
+    monkeypatch.setattr(export, "export_model", lambda *wanted: made.append(wanted))
+    make.export(tmp_path, tmp_path / "file", "wish")
+    assert made == [(("model of", tmp_path), tmp_path / "file", "wish")]
