@@ -105,3 +105,61 @@ def test_long_pictures_are_no_exception(shape):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(InvalidSetting, match="most"):
         HighlightSettings(most=2.0)
+
+
+def spotted(colour, tissue=(200, 150, 150), size=(256, 320), side=9):
+    """Even tissue with one square of another colour in its middle."""
+    image = np.full((*size, 3), tissue, np.uint8)
+    y, x = size[0] // 2, size[1] // 2
+    image[y : y + side, x : x + side] = colour
+    return image
+
+
+@pytest.mark.parametrize(
+    ("colour", "tissue", "found"),
+    [
+        ((240, 200, 200), (200, 150, 150), True),
+        ((200, 240, 200), (200, 150, 150), True),
+        ((200, 200, 240), (200, 150, 150), True),
+        ((230, 200, 200), (200, 150, 150), False),
+        ((255, 180, 255), (180, 90, 90), True),
+        ((255, 160, 255), (180, 90, 90), False),
+        ((160, 255, 255), (180, 90, 90), False),
+        ((255, 255, 160), (180, 90, 90), False),
+        ((240, 185, 185), (200, 150, 150), True),
+        ((240, 175, 175), (200, 150, 150), False),
+    ],
+)
+def test_a_highlight_is_bright_nearly_white_and_brighter_than_its_surroundings(colour, tissue, found):
+    assert (without_highlights(spotted(colour, tissue)) is not None) == found
+
+
+@pytest.mark.parametrize(("size", "grown"), [((64, 80), 1), ((512, 640), 2)])
+def test_highlights_grow_by_a_pixel_at_least_and_by_two_of_640(size, grown):
+    kept = without_highlights(spotted(255, (180, 90, 90), size))
+    rows, columns = np.nonzero(kept == 0)
+    assert (np.ptp(rows) + 1, np.ptp(columns) + 1) == (9 + 2 * grown, 9 + 2 * grown)
+    assert rows.min() == size[0] // 2 - grown and columns.min() == size[1] // 2 - grown
+
+
+@pytest.mark.parametrize(("apart", "found"), [(12, True), (7, False)])
+def test_white_dots_all_over_are_no_highlights(apart, found):
+    """Dots of 4 x 4 pixels cover a ninth of the picture 12 apart, and a third 7 apart."""
+    image = np.full((256, 320, 3), (180, 20, 20), np.uint8)
+    for y in range(0, 256, apart):
+        for x in range(0, 320, apart):
+            image[y : y + 4, x : x + 4] = 255
+    assert (without_highlights(image) is not None) == found
+
+
+def test_what_is_black_beyond_the_field_of_view_does_not_make_pale_tissue_a_highlight():
+    image = np.zeros((256, 320, 3), np.uint8)
+    cv2.circle(image, (160, 128), 80, (240, 190, 190), -1)
+    kept, inside = without_highlights(image), cv2.circle(np.zeros((256, 320), np.uint8), (160, 128), 70, 1, -1)
+    assert kept is None or kept[inside > 0].all()
+
+
+def test_a_white_area_wider_than_the_surroundings_is_kept_in_its_middle():
+    kept = without_highlights(spotted(250, (180, 90, 90), side=80))
+    assert kept is None or kept[128 + 30 : 128 + 50, 160 + 30 : 160 + 50].all()
+    assert not without_highlights(spotted(250, (180, 90, 90), side=15))[128 : 128 + 15, 160 : 160 + 15].any()

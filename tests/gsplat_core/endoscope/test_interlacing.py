@@ -103,3 +103,63 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(InvalidSetting, match="comb_ratio"):
         InterlacingSettings(comb_ratio=0.5)
+
+
+def lines(amplitude, slope=0, rows=34, columns=128):
+    """A picture whose left half has odd lines brighter by `amplitude`, on a vertical ramp."""
+    y, x = np.mgrid[:rows, :columns]
+    grey = 20 + slope * y + amplitude * (y % 2) * (x < columns // 2)
+    return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("amplitude", "share"), [(4, 0.0), (6, 0.5), (60, 0.5)])
+def test_the_share_of_combs_is_that_of_the_picture_with_visible_combs(amplitude, share):
+    assert comb_share(lines(amplitude), DEFAULTS) == share
+
+
+@pytest.mark.parametrize(("slope", "share"), [(4, 0.5), (6, 0.0)])
+def test_a_vertical_gradient_hides_combs_that_are_weaker_than_it(slope, share):
+    """Lines two apart differ by twice the slope, and neighbouring lines by the amplitude on average."""
+    assert comb_share(lines(12, slope), DEFAULTS) == share
+
+
+@pytest.mark.parametrize(("rows", "columns", "share"), [(33, 128, 0.0), (34, 60, 0.0), (34, 64, 0.5)])
+def test_a_picture_of_less_than_two_blocks_has_no_combs(rows, columns, share):
+    assert comb_share(lines(60, 0, rows, columns), DEFAULTS) == share
+
+
+@pytest.mark.parametrize(("combed", "interlaced"), [((0, 4, 8), False), ((0, 4, 8, 11), True), ((0, 4, 8, 12), False)])
+def test_four_combed_pictures_among_twelve_make_a_stream_interlaced(combed, interlaced):
+    deinterlacer = Deinterlacer()
+    for k in range(20):
+        deinterlacer.process(lines(60 if k in combed else 0))
+    assert deinterlacer.interlaced == interlaced
+
+
+def test_an_interlaced_stream_stays_so_for_six_hundred_pictures_without_combs():
+    deinterlacer = Deinterlacer()
+    for _ in range(4):
+        deinterlacer.process(lines(60))
+    after = [deinterlacer.process(lines(0)) is not None and deinterlacer.interlaced for _ in range(600)]
+    assert after == [True] * 599 + [False]
+
+
+def test_a_pixel_that_stands_out_from_both_lines_is_replaced_with_two_beside_it():
+    image = np.full((12, 40, 3), 100, np.uint8)
+    image[6] = 110
+    image[5, 17:24] = 113
+    image[5, 20] = 130
+    image[8, 20] = 200
+    repaired = without_combs(image, 4)
+    assert repaired[5, 16:25, 0].tolist() == [100, 113, 105, 105, 105, 105, 105, 113, 100]
+    untouched = np.ones(image.shape, bool)
+    untouched[5, 18:23] = untouched[[7, 9], 18:23] = False
+    np.testing.assert_array_equal(repaired[untouched], image[untouched])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("levels", "replaced"), [(4, False), (5, True)])
+def test_an_excess_over_both_lines_must_exceed_the_limit(sign, levels, replaced):
+    image = np.full((9, 20, 3), 100, np.uint8)
+    image[3, 10] = 100 + sign * levels
+    assert (without_combs(image, 4)[3, 10, 0] == 100) == replaced
