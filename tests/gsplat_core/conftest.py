@@ -28,7 +28,7 @@ class Scene:
     height: int
 
     def to(self, dtype: torch.dtype) -> Scene:
-        """Return a copy of the scene in another dtype, as new leaves."""
+        """Return the scene in another dtype, as new leaves."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("width", "height")}
         return replace(self, **{name: tensor.detach().to(dtype).clone() for name, tensor in tensors.items()})
 

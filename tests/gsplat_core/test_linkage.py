@@ -1,4 +1,4 @@
-"""Symbols that the compiled libraries take from the C++ runtime, and argument errors under either linkage."""
+"""Symbols that the compiled libraries import from the C++ runtime, and refusal of arguments for every kind of linking."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def check_lists(frame: Frame) -> None:
 
 
 def plain(s: Scene) -> tuple[Tensor, Tensor]:
-    """Return `rasterization`'s picture of the scene on the GPU, moved to the CPU."""
+    """Return the result of `rasterization` for the scene, on the CPU."""
     means, quats, log_scales, logits, sh, d, viewmat, K, background = s.tensors("cuda", torch.float32)
     if d is not None:
         means, quats, log_scales, logits = (

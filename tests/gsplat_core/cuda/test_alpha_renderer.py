@@ -55,7 +55,7 @@ def assert_same_bits(output, expected):
 
 
 def assert_same_shapes(output, expected):
-    """Check alpha and depth bit for bit, and colours to 1e-5: the captured path sums in another order."""
+    """Results are bit-identical except for colours, to which the captured path adds the field's part in another order."""
     assert torch.equal(output.alpha, expected.alpha) and torch.equal(output.depth, expected.depth)
     torch.testing.assert_close(output.image, expected.image, rtol=1e-5, atol=1e-5)
 

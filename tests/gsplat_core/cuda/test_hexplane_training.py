@@ -59,7 +59,7 @@ def test_deltas_and_gradients_equal_the_reference(gpu, case):
 
 
 def shifted(tensor):
-    """Return the same values at an address one float past alignment."""
+    """Return a copy of the values that is misaligned by one float."""
     return torch.cat([tensor.new_zeros(1), tensor.flatten()])[1:].view(tensor.shape)
 
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.cuda
 
 @pytest.fixture(autouse=True)
 def calls(monkeypatch) -> list[bool]:
-    """Record for each `rasterization` call if the native path took it."""
+    """Record for each call of `rasterization` if the native implementation handled it."""
     found: list[bool] = []
     take = single_call._takes
 

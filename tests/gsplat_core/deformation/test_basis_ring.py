@@ -39,7 +39,7 @@ def wave(count: int, time_s: float) -> torch.Tensor:
 
 
 def watch(field: BasisField, time_s: float, newest_s: float, steps: int = 2, rates: BasisRates = RATES) -> None:
-    """Train the field on one frame as the reconstructor does."""
+    """Process a frame in the order of the reconstructor."""
     field.cover(time_s, newest_s)
     for _ in range(steps):
         target = wave(field.count, time_s).to(field.weights.device)

@@ -1,4 +1,4 @@
-"""Extrapolation of a field after the newest frame, and moving a field at one time."""
+"""Extrapolation of a field after the newest frame, and its displacement at one time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contract common to both deformation fields."""
+"""Properties that both deformation fields share."""
 
 import json
 

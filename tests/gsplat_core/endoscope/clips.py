@@ -49,5 +49,5 @@ def resized(images: tuple[Image, ...] | list[Image], like: Image) -> list[Image]
 
 
 def brightened(image: Image, gains: float | NDArray[np.floating]) -> Image:
-    """Return the image with camera gain applied: multiplied and clipped."""
+    """Multiply a picture by gains and clip it, as a camera with another gain does."""
     return np.clip(np.rint(image * np.asarray(gains)), 0, 255).astype(np.uint8)

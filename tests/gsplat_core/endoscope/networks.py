@@ -60,7 +60,7 @@ def grey_network(path: Path, **options: Any) -> Path:
 
 
 def external_weights(path: Path, location: str) -> Path:
-    """Write the model with its weights in an external file."""
+    """Write the grey network with its weights in another file."""
     nodes, parts = conv(*GREY)
     write(path, nodes, parts)
     model = onnx.load(str(path))

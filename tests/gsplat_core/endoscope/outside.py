@@ -172,7 +172,7 @@ OUTSIDE: dict[str, Draw] = {
     "lamps": lamps,
     "bars": bars,
 }
-"""Scenes with evidence of the outside for every seed."""
+"""Pictures with evidence of being outside the body, for every seed."""
 WITHOUT_EVIDENCE: dict[str, Draw] = {
     "black": lambda rng: plain(0, 0, 0),
     "overexposed": lambda rng: plain(255, 255, 255),
@@ -183,4 +183,4 @@ WITHOUT_EVIDENCE: dict[str, Draw] = {
     "near face": lambda rng: face(rng, close=True),
     "monitor": monitor,
 }
-"""Scenes that pass: indistinguishable from pale, red or overexposed tissue."""
+"""Pictures that pass as tissue, since they do not differ from pale, red or overexposed tissue."""

@@ -20,7 +20,7 @@ OTHERS = list(itertools.permutations(PLACES, 2))
 
 
 def verdicts(images, withheld=()):
-    """Return the reported verdicts by frame index."""
+    """Return the reported events by frame index."""
     detector, found = CutDetector(), {}
     for k, image in enumerate(images):
         if k in withheld:

@@ -16,7 +16,7 @@ DEFAULTS = InterlacingSettings()
 
 
 def woven(images):
-    """Interleave the even lines of each picture with the odd lines of the next one."""
+    """Combine the even lines of each picture with the odd lines of the next, as an interlaced camera does."""
     result = [image.copy() for image in images[:-1]]
     for image, later in zip(result, images[1:], strict=True):
         image[1::2] = later[1::2]

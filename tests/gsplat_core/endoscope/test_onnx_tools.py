@@ -90,7 +90,7 @@ def test_half_precision(tmp_path):
 
 @pytest.mark.parametrize("beside", [False, True])
 def test_normalisation_and_order_of_channels_come_from_the_model_or_from_a_file_beside_it(tmp_path, beside):
-    """Settings in the JSON file take precedence over the model's metadata."""
+    """Settings in the sidecar file override those in the model."""
     settings = {"white": 255, "mean": [10, 20, 30], "std": [2, 4, 5], "channels": "bgr", "values": "logits"}
     # Blue first: the value is zero for one colour, and both sides of it are tried.
     nodes, parts = conv([[1.0, 0.0, 0.0]], [-(150 - 30) / 5])

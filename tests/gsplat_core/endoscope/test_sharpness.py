@@ -33,7 +33,7 @@ def defocused(image):
 
 
 def moved(image, down=False):
-    """Blur the image by a scope motion of 1/40 of the picture during exposure."""
+    """Blur a picture by a motion of a fortieth of its longer side during the exposure."""
     length = round(max(image.shape) / 40) | 1
     return cv2.blur(image, (1, length) if down else (length, 1))
 

@@ -1,4 +1,4 @@
-"""Attribution of a sequence's change to the parts of a deformation, on known deformations."""
+"""Attribution of a sequence's change to the parts of a deformation, on sequences with known cause."""
 
 from __future__ import annotations
 

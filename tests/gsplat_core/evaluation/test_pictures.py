@@ -1,4 +1,4 @@
-"""Pictures for scoring are rendered at the frame's time, pose and exposure."""
+"""Scores are of the model's picture at the frame's time, pose and exposure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scoring of the right eye's view and of its trivial baselines."""
+"""Measures of the right eye's view, and the scores of trivial predictors."""
 
 import numpy as np
 import pytest

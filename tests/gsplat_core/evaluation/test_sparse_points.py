@@ -108,7 +108,7 @@ def test_a_depth_of_another_size_is_refused() -> None:
 
 
 def test_both_planes_stand_beside_points_on_a_slope() -> None:
-    """The best-fit plane of points on a tilted plane has no error, and the level plane has one."""
+    """Points on a tilted plane have no error to the best-fit plane and an error to the level plane."""
     pixels = np.mgrid[5:35:6, 5:55:8].reshape(2, -1).T[:, ::-1] + 0.5
     rays = np.column_stack([(pixels - CAMERA.K[:2, 2]) / np.diag(CAMERA.K)[:2], np.ones(len(pixels))])
     z = 3 / (1 - 0.5 * rays[:, 0])

@@ -16,7 +16,7 @@ def _way(count: int = 40) -> np.ndarray:
 
 
 def _elsewhere(poses: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Return the trajectory in another world frame: rotated, shifted and scaled."""
+    """Return a trajectory in another world frame: rotated, shifted and scaled."""
     angle = 0.8
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     moved = poses.copy()

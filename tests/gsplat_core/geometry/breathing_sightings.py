@@ -1,4 +1,4 @@
-"""Exact sightings of a breathing sheet by a swaying scope, and the poses estimated if the sheet is taken as static."""
+"""Exact point observations of a breathing sheet by a swaying scope, and the poses estimated from them for static tissue."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swayin
 def seen_for(
     length_s: float, breathes: float = 1.0, rate_hz: float = 10.0, noise_px: float = 0.2, pulled: int = 0
 ) -> tuple[Sightings, NDArray[np.float64]]:
-    """Return sightings and true poses. `pulled`: number of points dragged about without repetition."""
+    """Return the observations and the true poses. `pulled` is the number of points with irregular motion of their own."""
     times_s = np.arange(0, length_s, 1 / rate_hz)
     poses, points = swaying(times_s), places(times_s, breathes)
     points[:, :pulled] += 6 * np.clip(np.sin(times_s**1.7), 0, 1)[:, None, None] * np.array([0.5, 0.3, -0.8])

@@ -39,7 +39,7 @@ def noise(seed, cell_px):
 
 
 def pigment(seed=3, cell_px=6):
-    """Return the tissue's reflectance per channel [H, W, 3]."""
+    """Return the reflectance of the tissue per channel [H, W, 3]."""
     return PINK * np.exp(-np.maximum(noise(seed, cell_px), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
 
 

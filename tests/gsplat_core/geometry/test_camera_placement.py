@@ -75,7 +75,7 @@ def test_rounding_errors_do_not_grow():
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 9e-5, 1.1e-4, 0.3, 2.0])
 def test_a_twist_is_the_matrix_exponential(size):
-    """Compare with the power series of the 4x4 matrix, for angles on both sides of the closed form's threshold."""
+    """The motion equals the power series of the 4 x 4 matrix for angles on both sides of the switch of the closed form."""
     twist = np.array([0.4, -0.3, 0.2, *(size * np.array([0.6, -0.48, 0.64]))])
     generator = np.zeros((4, 4))
     generator[:3, :3] = [[0, -twist[5], twist[4]], [twist[5], 0, -twist[3]], [-twist[4], twist[3], 0]]

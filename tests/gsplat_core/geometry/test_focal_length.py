@@ -40,7 +40,7 @@ def sideways(share: float) -> np.ndarray:
 
 
 def seen(way, focal_px: float, points: int = POINTS) -> tuple[Observations, Trajectory]:
-    """Return noisy observations of random points by a camera with this focal length, and the true poses."""
+    """Return noisy observations of random points in a box by a camera, and its true poses."""
     random = np.random.default_rng(0)
     scene = random.uniform([-22, -18, 48], [22, 18, 72], (points, 3))
     poses = np.stack([way(number / COUNT) for number in range(COUNT)])

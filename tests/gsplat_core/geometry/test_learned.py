@@ -107,7 +107,7 @@ def test_pictures_are_normalised_as_such_networks_expect(network):
 
 
 def test_a_network_that_refuses_multiples_of_14_is_given_multiples_of_32(network):
-    """Four halvings and doublings restore the size only for multiples of 16."""
+    """A network that halves its input four times and restores its size needs multiples of 16."""
     scales = numpy_helper.from_array(np.array([1, 1, 16, 16], np.float32), "scales")
     small = helper.make_node("AveragePool", ["red"], ["small"], kernel_shape=[16, 16], strides=[16, 16])
     large = helper.make_node("Resize", ["small", "", "scales"], ["large"], mode="nearest")

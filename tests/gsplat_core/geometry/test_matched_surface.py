@@ -22,7 +22,7 @@ def plane(slope: float = 3.0) -> np.ndarray:
 
 
 def noise(seed: int = 0) -> np.ndarray:
-    """Return noise as left by matching: correlated between neighbours."""
+    """Return correlated noise like that of matched disparities."""
     rough = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH)), (0, 0), 1.5)
     return (NOISE_PX * rough / rough.std()).astype(np.float32)
 
@@ -36,7 +36,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def slopes(values: np.ndarray) -> float:
-    """Return the RMS gradient of an error map, the cause of wrong normals."""
+    """Return the slope of an error map, which determines the error of normals."""
     return rms(np.gradient(values, axis=0)) + rms(np.gradient(values, axis=1))
 
 

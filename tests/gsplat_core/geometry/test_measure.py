@@ -106,7 +106,7 @@ def test_two_surfaces_at_one_pixel_make_a_large_error():
 
 
 def test_error_bars_hold_on_a_trained_model():
-    """After training on one frame with depth most errors lie within two standard errors, and the bars stay narrow."""
+    """On a model trained on one frame with depth, most true errors are within two standard errors, and the error bars are not much wider."""
     recording = render_recording(Asked(frames=1, width_px=96, height_px=80, fps=30, seed=5))
     frame = next(iter(recording))
     learning = Reconstructor(ReconstructorConfig(gaussians=2000, max_gaussians=2500), recording.camera)

@@ -1,4 +1,4 @@
-"""Confidence of measured depth: pixels between the two sides of an edge and near-zero values are rejected."""
+"""Confidence of measured depth: pixels between the two sides of an edge and pixels near zero get none."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def slope(nearest=45.0, farthest=75.0) -> np.ndarray:
 
 
 def one_by_one(depth: np.ndarray) -> np.ndarray:
-    """Compute `measured_confidence` one pixel at a time."""
+    """Compute the confidence pixel by pixel as an independent reference."""
     known = np.isfinite(depth) & (depth > 0)
     sampled = known[2::4, 2::4]
     found = depth[2::4, 2::4][sampled] if sampled.any() else depth[known]

@@ -40,7 +40,7 @@ def test_a_slow_stream_is_looked_at_whole(monkeypatch):
 
 
 def decided(monkeypatch, points=100, hz=(0.5,), off_px=1.0, cycles=4.0, error=0.024, motion_error=0.032):
-    """Return the decision for a window with this motion. The two errors add up to 0.04."""
+    """Return the decision for a window with this motion, and its key frames. The default errors have a joint magnitude of 0.04."""
     length_s = cycles / (hz[0] if hz else 1)
     times = np.linspace(0, length_s, 41)
     keys = []

@@ -57,7 +57,7 @@ def test_what_is_not_believed_continues_what_is_and_is_believed_by_a_fifth_at_mo
 
 @pytest.mark.parametrize(("side", "is_kept"), [(2, False), (3, True)])
 def test_patches_below_fourteen_of_ten_thousand_pixels_are_speckles(side, is_kept):
-    """The limit for 5,000 pixels is 7."""
+    """In a picture of 5,000 pixels the limit is 7 pixels."""
     labels, confidence = np.full((50, 100), 10.0, np.float32), np.zeros((50, 100), np.float32)
     labels[20 : 20 + side, 20 : 20 + side], confidence[20 : 20 + side, 20 : 20 + side] = 14.0, 0.9
     found = multiview._without_speckles(labels, confidence)

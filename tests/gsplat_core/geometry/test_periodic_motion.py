@@ -22,7 +22,7 @@ def seen(
 
 
 def relative_errors(motion: PeriodicMotion, tracks: GridTracks, points: np.ndarray) -> np.ndarray:
-    """Return position errors relative to the distance from the camera [T, N]."""
+    """Return relative errors of the distance from the camera [T, N]."""
     found, true = in_cameras(motion.at(tracks.times_s), tracks.poses), in_cameras(points, tracks.poses)
     return np.abs(found[..., 2] / true[..., 2] - 1)
 

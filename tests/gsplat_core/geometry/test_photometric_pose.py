@@ -50,7 +50,7 @@ def seen(scene: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def off_px(scene: Gaussians, camera: Camera) -> float:
-    """Return the median pixel offset of the Gaussians from their places in `CAMERA`."""
+    """Return the median displacement of the Gaussians in pixels. In front of a wall, rotation and sideways motion look alike."""
     return float((seen(scene, camera) - seen(scene, CAMERA)).norm(dim=1).median())
 
 

@@ -39,7 +39,7 @@ def there_and_back() -> RenderedRecording:
 
 
 def drift(recording: RenderedRecording) -> tuple[float, LiveOdometry]:
-    """Return the drift of the last frame, taken at the first one's place, relative to the travel; and the odometry."""
+    """Return the error of the last position relative to the length of the trajectory."""
     odometry = LiveOdometry(recording.camera, measured=False)
     poses = [odometry.place(frame) for frame in recording]
     places = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])

@@ -1,4 +1,4 @@
-"""Selection of a stream's depth estimator and of the frames that it processes."""
+"""Choice of the depth estimator of a stream, and of the frames that it processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Appearance of a relief against a rendering of its points and normals, and derivatives against finite differences."""
+"""Brightness of a relief compared with a surface rendered from its points and normals, and its derivatives with finite differences."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def test_weak_evidence_leaves_the_relief_small():
 
 @pytest.fixture
 def equations(monkeypatch):
-    """Record the arguments of each `Equations` call."""
+    """Record the arguments of each call of `Equations`."""
     given = []
 
     def record(own, relief, off, weight, prior, away, tell=1.0):

@@ -1,4 +1,4 @@
-"""Extraction of the shading of a picture."""
+"""Separation of a picture into illumination, pigment and highlights."""
 
 from __future__ import annotations
 

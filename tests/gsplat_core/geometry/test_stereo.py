@@ -227,7 +227,7 @@ def surrounded(grey, rng):
 
 
 def test_a_still_pair_has_the_same_depth_in_every_frame(left, right, rng):
-    """Mismatches must not widen the next frame's disparity range, which would change that frame's matches."""
+    """Wrong matches must not widen the search range of the next frame, since that would change its depth."""
     eyes = surrounded(left, rng), surrounded(right, rng)
     estimator = StereoDepth()
     found = [estimator.estimate(frame(*eyes, seq=seq), camera()) for seq in range(5)]

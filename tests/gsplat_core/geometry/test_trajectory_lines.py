@@ -24,7 +24,7 @@ def poses(*swings: tuple[float, float, int]) -> torch.Tensor:
 
 
 def refined(poses: torch.Tensor, hz: tuple[float, ...]) -> torch.Tensor:
-    """Return the trajectory after the prior attributed these frequencies to the tissue."""
+    """Return a trajectory without the periodic part that the prior attributes to the tissue."""
     poses, swings = poses.clone(), waves(TIMES_S, hz)
     for _ in range(4):
         prior = learned_from(poses, TIMES_S, swings)

@@ -1,4 +1,4 @@
-"""Argument checks of `fully_fused_projection` and their messages."""
+"""Arguments that `fully_fused_projection` refuses, with their error messages."""
 
 from __future__ import annotations
 

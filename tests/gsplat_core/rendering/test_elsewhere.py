@@ -39,7 +39,7 @@ def at(model, time_s, centre):
 
 
 def squared_error(recorded, shown):
-    """Return the error of the third camera's pictures over tissue that the scope also sees."""
+    """Return the error of the third camera's pictures on tissue that the scope sees as well."""
     recording, truth, model = recorded
     errors = []
     for frame in recording:

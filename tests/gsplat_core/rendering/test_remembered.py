@@ -1,4 +1,4 @@
-"""Share of a picture that comes from Gaussians currently out of view, against a reference and known scenes."""
+"""Share of a picture that shows remembered Gaussians, compared with the reference and with exact cases."""
 
 from __future__ import annotations
 

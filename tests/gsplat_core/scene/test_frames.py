@@ -1,4 +1,4 @@
-"""Validation of frames, and their properties for the right eye and depth."""
+"""Values that a frame refuses, and its statements about the right eye and depth."""
 
 from __future__ import annotations
 

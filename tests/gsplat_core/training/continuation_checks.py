@@ -1,4 +1,4 @@
-"""Checks of a published state after its newest frame, for any motion prior."""
+"""Checks of a published state after its newest frame, for every motion prior."""
 
 from __future__ import annotations
 

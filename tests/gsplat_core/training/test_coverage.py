@@ -1,4 +1,4 @@
-"""Detection of uncovered pixels, and the count from which Gaussians are added."""
+"""Detection of uncovered pixels, and the number of them from which Gaussians are added."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Expected share of the last motion that continues."""
+"""Estimate of the share of the last motion that continues."""
 
 from __future__ import annotations
 

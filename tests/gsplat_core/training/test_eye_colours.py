@@ -1,4 +1,4 @@
-"""Matching of the right eye's colours to the left eye's."""
+"""Matching of the right eye's colours to those of the left one."""
 
 from itertools import pairwise
 

@@ -11,7 +11,7 @@ from gsplat_core.training.image_motion import ImageMotion, revealed_px, typical_
 
 
 def texture(shift_x: float, shift_y: float, size: tuple[int, int] = (96, 128)) -> NDArray[np.uint8]:
-    """Return a smooth random picture, shifted."""
+    """Return a smooth random picture, moved."""
     noise = np.random.default_rng(0).uniform(0, 255, (size[0] + 104, size[1] + 112, 3)).astype(np.float32)
     smooth = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX)
     height, width = size

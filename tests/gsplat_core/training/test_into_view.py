@@ -1,4 +1,4 @@
-"""Gaussians for tissue that a moving camera brings into view exist before training on the frame."""
+"""Tissue that a moving camera brings into view is added before training on the frame."""
 
 from __future__ import annotations
 

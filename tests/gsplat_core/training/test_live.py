@@ -110,7 +110,7 @@ def test_another_scene_of_another_size_begins_in_the_middle():
 
 @pytest.mark.parametrize("preallocate", [False, True])
 def test_a_scene_that_begins_again_is_as_good_as_the_first_one(preallocate):
-    """Equal frames give equal models, independent of earlier training."""
+    """A model depends only on the frames since the reset, not on earlier training."""
     fresh, used = reconstructor(preallocate=preallocate), reconstructor(preallocate=preallocate)
     for k in range(10, 14):
         used.observe(frame_at(k), budget=Budget.of_steps(5))

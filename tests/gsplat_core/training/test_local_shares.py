@@ -16,7 +16,7 @@ def noise(seed: int, shape: tuple[int, int, int] = (48, 64, 3)) -> NDArray[np.fl
 
 
 def taught(shares: LocalShares, share_of: NDArray[np.float32], frames: int = 10) -> LocalShares:
-    """Train on targets made of the first guess alone, in shares [h, w]."""
+    """Teach `shares` that the next motion is a local share [h, w] of the first prediction."""
     weight = np.ones(share_of.shape, np.float32)
     for seed in range(frames):
         first, second = noise(2 * seed), noise(2 * seed + 1)

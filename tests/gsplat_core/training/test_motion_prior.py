@@ -1,4 +1,4 @@
-"""Motion prior after the newest frame: predictions for moving, still and broken streams."""
+"""Motion predicted after the newest frame of moving, still and interrupted streams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of frames to observations, and selection of frames for training steps."""
+"""Conversion of frames to observations, and the choice of observations for training steps."""
 
 from dataclasses import replace
 

@@ -164,7 +164,7 @@ def test_the_archive_is_bounded_and_counts_what_it_drops():
 
 
 def test_a_published_model_knows_what_was_not_seen(device):
-    """The first view counts as seen, and no longer after the scope has moved by one picture."""
+    """A published model counts tissue as seen at first and as remembered once the scope has left it."""
     made = reconstructor(2000, device)
     here, there = frame_at(0, 0), frame_at(60, WIDTH, time_s=2.0)
 

@@ -1,4 +1,4 @@
-"""Selection of frames for depth from camera motion, and of recordings that are left unchanged."""
+"""Selection of frames that get depth from the camera's motion, and of recordings that get none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Input rejected by a reconstructor leaves its model unchanged."""
+"""A reconstructor refuses invalid input and leaves its model unchanged."""
 
 from __future__ import annotations
 

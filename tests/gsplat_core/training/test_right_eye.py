@@ -207,7 +207,7 @@ def tinted(seq: int) -> Frame:
 
 @pytest.mark.parametrize(("way", "better_db"), [("online", 0.1), ("offline", 0.2), ("live", 4)])
 def test_each_eye_keeps_its_own_colours(way, better_db):
-    """Content of one eye stays out of the other eye's picture and reaches its own, at once if colours are corrected."""
+    """A tint of one eye appears in its own rendered picture and not in that of the other eye."""
     frames = [tinted(seq) for seq in range(4)]
     if way == "live":
         config = dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True)

@@ -1,4 +1,4 @@
-"""Prediction from earlier moments that resemble the current one."""
+"""Prediction of the next motion from what followed similar earlier moments."""
 
 from __future__ import annotations
 

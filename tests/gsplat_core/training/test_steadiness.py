@@ -1,4 +1,4 @@
-"""Evenness of the change between pictures."""
+"""Measure of the regularity of changes between pictures."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from gsplat_core.training.surface_tracks import steady_course
 from tests.gsplat_core.training.two_eyes import LEFT, stereo_frame
 
 NEAREST_MM = 48.0
-"""Distance of the nearest point of the surface."""
+"""Smallest distance of the surface in millimetres."""
 
 
 def still_frames(count: int, wrong_in: tuple[int, ...], factor: float) -> list[Frame]:

@@ -48,7 +48,7 @@ def points_of(asked: Asked) -> torch.Tensor:
 
 
 def seen_throughout(recording, points: torch.Tensor) -> torch.Tensor:
-    """Return the mask of points [P] that all frames show well inside the picture and off the tool."""
+    """Return True for points that all frames show well inside the picture and off the tool [P]."""
     shown = torch.ones(points.shape[1], dtype=torch.bool)
     for frame, here in zip(recording, points, strict=True):
         seen = Seen(recording.camera.with_pose(frame.pose), here)
@@ -139,7 +139,7 @@ def test_between_what_is_known():
 
 
 def test_a_model_has_the_motion_along_the_line_of_sight_after_few_steps(fixed):
-    """Optimiser steps alone cannot learn it: positions move by hundredths of a pixel per step."""
+    """Steps alone would not learn this motion, since positions move by hundredths of a pixel in a step."""
     config = replace(ReconstructorConfig.offline(), gaussians=1500, max_gaussians=2000)
     learner = Reconstructor(config, fixed.camera)
     learner.fit(list(fixed), 24)

@@ -1,4 +1,4 @@
-"""Gaussians without observations stay in place, and unneeded Gaussians are removed."""
+"""Gaussians that no picture shows stay in place, and Gaussians that no picture needs are removed."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def true_depth(width: int, height: int) -> np.ndarray:
 
 @cache
 def surface() -> Gaussians:
-    """Return the scene's Gaussians, which reach beyond the cameras' pictures."""
+    """Return the Gaussians of the scene, which extends beyond the fields of view of both cameras."""
     width, height = WIDTH + 2 * MARGIN, HEIGHT + 2 * MARGIN
     wide = Camera.from_focal(60.0, width, height)
     random = np.random.default_rng(3)

@@ -15,7 +15,7 @@ from operators.sources.source import SourceState
 
 
 class Scripted:
-    """Source with prepared results; None stands for a timeout. Its state is that after the last read."""
+    """Source that returns the given frames, and None where no frame arrived in time. Its state is that after the last read."""
 
     def __init__(self, given, digest="d"):
         self.given, self.calls = given, []

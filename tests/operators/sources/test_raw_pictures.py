@@ -13,7 +13,7 @@ BYTES = {
     "rgb24": 1683, "bgr24": 1683, "rgba": 2244, "bgra": 2244, "gray": 561, "yuv420p": 867, "yuvj420p": 867, "yuv422p": 1139,
     "yuv444p": 1683, "nv12": 867, "yuyv422": 1156, "uyvy422": 1156,
 }  # fmt: skip
-"""Bytes of one picture of that odd size: half a chroma pixel is rounded up."""
+"""Bytes of one picture of this odd size. Half a pixel of chroma is stored as a whole one."""
 
 
 def test_each_format_takes_its_bytes():

@@ -1,4 +1,4 @@
-"""Data from shared memory is validated before it is read."""
+"""Headers of shared memory are checked before any data is read."""
 
 from __future__ import annotations
 

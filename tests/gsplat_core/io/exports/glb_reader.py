@@ -86,7 +86,7 @@ def accessor(document: dict[str, Any], binary: bytes, index: int, target: int = 
 
 
 def check_gaussians(document: dict[str, Any], primitive: dict[str, Any], values: dict[str, np.ndarray]) -> None:
-    """Check a primitive against KHR_gaussian_splatting with the kernel `ellipse`."""
+    """Check the attributes that KHR_gaussian_splatting requires of a primitive with the kernel `ellipse`."""
     said = primitive["extensions"][NAME]
     assert said["kernel"] == "ellipse" and said["colorSpace"] in ("srgb_rec709_display", "lin_rec709_display")
     assert said.get("projection", "perspective") == "perspective"

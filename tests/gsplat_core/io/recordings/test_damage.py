@@ -46,7 +46,7 @@ def _read(path: Path) -> tuple[list[Frame], bool]:
 
 
 def _unseen(path: Path, intact: list[Frame]) -> bool | None:
-    """Return true if a changed picture is accepted without a finding. None if no picture changed."""
+    """Return True if a changed picture is accepted without an error that names the file; None if no picture changed."""
     frames, whole = _read(path)
     changed = [
         frame

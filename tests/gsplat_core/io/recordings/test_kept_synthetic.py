@@ -19,7 +19,7 @@ ONE = 2 * (40 * 32 * (3 + 3 + 4 + 1) + 128)
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """Record the requests that were rendered instead of read from the cache."""
+    """Record which recordings were rendered instead of read from a file."""
     asked = []
 
     def render(what, progress=None):

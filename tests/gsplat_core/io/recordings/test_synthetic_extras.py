@@ -1,4 +1,4 @@
-"""Optional parts of synthetic recordings: other scenes, a third camera, exact motion, noise, smoke, exposure."""
+"""Optional parts of synthetic recordings: another scene, a third camera, exact motion, noise, smoke, exposure."""
 
 from __future__ import annotations
 

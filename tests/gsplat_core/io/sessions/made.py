@@ -49,7 +49,7 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
 
 
 def same_frame(a: Frame, b: Frame) -> bool:
-    """Return true if two frames agree bit for bit, except `arrived_ns` and `live`, which replay lacks."""
+    """Return True if two frames are bit-identical except for `arrived_ns` and `live`, which a replay does not have."""
     planes = [
         (getattr(a, n), getattr(b, n))
         for n in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "pose")

@@ -48,7 +48,7 @@ def plays(folder: Path, frames: list[Frame]) -> list[int]:
 
 
 def whole_before(path: Path, at: int) -> int:
-    """Return the number of pictures or lines of a file that end before a byte offset."""
+    """Return the number of pictures or lines of a file that end before a byte."""
     if path.suffix == ".jsonl":
         return path.read_bytes()[:at].count(b'"event":"frame"')
     with path.open("rb") as file:
