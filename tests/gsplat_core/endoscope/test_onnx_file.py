@@ -126,3 +126,56 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
         OnnxToolFinder(tmp_path / "missing.onnx")
     with pytest.raises(InvalidSetting, match="cannot be read"):
         OnnxToolFinder(tmp_path)
+
+
+def tagged(number: int, payload: bytes) -> bytes:
+    """Encode a length-delimited protobuf field with any field number below 2048."""
+    tag = number << 3 | 2
+    head = bytes([tag]) if tag < 0x80 else bytes([tag & 0x7F | 0x80, tag >> 7])
+    length = len(payload)
+    return head + (bytes([length]) if length < 0x80 else bytes([length & 0x7F | 0x80, length >> 7])) + payload
+
+
+BY_KEY, BY_LOCATION = tagged(13, b""), bytes([14 << 3, 1])
+PATHS = {
+    "initializer": (7, 5),
+    "sparse values": (7, 15, 1),
+    "sparse indices": (7, 15, 2),
+    "tensor of an attribute": (7, 1, 5, 5),
+    "tensors of an attribute": (7, 1, 5, 10),
+    "graph of an attribute": (7, 1, 5, 6, 5),
+    "graphs of an attribute": (7, 1, 5, 11, 5),
+    "sparse tensor of an attribute": (7, 1, 5, 22, 1),
+    "sparse tensors of an attribute": (7, 1, 5, 23, 2),
+    "training initialization": (20, 1, 5),
+    "training algorithm": (20, 2, 5),
+    "function node": (25, 7, 5, 5),
+    "function attribute": (25, 11, 5),
+}
+"""Field numbers of onnx.proto from the model to a tensor."""
+
+
+@pytest.mark.parametrize("tensor", [BY_KEY, BY_LOCATION])
+@pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
+@pytest.mark.parametrize(
+    "before", [b"", b"\x09" + bytes(8), b"\x0d" + bytes(4), b"\x08\xff\x01", tagged(9, bytes(300))]
+)
+def test_external_tensors_are_found_at_every_place_of_the_format(path, tensor, before):
+    """Fields of every wire type before the tensor are skipped."""
+    message = before + tensor
+    for number in reversed(path):
+        message = before + tagged(number, message)
+    assert has_external_data(message)
+    assert not has_external_data(message.replace(tensor, tagged(9, bytes(len(tensor) - 2))))
+
+
+@pytest.mark.parametrize(
+    "data", [b"\x09" + bytes(7), b"\x0d" + bytes(3), b"\x0a\x03ab", b"\x08" + b"\xff" * 10, b"\x08\x80"]
+)
+def test_messages_that_end_within_a_field_are_refused(data):
+    with pytest.raises(ValueError, match=r"ends too early|more than 64 bits"):
+        has_external_data(data)
+
+
+def test_values_in_the_tensor_are_not_external():
+    assert not has_external_data(tagged(7, tagged(5, bytes([14 << 3, 0]))))

@@ -225,3 +225,41 @@ def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
         InvalidSetting, match=r"needs the package onnxruntime .*install intrasplat with the extra `onnx`"
     ):
         OnnxToolFinder(grey_network(tmp_path / "net.onnx"))
+
+
+@pytest.mark.parametrize(("threshold", "tool_at"), [(0.5, 0.0), (0.9, np.log(9)), (0.1, -np.log(9))])
+def test_the_threshold_is_a_probability_of_the_best_tool_class_against_the_best_other_class(
+    tmp_path, threshold, tool_at
+):
+    """For two classes the probability is the logistic function of the difference of the scores."""
+    finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", metadata={"threshold": threshold, "values": "logits"}))
+    for margin, is_tool in ((-0.1, False), (0.1, True)):
+        single = np.full((1, 1, 8, 8), tool_at + margin, np.float32)
+        assert (finder._score(single) >= 0).all() == is_tool
+        scores = np.zeros((1, 4, 8, 8), np.float32)
+        scores[0, :, :, :] = np.array([5, 5 + tool_at + margin, -9, 2 - 9 + tool_at])[:, None, None]
+        assert (finder._score(scores) >= 0).all() == is_tool
+
+
+def test_infinite_scores_are_compared_without_becoming_nan(tmp_path):
+    finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx"))
+    scores = np.zeros((1, 3, 4, 4), np.float32)
+    scores[0, 0], scores[0, 1:] = -np.inf, -np.inf
+    scores[0, 1, :2], scores[0, 0, 2:] = np.inf, np.inf
+    assert (finder._score(scores)[:2] > 0).all() and (finder._score(scores)[2:] < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [((1024, 1280), (512, 640)), ((50, 100), (64, 96)), ((10, 10), (32, 32)), ((1280, 640), (640, 320))],
+)
+def test_networks_of_any_size_get_multiples_of_32_of_at_most_640(tmp_path, image, expected):
+    network = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=("h", "w")))._network
+    assert network.run(np.zeros((*image, 3), np.uint8)).shape[2:] == expected
+
+
+def test_large_pictures_are_averaged_on_reduction(tmp_path):
+    nodes, parts = conv([[1.0, 0.0, 0.0]], [0.0])
+    network = OnnxToolFinder(write(tmp_path / "net.onnx", nodes, parts))._network
+    chequers = np.repeat(((np.indices((128, 160)).sum(0) % 2) * 255)[..., None], 3, axis=2).astype(np.uint8)
+    np.testing.assert_allclose(network.run(chequers), 0.5, atol=0.01)

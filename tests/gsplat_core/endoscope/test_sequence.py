@@ -138,3 +138,66 @@ def test_no_picture_of_any_size_raises(height, width, seed, flat):
 def test_settings_out_of_range_are_refused_by_name(wrong):
     with pytest.raises(InvalidSetting, match=next(iter(wrong))):
         SequenceSettings(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "expected"),
+    [(0.2, ["duplicate", "frozen"]), (0.1, ["duplicate"] * 2 + ["frozen"]), (1.0, ["duplicate", "frozen"])],
+)
+def test_a_stream_freezes_after_a_quarter_of_a_second_and_two_repetitions(interval_s, expected):
+    check, image = SequenceCheck(), texture(1, 1)[0]
+    found = [check.fault(image, round(k * interval_s * 1e9)) for k in range(len(expected) + 1)]
+    assert found == [None, *expected]
+
+
+def test_a_stream_with_a_clock_that_stands_still_freezes_after_eight_repetitions():
+    check, image = SequenceCheck(), texture(1, 1)[0]
+    assert [check.fault(image, 0) for _ in range(9)] == [None, *["duplicate"] * 7, "frozen"]
+
+
+@pytest.mark.parametrize(("period_px", "fault"), [(10, None), (8, None), (5, "noise"), (4, "noise")])
+def test_stripes_are_noise_where_neighbours_differ_by_half_as_much_as_unrelated_pixels(period_px, fault):
+    """For a sine this ratio is 1 - cos(2 pi / period)."""
+    x = np.tile(128 + 60 * np.sin(2 * np.pi * (np.arange(160) + 0.3) / period_px), (128, 1))
+    image = np.repeat(np.rint(x)[..., None], 3, axis=2).astype(np.uint8)
+    assert SequenceCheck().fault(image, 0) == fault
+
+
+@pytest.mark.parametrize(("size", "fault"), [((31, 160), None), ((32, 160), "noise")])
+def test_small_pictures_are_not_tested_for_noise(size, fault):
+    image = np.random.default_rng(0).integers(0, 256, (*size, 3), np.uint8)
+    assert SequenceCheck().fault(image, 0) == fault
+
+
+@pytest.mark.parametrize(("share", "fault"), [(0.05, None), (0.15, "torn"), (0.85, "torn"), (0.97, None)])
+def test_a_tear_has_a_least_height_on_both_sides(share, fault):
+    images = with_changed(texture(1, 20), 12, lower_part_of_the_one_before(1 - share))
+    assert faults(images)[12] == fault
+
+
+@pytest.mark.parametrize(("index", "fault"), [(3, None), (9, "torn")])
+def test_tears_are_found_once_the_moving_rows_are_known(index, fault):
+    assert faults(with_changed(texture(1, 12), index, lower_part_of_the_one_before(0.5)))[index] == fault
+
+
+def test_a_grey_lower_part_is_a_tear():
+    assert faults(with_changed(texture(1, 20), 12, grey_below))[12] == "torn"
+
+
+@pytest.mark.parametrize(("lit", "fault"), [(0.02, "black"), (0.05, None)])
+def test_a_black_picture_may_have_a_few_lit_pixels(lit, fault):
+    image = np.zeros((128, 128, 3), np.uint8)
+    image[: round(128 * lit)] = np.random.default_rng(0).integers(60, 62, (round(128 * lit), 128, 3))
+    found = SequenceCheck(SequenceSettings(one_colour_levels=0, odd_share=0.03)).fault(image, 0)
+    assert (found == "black") == (fault == "black")
+
+
+@pytest.mark.parametrize(("spread", "is_one_colour"), [(3, True), (12, False)])
+def test_one_colour_has_a_small_spread_in_every_channel(spread, is_one_colour):
+    rng = np.random.default_rng(0)
+    image = np.full((128, 128, 3), (120, 60, 50), np.uint8)
+    for channel in range(3):
+        spotted = image.copy()
+        spotted[:, ::8, channel] += rng.integers(0, spread + 1, (128, 16), np.uint8)
+        spotted[:, ::16, channel] += np.uint8(spread - 3)
+        assert (SequenceCheck().fault(spotted, 0) == "one colour") == is_one_colour

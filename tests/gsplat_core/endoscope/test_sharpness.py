@@ -271,3 +271,55 @@ def test_usual_sharpness_is_that_of_a_second_and_a_half_and_of_five_frames_at_le
         gate.fault(np.zeros((2, 2, 3), np.uint8), round(k * 1e9 / fps))
     assert len(gate._recent) == pytest.approx(frames, abs=1)
     assert len(gate._clear) == 300 and gate._clear_count == 120
+
+
+def waves(across, down, size=(256, 320), amplitude=50.0):
+    y, x = np.mgrid[: size[0], : size[1]]
+    grey = 128 + amplitude * (np.sin(2 * np.pi * x / across) + np.sin(2 * np.pi * y / down)) / 2
+    return np.repeat(np.rint(grey)[..., None], 3, axis=2).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("across", "down"), [(32, 32), (40, 32), (64, 40)])
+def test_sharpness_of_sine_waves_is_the_ratio_of_their_differences(across, down):
+    """The difference of a sine over d pixels has the amplitude 2 sin(pi d / period)."""
+    seen = appearance(waves(across, down))
+    expected = [np.sin(np.pi / period) / np.sin(8 * np.pi / period) for period in (down, across)]
+    assert [seen.rows, seen.columns] == pytest.approx(expected, rel=0.06)
+
+
+def test_large_pictures_are_measured_at_320_pixels():
+    large = np.repeat(np.repeat(waves(40, 40), 4, 0), 4, 1)
+    small, seen = appearance(waves(40, 40)), appearance(large)
+    assert (seen.rows, seen.columns) == pytest.approx((small.rows, small.columns), rel=0.02)
+
+
+def test_contrast_saturation_and_haze_of_two_colours():
+    image = waves(32, 32, amplitude=4)[..., :1] - 128.0
+    image = np.concatenate([image[:, :160] + [120, 60, 80], image[:, 160:] + [200, 100, 150]], axis=1)
+    seen = appearance(np.rint(image).astype(np.uint8))
+    grey = np.array([[120, 60, 80], [200, 100, 150]]) @ [0.299, 0.587, 0.114]
+    assert seen.contrast == pytest.approx(np.log(grey[1] + 1) / 2 - np.log(grey[0] + 1) / 2, rel=0.03)
+    assert seen.saturation == pytest.approx(0.5, abs=0.02) and seen.haze == pytest.approx(58, abs=2)
+
+
+@pytest.mark.parametrize(("rows", "is_measured"), [(2, False), (26, True)])
+def test_a_picture_needs_some_usable_pixels(rows, is_measured):
+    kept = np.zeros((256, 320), np.uint8)
+    kept[100 : 100 + rows] = 1
+    assert (appearance(waves(32, 32), kept) is not None) == is_measured
+    dark = waves(32, 32)
+    dark[kept == 0] = 5
+    assert (appearance(dark) is not None) == is_measured
+
+
+def test_a_flat_picture_has_no_sharpness():
+    assert appearance(np.full((256, 320, 3), 120, np.uint8)) is None
+    assert appearance(waves(32, 32, (16, 16))) is None and appearance(waves(32, 32, (18, 18))) is not None
+
+
+def test_usual_sharpness_is_the_median_weighted_by_the_intervals():
+    gate = SharpnessGate()
+    gate._recent.extend([(0.1, 0.3, 0.9), (0.1, 0.4, 0.8), (1.0, 0.5, 0.2)])
+    assert gate._usual_sharpness() == (0.5, 0.2)
+    gate._recent.extend([(1.0, 0.3, 0.6), (1.0, 0.4, 0.7)])
+    assert gate._usual_sharpness() == (0.4, 0.6)

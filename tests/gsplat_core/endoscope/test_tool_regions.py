@@ -125,7 +125,7 @@ def test_the_rim_of_the_field_of_view_counts_as_the_border_of_the_picture_and_it
         seen = tool_regions(view(np.where(where, TOOL, np.where(inside, TISSUE, 0.0)), black, inside))
         np.testing.assert_array_equal(seen, where if found else 0 * where)
     # Grey tissue that fades inwards has an edge only at the rim, where the picture ends.
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    _, x = np.mgrid[:HEIGHT, :WIDTH]
     fading = np.where(inside > 0, np.clip((x - 15) / 90, 0, 1), 1.0)
     assert not tool_regions(view(fading, black, inside)).any()
 

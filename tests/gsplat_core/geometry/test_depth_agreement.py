@@ -123,3 +123,33 @@ def test_offline_all_depth_is_kept_where_most_looks_are_confirmed(factors: tuple
     given = _confirmed(frames, cameras, Counter())
     assert sum(frame.depth is not None for frame in given.frames) == kept
     assert given.doubts.get(UNCONFIRMED, 0) == 5 - kept and given.at_rest
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.05, 1.5])
+def test_disagreement_is_the_logarithm_of_a_wrong_scale_over_the_spread_of_the_relief(factor: float) -> None:
+    depth = true_depth(CAMERA).astype(np.float64)
+    spread = np.median(np.abs(np.log(depth) - np.median(np.log(depth))))
+    found = disagreement(look(CAMERA), look(CAMERA, (factor * depth).astype(np.float32)))
+    assert found == pytest.approx(abs(np.log(factor)) / spread, rel=0.03)
+
+
+@pytest.mark.parametrize(("rows", "is_compared"), [(6, False), (14, True)])
+def test_looks_must_share_a_tenth_of_the_picture(rows: int, is_compared: bool) -> None:
+    depth = true_depth(CAMERA)
+    depth[rows:] = 0
+    assert np.isfinite(disagreement(look(CAMERA), look(CAMERA, depth))) == is_compared
+    assert np.isfinite(disagreement(look(CAMERA, depth), look(CAMERA))) == is_compared
+
+
+@pytest.mark.parametrize(("size", "compared"), [((640, 480), (120, 160)), ((100, 80), (80, 100))])
+def test_large_depth_maps_are_compared_at_160_pixels(size: tuple[int, int], compared: tuple[int, int]) -> None:
+    camera = Camera.from_focal(100.0, *size)
+    depth = np.full(size[::-1], 50, np.float32)
+    depth[:, : size[0] // 2] = 0
+    confidence = np.full(size[::-1], 0.9, np.float32)
+    confidence[: size[1] // 2] = 0.1
+    found = Look.of(depth, confidence, camera)
+    assert found.inverse.shape == found.believed.shape == compared
+    columns, rows = np.arange(compared[1]) >= compared[1] // 2, np.arange(compared[0]) >= compared[0] // 2
+    np.testing.assert_allclose(found.inverse, np.tile(columns / 50, (compared[0], 1)))
+    np.testing.assert_array_equal(found.believed, columns[None] & rows[:, None])

@@ -8,7 +8,7 @@ import torch
 from gsplat_core import reference
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0
-from gsplat_core.training.colour_correction import LEAST_WEIGHT_PX, colour_correction
+from gsplat_core.training.colour_correction import LEAST_WEIGHT_PX, ResidualTarget, colour_correction
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.photometric import LossWeights, loss_and_gradients
 
@@ -112,3 +112,15 @@ def test_every_loss_has_the_correction_of_the_squared_error_and_keeps_its_own_gr
     for name in ("means", "quats", "log_scales", "logit_opacities"):
         assert_near(compared.gradients[name], plain.gradients[name], of_largest=1e-5)
     assert plain.gradients["sh"][:, 0].any() and not compared.gradients["sh"][:, 0].any()
+
+
+def test_the_residual_target_is_the_tissue_of_the_observation_minus_the_picture():
+    seen, shown = observation(5, 4), torch.rand(4, 5, 4, generator=torch.Generator().manual_seed(3))
+    target = ResidualTarget(seen.image)
+    target.take(seen.image.flip(0), 1 - seen.mask)
+    target.take(seen.image, 3 * seen.mask)
+    found = target.correction(shown, torch.tensor([1.5]))
+    tissue = (seen.mask > 0).double()[..., None]
+    expected = torch.cat([tissue * (seen.image.double() / 255 - shown[..., :3].double()), tissue], -1)
+    torch.testing.assert_close(found.residuals.double(), expected, atol=1e-6, rtol=0)
+    assert found.relaxation.tolist() == [1.5]

@@ -19,7 +19,7 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen
-from gsplat_core.training.surface_tracks import SurfaceTracks, between_known
+from gsplat_core.training.surface_tracks import SurfaceDepth, SurfaceTracks, between_known, steady_course
 
 FRAMES, FPS = 12, 8.0
 ASKED = Asked(FRAMES, 192, 160, FPS, seed=1)
@@ -171,3 +171,32 @@ def test_depth_that_is_uncertain_from_frame_to_frame_does_not_move_tissue_at_res
     assert (found - points[:, None]).norm(dim=2)[:, [0, FRAMES - 1]].median() > 0.2, (
         "across the picture they go with the flow"
     )
+
+
+def test_a_course_is_shrunk_by_the_share_of_noise_of_its_uneven_samples():
+    """Compared with a scalar computation in float64 of a Wiener filter towards the median."""
+    times = torch.tensor([0.0, 1.0, 1.5, 4.0, 5.0, 9.0, 9.5], dtype=torch.float64)
+    random = torch.Generator().manual_seed(0)
+    smooth = 1 + 0.1 * torch.linspace(0, 1, 7, dtype=torch.float64)
+    values = smooth + torch.tensor([[0.0], [0.01], [0.05]]) * torch.randn(3, 7, generator=random, dtype=torch.float64)
+    found = steady_course(values, times)
+    for row, out in zip(values.tolist(), found.tolist(), strict=True):
+        middle, noise = sorted(row)[3], []
+        for k in range(1, 6):
+            share = float((times[k] - times[k - 1]) / (times[k + 1] - times[k - 1]))
+            between = (1 - share) * row[k - 1] + share * row[k + 1]
+            noise.append((row[k] - between) ** 2 / (1 + share**2 + (1 - share) ** 2))
+        variation = sum((value - middle) ** 2 for value in row) / 7
+        kept = min(1.0, max(0.0, 1 - sum(noise) / 5 / variation))
+        assert out == pytest.approx([middle + kept * (value - middle) for value in row])
+
+
+def test_depth_is_read_between_pixels_and_not_beside_a_hole():
+    depth = np.tile(np.linspace(40, 60, 21, dtype=np.float32), (15, 1))
+    depth[7, 10] = 0
+    found = SurfaceDepth.of(depth, torch.device("cpu"))
+    pixels = torch.tensor([[3.5, 3.5], [4.0, 3.5], [16.25, 11.0], [10.5, 7.5], [9.0, 7.5], [11.8, 8.6]])
+    smooth, ratio = found.at(pixels)
+    torch.testing.assert_close((smooth * ratio)[:3], torch.tensor([43.0, 43.5, 55.75]))
+    assert ratio[3:].tolist() == [0, 0, 0] and (smooth[3:] - pixels[3:, 0] - 39.5).abs().max() < 1
+    assert SurfaceDepth.of(np.full((4, 5), np.nan, np.float32), torch.device("cpu")) is None
