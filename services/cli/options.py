@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.plain_numbers import is_plain
+from gsplat_core.plain_numbers import is_plain, plain_float
 from operators.options import Command, Declared, Section, options_for, options_of
 from operators.settings import ReplayOptions
 
@@ -226,7 +226,7 @@ def _value(each: Declared, given: Any) -> Any:
     if given == each.option.word:
         return None
     try:
-        return float(given)
+        return plain_float(given)
     except ValueError:
         raise InvalidSetting(f"{each.name} is {given!r:.60}; give {each.option.word}, or a number") from None
 
