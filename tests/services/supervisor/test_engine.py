@@ -22,7 +22,7 @@ def test_every_setting_of_the_specification_reaches_the_session(tmp_path):
     }  # fmt: skip
     settings = engines.live_settings(EngineSpec(**chosen, budget_ms=70.0), tmp_path / "out", "scope")
     assert {name: getattr(settings, name) for name in chosen} == chosen
-    assert (settings.source, settings.out, settings.clock.budget_ms) == ("scope", tmp_path / "out", 70.0)
+    assert (settings.source, settings.out, settings.budget_ms) == ("scope", tmp_path / "out", 70.0)
     assert not settings.report, "an endless session writes no output that grows"
 
 
