@@ -27,8 +27,7 @@ from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 

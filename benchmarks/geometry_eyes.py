@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.evaluation.views import EVERY, evaluate_second_eye, matched_disparity
-from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera

@@ -19,10 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.depth.light import LightDepth, frames_with_light
+from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
-from gsplat_core.geometry.depth_map import BELIEVED
-from gsplat_core.geometry.light import LightDepth
-from gsplat_core.geometry.light_of_recording import frames_with_light
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.scene.cameras import Camera

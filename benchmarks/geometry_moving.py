@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from run_facts import run_facts
 
+from gsplat_core.depth.maps import BELIEVED
+from gsplat_core.depth.moving_tissue import MovingTissue
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
-from gsplat_core.geometry.depth_map import BELIEVED
-from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 

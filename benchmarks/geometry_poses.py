@@ -27,15 +27,15 @@ import torch
 from geometry_moving import add_breathing_options, asked_breathing, breathing_facts
 from run_facts import run_facts
 
+from gsplat_core.depth.moving_tissue import MovingTissue
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
-from gsplat_core.geometry.focal_length import trajectory_without_calibration, with_focal_length
-from gsplat_core.geometry.live_odometry import LiveOdometry
-from gsplat_core.geometry.moving_tissue import MovingTissue
-from gsplat_core.geometry.odometry import Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.poses.focal_length import trajectory_without_calibration, with_focal_length
+from gsplat_core.poses.live_odometry import LiveOdometry
+from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gsplat_core.depth.maps import measured_confidence
+from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.evaluation.depth import DepthShareSums
-from gsplat_core.geometry.measured_depth import measured_confidence
-from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 import torch
 
-from gsplat_core.geometry.depth_map import BELIEVED, DepthMap
-from gsplat_core.geometry.stereo import StereoDepth, grey
+from gsplat_core.depth.maps import BELIEVED, DepthMap
+from gsplat_core.depth.stereo import StereoDepth, grey
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.scene.cameras import Camera

@@ -35,12 +35,12 @@ from pathlib import Path
 import numpy as np
 
 from gsplat_core.evaluation.geometry import Geometry
-from gsplat_core.geometry.odometry import trajectory_of
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.truth import open_truth
+from gsplat_core.poses.odometry import trajectory_of
 from operators.applications.geometry import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay

@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 import torch
 
-from gsplat_core.geometry.disparity import SMOOTH_GREY, SMOOTHNESS
-from gsplat_core.geometry.stereo import StereoDepth
+from gsplat_core.depth.stereo import SMOOTH_GREY, SMOOTHNESS, StereoDepth
 from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
 from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
 from gsplat_core.ops.stereo_matching.stereo_matching import UNKNOWN, match_disparities

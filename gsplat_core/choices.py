@@ -13,7 +13,7 @@ from gsplat_core.registry import Registry
 
 if TYPE_CHECKING:
     from gsplat_core.deformation.field import FieldKind
-    from gsplat_core.geometry.registry import Estimator
+    from gsplat_core.depth.registry import Estimator
     from gsplat_core.rendering.renderer import RendererKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
@@ -36,12 +36,12 @@ CONTRIBUTING.md, "A renderer", describes how to add one.
 DEPTHS: Registry[Callable[..., Estimator]] = Registry(
     "depth",
     {
-        "recorded": "gsplat_core.geometry.registry:RecordedDepth",
-        "stereo": "gsplat_core.geometry.stereo:StereoDepth",
-        "light": "gsplat_core.geometry.light:LightDepth",
-        "parallax": "gsplat_core.geometry.key_frames:ParallaxDepth",
-        "onnx": "gsplat_core.geometry.learned:LearnedDepth",
-        "none": "gsplat_core.geometry.registry:NoDepth",
+        "recorded": "gsplat_core.depth.registry:RecordedDepth",
+        "stereo": "gsplat_core.depth.stereo:StereoDepth",
+        "light": "gsplat_core.depth.light:LightDepth",
+        "parallax": "gsplat_core.depth.multiview:ParallaxDepth",
+        "onnx": "gsplat_core.depth.learned:LearnedDepth",
+        "none": "gsplat_core.depth.registry:NoDepth",
     },
 )
 """Factories of depth estimators by name. A factory takes an address if its name is in `DEPTHS_WITH_ADDRESS`."""

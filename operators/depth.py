@@ -9,8 +9,8 @@ from typing import Any
 
 import cv2
 
-from gsplat_core.geometry.depth_map import BELIEVED
-from gsplat_core.geometry.registry import DepthFinder, check_depth
+from gsplat_core.depth.maps import BELIEVED
+from gsplat_core.depth.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig

@@ -6,11 +6,11 @@ import threading
 import time
 from typing import Any
 
-from gsplat_core.geometry.registry import DepthFinder, check_depth
+from gsplat_core.depth.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import use_one_thread
-from gsplat_core.training.late_depth import LateDepth
+from gsplat_core.training.placement import LateDepth
 from operators.depth import DepthCounts
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.late_depth import LateDepth
 from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.placement import LateDepth
 from operators.graph.tracking import Histogram
 from operators.outcome import OutcomeBuilder
 

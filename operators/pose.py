@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.geometry.live_odometry import MOSTLY, LiveOdometry
-from gsplat_core.geometry.odometry import DISTANCE
+from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
+from gsplat_core.poses.odometry import DISTANCE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.choices import Poses

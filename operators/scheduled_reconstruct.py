@@ -17,8 +17,8 @@ from gsplat_core.io.sessions.records import (
     ScheduleLine,
 )
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.training.late_depth import MOST_LATE
 from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.placement import MOST_LATE
 from operators.messages import Reconstruction
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ReconstructOp

@@ -41,8 +41,7 @@ from gsplat_core.deformation.regularisers import least_squares_weights, towards_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS, POSITION, ROTATION
+from gsplat_core.scene.gaussians import BASIS_CHANNELS, POSITION, ROTATION, Gaussians
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 

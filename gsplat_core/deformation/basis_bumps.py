@@ -14,8 +14,7 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS
+from gsplat_core.scene.gaussians import BASIS_CHANNELS, Gaussians
 from gsplat_core.scene.rows import RowMoves
 
 

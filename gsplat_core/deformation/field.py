@@ -23,8 +23,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.scalars.scalars import store_scalars_
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION, Gaussians
 from gsplat_core.scene.rows import RowMoves
 from gsplat_core.value_ranges import ListOf, NumberIn, ValueRange
 
@@ -37,7 +36,7 @@ class Continuation(torch.nn.Module):
     horizon).
 
     `velocity` [N, 16] is the change of the deltas per second, in the columns of
-    `gsplat_core.scene.layout`. Writing keeps the tensors' addresses, so captured graphs read the
+    `gsplat_core.scene.gaussians`. Writing keeps the tensors' addresses, so captured graphs read the
     new values. The tensors are not part of a `state_dict`.
     """
 

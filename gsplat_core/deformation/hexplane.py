@@ -40,8 +40,7 @@ from gsplat_core.ops.hexplane_training.hexplane_training import (
     hexplane_train_backward,
     network_adam_,
 )
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import HEAD_COLUMNS, HEAD_GROUPS, width_of
+from gsplat_core.scene.gaussians import HEAD_COLUMNS, HEAD_GROUPS, Gaussians, width_of
 from gsplat_core.value_ranges import IntegerIn, ListOf
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")

@@ -1,10 +1,9 @@
 """Exposure and white balance of each frame relative to the first frames of the stream.
 
-A gain change multiplies all pixels of a channel by one factor, which is the ratio to the same
-tissue in an earlier picture where neither is dark or clipped. Pictures of the last seconds are kept
-as references with their gains. A frame is compared with the references that resemble it most, so
-heartbeat and tools need no tracking. Changes that references do not reveal, such as a slow approach
-or bleeding, are left to the model.
+A gain change multiplies all pixels of a channel by one factor, which is the ratio to the same tissue in an earlier
+picture where neither is dark or clipped. Pictures of the last seconds are kept as references with their gains. A
+frame is compared with the references that resemble it most, so heartbeat and tools need no tracking. Changes that
+references do not reveal, such as a slow approach or bleeding, are left to the model.
 """
 
 from __future__ import annotations
@@ -14,12 +13,87 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.exposure_samples import Reference, Sample, ratio, sample_of, share_with
+from gsplat_core.endoscope.reduced import median_of, reduced, reduced_mask
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
+
+WIDTH_PX, HEIGHT_PX = 24, 20
+"""Size of the reduced pictures. They have fewer than 500 pixels, because numpy releases the
+interpreter lock for larger arrays and must wait to reacquire it.
+"""
+AGREEMENT = 0.05
+"""Largest difference of log ratios that agree."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Reduced picture as log levels with validity."""
+
+    logs: NDArray[np.float32]
+    """Log levels, [pixels, 3]."""
+    valid: NDArray[np.bool_]
+    """Comparable values, [pixels, 3]."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Earlier picture with its log gains."""
+
+    sample: Sample
+    log_gain: NDArray[np.float64]
+    """Log gains, [3]."""
+
+
+def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None, darkest: int, brightest: int) -> Sample:
+    """Reduce a picture.
+
+    Args:
+        image: RGB uint8 [H, W, 3].
+        kept: [H, W], 0 outside the tissue, or None.
+        darkest: level that valid channels exceed.
+        brightest: level that valid channels stay below.
+    """
+    # The last averaging is in floats: in 8 bits a change of 1 % in a dark channel would be lost.
+    small = reduced(image, 4 * WIDTH_PX, 4 * HEIGHT_PX).astype(np.float32)
+    small = np.asarray(cv2.resize(small, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA), np.float32)
+    valid = (small > darkest) & (small < brightest)
+    if kept is not None:
+        valid &= reduced_mask(kept, WIDTH_PX, HEIGHT_PX)[..., None]
+    return Sample(np.log(np.maximum(small, 1.0)).reshape(-1, 3), valid.reshape(-1, 3))
+
+
+def ratio(sample: Sample, reference: Sample, channel: int) -> tuple[float, float]:
+    """Return the log ratio of a channel to the reference, and the median deviation of the pixels
+    from it; infinite with too few pixels.
+    """
+    both = sample.valid[:, channel] & reference.valid[:, channel]
+    difference = (sample.logs[:, channel] - reference.logs[:, channel])[both]
+    if len(difference) < len(both) // 20:
+        return 0.0, math.inf
+    shift = median_of(difference)
+    away = np.abs(difference - shift)
+    spread = median_of(away)
+    # Average values near the median. Moving parts and tools deviate to one side.
+    for _ in range(2):
+        near = difference[away <= max(2 * spread, 0.02)]
+        shift = float(near.mean()) if len(near) else shift
+        away = np.abs(difference - shift)
+    return shift, spread
+
+
+def share_with(sample: Sample, reference: Sample, log_gain: NDArray[np.float64]) -> float:
+    """Return the share of pixels whose ratios agree with log gains [3] within `AGREEMENT` in every
+    comparable channel.
+    """
+    both = sample.valid & reference.valid
+    agrees = np.abs(sample.logs - reference.logs - log_gain.astype(np.float32)) <= AGREEMENT
+    some = both.any(axis=1)
+    return float(((agrees | ~both).all(axis=1) & some).sum()) / max(1, int(some.sum()))
+
 
 Gains = tuple[float, float, float]
 UNCHANGED: Gains = (1.0, 1.0, 1.0)

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.onnx_network import OnnxNetwork
-from gsplat_core.endoscope.onnx_settings import ToolSettings
+from gsplat_core.endoscope.onnx import OnnxNetwork, ToolSettings
 
 log = logging.getLogger(__name__)
 

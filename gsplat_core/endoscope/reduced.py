@@ -1,7 +1,7 @@
-"""Reduced pictures for all analysis in this package.
+"""Reduced pictures for all analysis in this package, and fast quantiles of them.
 
-With a preallocated result OpenCV releases the interpreter lock once per call. Otherwise it must
-reacquire the lock to allocate the result and waits if another thread runs.
+With a preallocated result OpenCV releases the interpreter lock once per call. Otherwise it must reacquire the lock to
+allocate the result and waits if another thread runs.
 """
 
 from __future__ import annotations
@@ -11,6 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+
+def median_of(values: NDArray[np.floating], share: float = 0.5) -> float:
+    """Return the value at a quantile of at least one value; between two values the upper one."""
+    at = int(share * len(values))
+    return float(np.partition(values, at)[at])
+
 
 SAMPLES = 128
 """Approximate number of rows and columns of the shorter side that are averaged; others are skipped

@@ -20,8 +20,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.median import median_of
-from gsplat_core.endoscope.reduced import lowest_and_highest, luma, reduced, reduced_mask, sampled, sampled_mask
+from gsplat_core.endoscope.reduced import (
+    lowest_and_highest,
+    luma,
+    median_of,
+    reduced,
+    reduced_mask,
+    sampled,
+    sampled_mask,
+)
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.depth_map import BELIEVED
+from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.projection import pixel_rays, points_of

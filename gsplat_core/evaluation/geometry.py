@@ -30,13 +30,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.depth.maps import BELIEVED, measured_confidence
 from gsplat_core.evaluation.depth import DepthShare, DepthShareSums, NormalErrors, NormalSums
 from gsplat_core.evaluation.motion import FlowErrors, FlowSums, FollowedPoints, Tracking
 from gsplat_core.evaluation.scores import why_left_out
 from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
 from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
-from gsplat_core.geometry.depth_map import BELIEVED
-from gsplat_core.geometry.measured_depth import measured_confidence
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera

@@ -1,3 +1,1 @@
-"""Depth from stereo, parallax, shading or networks, camera poses, and surfaces, meshes and
-measurements made from depth.
-"""
+"""Point tracks, surfaces, meshes, measurements and registration."""

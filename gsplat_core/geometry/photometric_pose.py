@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.pose import exp
+from gsplat_core.poses.se3 import exp
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians

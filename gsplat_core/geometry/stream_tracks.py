@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.highlights import HighlightFinder
-from gsplat_core.geometry.point_flow import Points, followed
+from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

@@ -1,5 +1,5 @@
 // The layout of a Gaussian's row of raw parameters: deformation deltas [N, 16] are added in it, and their gradient has it too.
-// gsplat_core/scene/layout.py has the same numbers for Python; a test compares them.
+// gsplat_core/scene/gaussians.py has the same numbers for Python; a test compares them.
 #pragma once
 
 constexpr int kRawColumns = 16;

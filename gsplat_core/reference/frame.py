@@ -15,7 +15,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.frame.view import View
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.rendering.settings import RenderMode
-from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 
 def render_frame(

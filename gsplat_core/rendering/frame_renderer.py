@@ -1,27 +1,200 @@
 """Rendering of whole frames on an NVIDIA GPU as one CUDA graph without host synchronisation.
 
+`CapturedSequence` captures a sequence of launches and replays it as one launch. `TileListCapacity` bounds the tile lists. The host reads an overflow counter
+later and repeats a frame that needed longer lists.
+
+Capacity of a frame's tile lists, and detection of frames that exceed it.
+
+An instance is a pair of a splat and a tile that it touches. A tile's list holds the instances that it blends.
+
 The graph deforms, projects, bins, sorts and blends.
 """
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, Generic, NamedTuple, TypeVar, get_args
 
 import torch
 from torch import Tensor
 
 from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.frame.frame import Frame, View, render_frame
+from gsplat_core.ops.frame.frame import (
+    MAX_SEGMENT,
+    STATUS_LONGEST,
+    STATUS_NEEDED,
+    STATUS_OVERFLOW,
+    TILE_SIZE,
+    Frame,
+    FrameMode,
+    View,
+    render_frame,
+)
 from gsplat_core.ops.scalars.scalars import store_scalars_
-from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.renderer import Precision, check_background, check_camera
-from gsplat_core.rendering.tile_capacity import FrameStatusCopy, TileListCapacity
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+
+Result = TypeVar("Result")
+_CAPTURING = threading.Lock()
+"""Lock held during a capture. Other threads may launch and allocate, but captures never overlap."""
+
+
+class GraphMemory:
+    """Memory pool for the captured graphs of one owner.
+
+    A graph that replaces an unused one takes over its memory.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        # torch frees a pool together with the last graph in it; this empty one keeps it.
+        self._keeper = torch.cuda.CUDAGraph()
+        _capture(self._keeper, lambda: torch.zeros(1, device=device), device, None)
+
+    @property
+    def pool(self) -> Any:
+        """Return torch's handle of the pool."""
+        return self._keeper.pool()
+
+
+class CapturedSequence(Generic[Result]):
+    """CUDA graph of the launches of `sequence()`.
+
+    Allocations of the sequence keep their addresses. `results` are the same tensors at every
+    replay, which overwrites them. Inputs that change between replays must be in device memory
+    referenced by the sequence.
+
+    Kernels cannot be loaded during a capture. The sequence must have run before, or `warm_up` runs
+    it once with all its side effects.
+    """
+
+    def __init__(
+        self, sequence: Callable[[], Result], device: torch.device, memory: GraphMemory, *, warm_up: bool
+    ) -> None:
+        if warm_up:
+            sequence()
+        self._graph = torch.cuda.CUDAGraph()
+        self.results = _capture(self._graph, sequence, device, memory.pool)
+
+    def replay(self) -> Result:
+        """Launch the graph on the current stream without waiting."""
+        self._graph.replay()
+        return self.results
+
+
+def _capture(
+    graph: torch.cuda.CUDAGraph,
+    sequence: Callable[[], Result],
+    device: torch.device,
+    pool: Any,
+) -> Result:
+    # Not `torch.cuda.graph`, which collects garbage first: that takes longer than many frames.
+    with _CAPTURING:
+        current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        side.wait_stream(current)
+        with torch.cuda.stream(side):
+            # thread_local lets other threads allocate
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                results = sequence()
+            finally:
+                graph.capture_end()
+        current.wait_stream(side)
+    return results
+
+
+CAPACITY_STEP = 1 << 16
+"""Granularity in instances of the capacity of a shared buffer."""
+TILE_STEP = 32
+"""Granularity in instances of the capacity of each tile's buffer."""
+HEADROOM = 1.25
+"""Capacity relative to a frame's need, so that a moving scene seldom exceeds it."""
+
+
+def capacity_for(needed: int) -> int:
+    """Return the shared capacity to allocate after a frame that needed `needed` instances."""
+    return max(1, math.ceil(needed * HEADROOM / CAPACITY_STEP)) * CAPACITY_STEP
+
+
+@dataclass(frozen=True)
+class TileListCapacity:
+    """Capacity of a buffer shared by all tile lists, or of each tile's own segment."""
+
+    capacity: int
+    per_tile: bool
+
+    @property
+    def mode(self) -> FrameMode:
+        """Mode of `render_frame` for this capacity."""
+        return FrameMode.SEGMENTS if self.per_tile else FrameMode.SHARED
+
+    @staticmethod
+    def for_frame(needed: int, most_in_tile: int) -> TileListCapacity:
+        """Return the capacity for a frame's measured need.
+
+        Separate buffers per tile are faster and take up to 32 bytes per pixel. If a tile has more
+        instances than fit, one shared buffer is used.
+
+        Args:
+            needed: number of instances in the frame.
+            most_in_tile: largest number of instances in one tile.
+        """
+        of_tile = max(1, math.ceil(most_in_tile * HEADROOM / TILE_STEP)) * TILE_STEP
+        if of_tile <= MAX_SEGMENT:
+            return TileListCapacity(of_tile, per_tile=True)
+        return TileListCapacity(capacity_for(needed), per_tile=False)
+
+    @staticmethod
+    def initial(gaussians: int, width_px: int, height_px: int) -> TileListCapacity:
+        """Return the initial capacity: four tiles per Gaussian, and twice the mean in a tile."""
+        tiles = math.ceil(width_px / TILE_SIZE) * math.ceil(height_px / TILE_SIZE)
+        return TileListCapacity.for_frame(4 * gaussians, math.ceil(8 * gaussians / tiles))
+
+
+class FrameNeeds(NamedTuple):
+    """Instances needed by rendered frames, and the number of overflows."""
+
+    instances: int
+    """Largest number of instances in all tiles of a frame."""
+    most_in_tile: int
+    overflowed: int
+    """Number of frames that dropped instances because their lists were full."""
+
+
+class FrameStatusCopy:
+    """Asynchronous copy of the last frame's status to the host.
+
+    Enqueue the copy with `queue` (also inside a CUDA graph), call `launched` after the launch that
+    contains it, then `wait`.
+    """
+
+    def __init__(self) -> None:
+        self._arrived = torch.cuda.Event()
+        self._values = torch.zeros(4, dtype=torch.int32, pin_memory=True)
+
+    def __del__(self) -> None:
+        # torch does not track writes of a graph and would free the memory while a copy is in
+        # flight.
+        self._arrived.synchronize()
+
+    def queue(self, status: Tensor) -> None:
+        """Enqueue the copy of a frame's `status` on the current stream."""
+        self._values.copy_(status, non_blocking=True)
+
+    def launched(self, device: torch.device) -> None:
+        """Record the point on the current stream of `device` that `wait` waits for."""
+        self._arrived.record(torch.cuda.current_stream(device))
+
+    def wait(self) -> FrameNeeds:
+        """Wait for the copy and return it."""
+        self._arrived.synchronize()
+        values = self._values.tolist()
+        return FrameNeeds(values[STATUS_NEEDED], values[STATUS_LONGEST], values[STATUS_OVERFLOW])
 
 
 class FrameControls:

@@ -1,20 +1,27 @@
-"""`rasterization` with gsplat's arguments and results, for any implementation of its operations."""
+"""`rasterization` with gsplat's arguments and results, for any implementation of the operations: project, colour, list by tile, blend.
+
+Rendering pipeline in four steps: project, colour, bin into tiles, blend.
+
+`rasterization()` and training run it with the compiled operations, tests with those in plain torch. On CUDA,
+`single_call.py` does the same in one native call.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection
-from gsplat_core.rendering.chain import Geometry, RenderedSplats, StepOperations, isect_ids_of, render_splats
+from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.rendering.settings import (
+    CONSTANTS,
     EPS2D,
     FAR_PLANE,
     NEAR_PLANE,
@@ -27,10 +34,195 @@ from gsplat_core.rendering.settings import (
     check_tensors,
     refuse_unsupported,
 )
-from gsplat_core.rendering.view_colors import view_colors
 
 if TYPE_CHECKING:
     from gsplat_core.ops.rasterization.rasterization import Rasterized
+
+
+@dataclass(frozen=True)
+class StepOperations:
+    """One implementation of the pipeline's operations, with gsplat's names and signatures."""
+
+    fully_fused_projection: Callable[..., Any]
+    spherical_harmonics: Callable[..., Tensor]
+    bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
+    rasterize_to_pixels: Callable[..., tuple[Tensor, ...]]
+    """Returns colours, alphas, and further values that `render_splats` passes on to its caller."""
+    zero_gradients_stay_zero: bool = False
+    """True if a zero gradient stays zero in backward operations, even times NaN, as on CUDA."""
+
+
+class Geometry(NamedTuple):
+    """Gaussians without colours, and cameras; shapes as in `rasterization`."""
+
+    means: Tensor
+    covars: Tensor | None
+    """Upper triangles [..., N, 6]; None if the next two are given."""
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+
+
+class RenderedSplats(NamedTuple):
+    """Rendered images and intermediate results.
+
+    A row is a pair of Gaussian and camera, or a visible pair if packed.
+    """
+
+    image: Tensor
+    """[..., C, H, W, channels]: colours, then the sum of weight times z if depth is rendered."""
+    alphas: Tensor
+    rows: DenseProjection | PackedProjection
+    channels: Tensor
+    """Blended values, [rows, channels]."""
+    opacities: Tensor
+    """Opacities [rows] including the antialiasing compensation."""
+    tiles_per_gauss: Tensor
+    flatten_ids: Tensor
+    isect_offsets: Tensor
+    rest: tuple[Tensor, ...]
+    """Values returned by `rasterize_to_pixels` after image and alphas."""
+
+
+Coloring = Callable[[DenseProjection], tuple[Tensor, DenseProjection]]
+"""Function that returns colours [..., C, N, D] and the projection without Gaussians it culls."""
+
+
+def render_splats(
+    ops: StepOperations,
+    geometry: Geometry,
+    coloring: Coloring | None,
+    backgrounds: Tensor | None,
+    settings: RenderSettings,
+) -> RenderedSplats:
+    """Project, colour, bin into tiles and blend; shapes must have been checked.
+
+    Without `coloring` only depth is rendered.
+    """
+    means, covars, quats, scales, opacities, viewmats, Ks = geometry
+    max_alpha, compensation_floor = CONSTANTS[settings.constants]
+    batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    dense: DenseProjection = ops.fully_fused_projection(
+        means, covars, quats, scales, viewmats, Ks, settings.width, settings.height,
+        eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
+        radius_clip=settings.radius_clip, calc_compensations=settings.rasterize_mode == "antialiased",
+        camera_model=settings.camera_model, opacities=opacities, compensation_floor=compensation_floor,
+    )  # fmt: skip
+    channels = None
+    if coloring is not None:
+        channels, dense = coloring(dense)
+    opacities = opacities[..., None, :].expand(*batch_dims, n_cameras, n_gaussians)
+    rows: DenseProjection | PackedProjection = dense
+    packing: dict[str, Any] = {}
+    if settings.packed:
+        rows = pack(dense)
+        image_ids = rows.batch_ids * n_cameras + rows.camera_ids
+        packing = {"packed": True, "n_images": math.prod(batch_dims) * n_cameras, "image_ids": image_ids}
+        picked = image_ids * n_gaussians + rows.gaussian_ids
+        opacities = opacities.reshape(-1)[picked]
+        channels = None if channels is None else channels.reshape(-1, channels.shape[-1])[picked]
+    if rows.compensations is not None:
+        opacities = opacities * rows.compensations
+    if settings.has_depth:
+        depth = rows.depths[..., None]
+        channels = depth if channels is None else torch.cat([channels, depth], -1)
+        if backgrounds is not None:
+            zeros = backgrounds.new_zeros(*backgrounds.shape[:-1], 1)
+            backgrounds = torch.cat([backgrounds, zeros], -1) if settings.has_colors else zeros
+    assert channels is not None
+    grid = TileGrid(settings.tile_size, *settings.tile_grid)
+    tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(
+        rows.means2d, rows.radii, rows.depths, grid, conics=rows.conics, opacities=opacities, **packing
+    )
+    isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, *reversed(settings.tile_grid))
+    image, alphas, *rest = ops.rasterize_to_pixels(
+        rows.means2d, rows.conics, channels, opacities, settings.width, settings.height, settings.tile_size, isect_offsets,
+        flatten_ids, backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad, max_alpha=max_alpha,
+    )  # fmt: skip
+    return RenderedSplats(
+        image, alphas, rows, channels, opacities, tiles_per_gauss, flatten_ids, isect_offsets, tuple(rest)
+    )
+
+
+def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, tiles_of_image: int) -> Tensor:
+    """Return gsplat's int64 key of each tile-list entry: image | tile | 32 bits of
+    float32 depth.
+    """
+    starts, length = isect_offsets.reshape(-1), flatten_ids.shape[0]
+    counts = torch.diff(starts, append=starts.new_full((1,), length))
+    tiles = torch.arange(len(starts), device=starts.device)
+    images = torch.div(tiles, tiles_of_image, rounding_mode="floor")
+    keys = (images << (32 + tiles_of_image.bit_length())) | ((tiles - images * tiles_of_image) << 32)
+    bits = depths.detach().float().reshape(-1).view(torch.int32)[flatten_ids].long() & 0xFFFFFFFF
+    return torch.repeat_interleave(keys, counts, output_size=length) | bits
+
+
+def view_colors(
+    ops: StepOperations,
+    means: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    dense: DenseProjection,
+    settings: RenderSettings,
+) -> tuple[Tensor, DenseProjection]:
+    """Return the colours [..., C, N, D] seen by each camera; cull Gaussians with non-finite colour.
+
+    On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They
+    have no
+    effect: culled Gaussians are in no tile list, compositing skips non-finite values, and a zero
+    colour gradient adds nothing to the coefficients' gradient.
+    """
+    shape = dense.depths.shape
+    visible = dense.radii[..., 0] > 0
+
+    def evaluate(visible: Tensor) -> Tensor:
+        per_camera = colors.dim() - (1 if settings.sh_degree is None else 2) == len(shape)
+        if settings.sh_degree is None:
+            values = colors if per_camera else colors[..., None, :, :]
+            return values.expand(*shape, values.shape[-1])
+        directions = means[..., None, :, :] - camera_centers(viewmats)[..., None, :]
+        # The extra dimension is broadcast by the op, which saves one copy of the coefficients per camera.
+        coefficients = colors if per_camera or means.dim() == 2 else colors[..., None, :, :, :]
+        return ops.spherical_harmonics(settings.sh_degree, directions, coefficients, masks=visible)
+
+    def shown(values: Tensor) -> Tensor:
+        return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
+
+    # checked before clamping, which would turn minus infinity into black
+    values = evaluate(visible)
+    if values.is_cuda and ops.zero_gradients_stay_zero:
+        finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
+        return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
+    # One cheap sum in the common case: a sum with a NaN or an infinity in it is not finite. A compiled graph cannot branch on a
+    # value, and always tests every colour.
+    if torch.compiler.is_compiling() or not torch.isfinite(values.detach().sum()):
+        finite = values.detach().isfinite().all(-1)
+        visible = visible & finite
+        values = torch.where(visible[..., None], evaluate(visible), torch.zeros_like(values))
+        keep = visible.to(dense.radii.dtype)
+        dense = dense._replace(radii=dense.radii * keep[..., None])
+    return shown(values), dense
+
+
+def camera_centers(viewmats: Tensor) -> Tensor:
+    """Return the camera centres [..., 3] of world-to-camera matrices [..., 4, 4].
+
+    This is the translation column of the inverse of any invertible matrix. On CUDA it is computed
+    by Cramer's rule, because `torch.linalg.inv` synchronises with the host to check invertibility.
+    The centre is the vector orthogonal to the first three rows, scaled so that its product with the
+    fourth row is 1.
+    """
+    if not viewmats.is_cuda:
+        return torch.linalg.inv(viewmats)[..., :3, 3]
+    rows, shifts = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    crosses = torch.linalg.cross(rows.roll(-1, -2), rows.roll(-2, -2))
+    center = -(shifts[..., None] * crosses).sum(-2)
+    determinant = (rows[..., 0, :] * crosses[..., 0, :]).sum(-1, keepdim=True)
+    last = viewmats[..., 3, :]
+    return center / ((last[..., :3] * center).sum(-1, keepdim=True) + last[..., 3:] * determinant)
+
 
 Meta = dict[str, Any]
 """Intermediate results under gsplat's names."""

@@ -22,8 +22,8 @@ from gsplat_core.ops.rasterization.rasterization import (
     rasterize,
 )
 from gsplat_core.ops.rasterization.rasterization import TILE_SIZE as NATIVE_TILE_SIZE
+from gsplat_core.rendering.pipeline import camera_centers
 from gsplat_core.rendering.settings import Arguments, RenderSettings
-from gsplat_core.rendering.view_colors import camera_centers
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 NATIVE_CONSTANTS = "1.6"

@@ -1,8 +1,8 @@
-"""Tangent frames of a deforming surface at material points.
+"""Tangent frames of a deforming surface at material points, by bilinear interpolation on grids.
 
-The pixel coordinates at which the points were first seen parameterise the tissue. The derivatives
-of position by these coordinates are fitted locally over cells of a coarse grid, because the motion
-of single points is too noisy to reveal rotation.
+The pixel coordinates at which the points were first seen parameterise the tissue. The derivatives of position by
+these coordinates are fitted locally over cells of a coarse grid, because the motion of single points is too noisy to
+reveal rotation.
 """
 
 from __future__ import annotations
@@ -10,9 +10,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.scene.bilinear import at_positions
+Array = NDArray[np.floating]
 
-Array = NDArray[np.float64]
+
+def at_positions(grid: Array, positions: Array) -> Array:
+    """Interpolate a grid [rows, columns, ...] bilinearly at positions [N, 2] (x, y).
+
+    Cell centres are at +0.5. Positions beyond the outermost centres take the edge value.
+
+    Returns:
+        [N, ...].
+    """
+    rows, columns = grid.shape[:2]
+    at = (positions - 0.5).clip(0, (columns - 1, rows - 1))
+    low = np.floor(at).astype(np.int64).clip(0, (max(columns - 2, 0), max(rows - 2, 0)))
+    column, row = low.T
+    right, down = ((at - low)[:, axis].reshape(-1, *(1,) * (grid.ndim - 2)) for axis in (0, 1))
+    after, under = np.minimum(column + 1, columns - 1), np.minimum(row + 1, rows - 1)
+    above = (1 - right) * grid[row, column] + right * grid[row, after]
+    below = (1 - right) * grid[under, column] + right * grid[under, after]
+    return np.asarray((1 - down) * above + down * below)
+
 
 CELLS = 20
 """Number of cells along the longer side of the picture."""

@@ -1,4 +1,4 @@
-"""Training budget of a frame: a number of steps, or the time until a deadline."""
+"""Training budget of a frame: a number of steps, or the time until a deadline; and the report of training on the frame."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.transfers import HostCopy
 
 Ending = Literal["steps", "deadline", "at_most"]
 """Reason why training on a frame ended: the requested number of steps was made, another step would
@@ -19,8 +20,6 @@ have missed the deadline, or `at_most` steps were made before it.
 """
 MAX_IN_FLIGHT = 4
 """Steps that may be queued on a GPU while a deadline is watched; enough to keep it busy."""
-
-
 TURNS, SECOND_EYE = 4, 2
 """With two eyes, the third of every four steps trains the second eye. The first eye is the
 displayed one, and the host prepares the second eye's picture while the GPU works on the first
@@ -234,3 +233,21 @@ class StepsInFlight:
         while self._events and self._events[0].query():
             self._events.popleft()
         return len(self._events)
+
+
+@dataclass(frozen=True)
+class ObserveReport:
+    """Training result of one frame."""
+
+    seq: int
+    steps: int
+    arriving_loss: HostCopy | None
+    """Loss of the last step, possibly unfinished on a GPU; None if the frame was not trained on."""
+    gaussians: int
+    ending: Ending = "steps"
+    """Reason why training on the frame ended."""
+
+    @property
+    def loss(self) -> float | None:
+        """Loss of the last step; waits for it."""
+        return None if self.arriving_loss is None else self.arriving_loss.item()

@@ -1,5 +1,6 @@
-"""Training step on an NVIDIA GPU as one CUDA graph without host synchronisation: deformation,
-rendering, loss, backward pass and Adam.
+"""Training step on an NVIDIA GPU as one CUDA graph without host synchronisation: deformation, rendering, loss, backward pass and update.
+
+Its inputs are held at fixed addresses.
 """
 
 from __future__ import annotations
@@ -9,22 +10,56 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import CapturedTraining
+from gsplat_core.deformation.field import CapturedTraining, copy_each
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
 from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
-from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
-from gsplat_core.rendering.frame_renderer import FrameControls
-from gsplat_core.rendering.tile_capacity import FrameStatusCopy, capacity_for
+from gsplat_core.rendering.frame_renderer import (
+    CapturedSequence,
+    FrameControls,
+    FrameStatusCopy,
+    GraphMemory,
+    capacity_for,
+)
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import COLOUR
-from gsplat_core.training.eye_gradients import LEFT, RIGHT
+from gsplat_core.scene.gaussians import COLOUR, Gaussians
+from gsplat_core.training.colour_correction import ResidualTarget
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
-from gsplat_core.training.photometric import LossWeights
-from gsplat_core.training.step_inputs import StepInputs
+from gsplat_core.training.photometric import LEFT, RIGHT, LossWeights
+
+
+class StepInputs:
+    """Picture, mask and depth buffers for one camera size and device."""
+
+    def __init__(self, camera: Camera, device: torch.device, *, with_depth: bool) -> None:
+        shape = (camera.height_px, camera.width_px)
+        self.image = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
+        self.mask = torch.ones(shape, dtype=torch.uint8, device=device)
+        self.depth = torch.zeros(shape, device=device) if with_depth else None
+        self.target: ResidualTarget | None = None
+        """Residual target, created when colours are first corrected."""
+        self._taken: Observation | None = None
+        self._corrects = False
+
+    def take(self, observation: Observation, corrects: bool) -> None:
+        """Queue the copy of an observation for a step with or without colour correction; skipped if
+        it is already here.
+        """
+        if corrects and self.target is None:
+            self.target = ResidualTarget(self.image)
+        if observation is self._taken and corrects == self._corrects:
+            return
+        self._taken, self._corrects = observation, corrects
+        copy_each([self.image, self.mask], [observation.image, observation.mask])
+        if corrects and self.target is not None:
+            self.target.take(self.image, self.mask)
+        elif self.depth is not None:
+            if observation.depth is None:
+                self.depth.zero_()  # unknown everywhere, so the loss term is 0
+            else:
+                self.depth.copy_(observation.depth, non_blocking=True)
 
 
 class FusedStep:

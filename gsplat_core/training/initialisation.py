@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.depth_fill import filled_depth
-from gsplat_core.geometry.depth_map import BELIEVED, POSSIBLE
+from gsplat_core.depth.maps import BELIEVED, POSSIBLE
+from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians

@@ -1,35 +1,315 @@
-"""Motion prior that learns periodic motion and temporal colour changes from the stream."""
+"""Motion prior that learns periodic motion and temporal colour changes from the stream.
+
+The next picture is predicted from the newest, mean and blurred pictures and several motions, in locally learned shares. Earlier similar moments give
+forecasts of heartbeat and breathing.
+
+Motion forecast from earlier similar moments, for periodic motion such as heartbeat and breathing.
+
+Forecasting by analogues (Lorenz, "Atmospheric predictability as revealed by naturally occurring analogues", 1969). No
+period is estimated, so several or changing periods need no model.
+
+Prediction of the next picture from the newest, mean and blurred pictures and several motions.
+
+Highlights flicker, noise is random and motion is uncertain. The best prediction of a colour is therefore a mixture of
+the moved newest picture, the mean of earlier ones, a blurred picture and other plausible motions. The mixture is
+learned locally from earlier predictions (`LocalShares`).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.field import displaced
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.layout import COLOUR, POSITION, RAW_COLUMNS
-from gsplat_core.training.colour_fit import colour_change
-from gsplat_core.training.damping import AT_FIRST
-from gsplat_core.training.expected_picture import ExpectedPicture, moved
-from gsplat_core.training.image_motion import Flow
-from gsplat_core.training.local_shares import LocalShares, SharesSettings
-from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, followed
-from gsplat_core.training.similar_moments import SimilarMoments, Weighted, weighted_mean
+from gsplat_core.scene.gaussians import COLOUR, POSITION, RAW_COLUMNS
+from gsplat_core.training.colour_correction import colour_change
+from gsplat_core.training.image_motion import CELL_PX, Flow, SurfaceMotion
+from gsplat_core.training.motion_prior import AT_FIRST, HORIZON_S, FlowPrior, followed
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
+
+Field = NDArray[np.float32]
+"""Picture or flow, float32 [h, w, channels]."""
+MOST_CELLS = 40
+"""Number of cells along the longer side with separate shares."""
+
+
+@dataclass(frozen=True)
+class SharesSettings:
+    """Settings of the learning; units are squares of the fields' units."""
+
+    at_first: tuple[float, ...]
+    """Shares before anything was learned."""
+    decay: float
+    """Weight of accumulated sums at each new frame; about 1 / (1 - decay) frames are remembered."""
+    around_cells: float
+    """Standard deviation of a cell's neighbourhood, in cells."""
+    pull: float
+    """Strength with which a cell's shares are pulled to those of the whole picture."""
+    ridge: float
+    """Strength with which shares of the whole picture are pulled to the initial ones."""
+
+
+class LocalShares:
+    """Recursive least squares with forgetting: observation = sum of share * prediction in each
+    cell, regularised towards the fit of the whole picture.
+
+    Memory is K * (K + 1) numbers per cell for K predictions, independent of the stream's length.
+    """
+
+    def __init__(self, settings: SharesSettings) -> None:
+        self._settings = settings
+        self._products: NDArray[np.float32] | None = None
+        """Products of the predictions with each other and with the observation, [h, w, K, K + 1].
+        """
+
+    def learn(self, guesses: Sequence[Field], came: Field, weight: NDArray[np.float32]) -> None:
+        """Add an observation `came` [h, w, channels] of earlier predictions, with pixel weights [h,
+        w].
+        """
+        fields = [*guesses, came]
+        count, size = len(guesses), cells_for(came.shape)
+        products = np.empty((size[1], size[0], count, count + 1), np.float32)
+        for row in range(count):
+            for column in range(row, count + 1):
+                product = (fields[row] * fields[column]).mean(axis=2) * weight
+                products[:, :, row, column] = cv2.resize(product, size, interpolation=cv2.INTER_AREA)
+                if column < count:
+                    products[:, :, column, row] = products[:, :, row, column]
+        if self._products is not None and self._products.shape == products.shape:
+            products += self._settings.decay * self._products
+        self._products = products
+
+    def whole(self) -> NDArray[np.float64]:
+        """Return the shares [K] that fit the whole picture."""
+        settings, first = self._settings, np.asarray(self._settings.at_first)
+        if self._products is None:
+            return first
+        mean = self._products.mean(axis=(0, 1), dtype=np.float64)
+        return np.linalg.solve(mean[:, :-1] + settings.ridge * np.eye(len(first)), mean[:, -1] + settings.ridge * first)
+
+    def local(self, shape: Sequence[int]) -> Field:
+        """Return the local shares [h, w, K] for fields of a shape."""
+        settings, whole, size = self._settings, self.whole(), (shape[1], shape[0])
+        if self._products is None:
+            return np.broadcast_to(whole.astype(np.float32), (shape[0], shape[1], len(whole))).copy()
+        rows, columns, count, _ = self._products.shape
+        flat = self._products.reshape(rows, columns, -1)
+        around = blurred(flat, settings.around_cells).reshape(self._products.shape).astype(np.float64)
+        left = around[..., :-1] + settings.pull * np.eye(count)
+        right = around[..., -1] + settings.pull * whole
+        shares = np.linalg.solve(left, right[..., None])[..., 0].astype(np.float32)
+        resized = np.asarray(cv2.resize(shares, size, interpolation=cv2.INTER_LINEAR), np.float32)
+        return resized.reshape(shape[0], shape[1], count)
+
+
+def cells_for(shape: Sequence[int]) -> tuple[int, int]:
+    """Return columns and rows of cells for fields [h, w, ...]."""
+    height, width = shape[:2]
+    shrink = min(1.0, MOST_CELLS / max(height, width))
+    return max(1, round(width * shrink)), max(1, round(height * shrink))
+
+
+def blurred(field: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
+    """Blur a field of any number of channels."""
+    return np.asarray(cv2.GaussianBlur(field, (0, 0), deviation), np.float32).reshape(field.shape)
+
+
+REMEMBERED = 256
+"""Number of remembered frames: some seconds, several heartbeats."""
+SOONEST = 6
+"""Smallest number of frames between compared moments, since neighbours are always similar."""
+EARLIER_COUNTS = 0.64
+"""Weight of the dissimilarity of preceding moments."""
+FOLLOWED = 6
+"""Number of most similar moments whose next motion is averaged."""
+Weighted: TypeAlias = tuple[float, Flow]
+"""Motion with its weight."""
+
+
+class SimilarMoments:
+    """Ring buffer of recent motions with the dissimilarity of each moment to now. Memory and time
+    per call are constant.
+    """
+
+    def __init__(self) -> None:
+        self._begin((1, 1, 2))
+
+    def _begin(self, shape: tuple[int, ...]) -> None:
+        self._motions = np.zeros((REMEMBERED, *shape), np.float16)
+        """Motion from frame k to k + 1 in row k modulo the ring size."""
+        columns, rows = cells_for(shape)
+        self._coarse = np.zeros((REMEMBERED, rows * columns * 2), np.float32)
+        self._unlike = np.full(REMEMBERED, np.inf)
+        self._taken = 0
+
+    def take(self, motion: Flow) -> None:
+        """Add the newest motion [h, w, 2]. Another size restarts the history. Moments next to a gap
+        in the motions count as neighbours, which affects few of many.
+        """
+        if self._motions.shape[1:] != motion.shape:
+            self._begin(motion.shape)
+        row = self._taken % REMEMBERED
+        self._motions[row] = motion
+        self._coarse[row] = cv2.resize(motion, cells_for(motion.shape), interpolation=cv2.INTER_AREA).ravel()
+        apart = np.square(self._coarse - self._coarse[row]).mean(axis=1, dtype=np.float64)
+        # The dissimilarity of two moments combines their last motions and the dissimilarity of the
+        # moments before.
+        of_moments_before = np.roll(self._unlike, 1)
+        of_moments_before[np.isinf(of_moments_before)] = 0.0
+        self._unlike = apart + EARLIER_COUNTS * of_moments_before
+        self._taken += 1
+        self._unlike[row] = np.inf
+        self._unlike[self._taken :] = np.inf
+
+    def next_motions(self) -> list[Weighted]:
+        """Return the motions after the moments most similar to now with weights summing to 1; empty
+        without any.
+        """
+        newest = self._taken - 1
+        kept = np.arange(max(0, self._taken - REMEMBERED + 1), newest - SOONEST)
+        unlike = self._unlike[kept % REMEMBERED]
+        best = np.argsort(unlike, kind="stable")[:FOLLOWED]
+        if len(best) == 0:
+            return []
+        weights = np.exp(-unlike[best] / max(unlike[best[0]], 1e-12))
+        weights /= weights.sum()
+        after = (kept[best] + 1) % REMEMBERED
+        return [
+            (float(weight), self._motions[row].astype(np.float32)) for weight, row in zip(weights, after, strict=True)
+        ]
+
+
+def weighted_mean(parts: Sequence[Weighted]) -> Field:
+    """Return the sum of weighted fields, whose weights sum to 1."""
+    mean = np.zeros_like(parts[0][1])
+    for weight, field in parts:
+        mean += np.float32(weight) * field
+    return mean
+
+
+FOLLOWS = 0.2
+"""Weight of the newest picture in the moving mean."""
+BLUR_PX = 1.5
+"""Standard deviation of the blurred picture in pixels."""
+PICTURE_SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=30.0)
+"""Settings for the shares of the unmoved newest picture, the mean, the blurred picture, and the
+mean over other motions. Units are squared grey levels, 0 to 255.
+"""
+INVERSE_STEPS = 2
+"""Fixed-point iterations for inverting a flow."""
+
+
+@dataclass(frozen=True)
+class _Guesses:
+    moved: Field
+    """Newest picture moved by the expected motion, [h, w, 3]."""
+    others: list[Field]
+    """Differences of the other predictions from it, [h, w, 3] each."""
+
+
+class ExpectedPicture:
+    """Mixture of predictions of the next picture with learned shares."""
+
+    def __init__(self) -> None:
+        self._shares = LocalShares(PICTURE_SHARES)
+        self._restart()
+
+    def _restart(self) -> None:
+        self._newest: Field | None = None
+        self._mean: Field | None = None
+        """Mean of earlier pictures, warped to the newest one."""
+        self._guesses: _Guesses | None = None
+
+    def take(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None, motion: Flow | None) -> None:
+        """Add the newest picture.
+
+        Args:
+            image: uint8 [H, W, 3].
+            mask: [H, W], non-zero on tissue, or None for all.
+            motion: flow from the previous picture, or None if unknown. The history then restarts,
+                but learned shares are kept.
+        """
+        picture = image.astype(np.float32)
+        if motion is None or self._newest is None or self._newest.shape != picture.shape:
+            self._restart()
+            self._mean = picture
+        else:
+            if self._guesses is not None:
+                weight = np.ones(picture.shape[:2], np.float32) if mask is None else (mask != 0).astype(np.float32)
+                self._shares.learn(self._guesses.others, picture - self._guesses.moved, weight)
+                self._guesses = None
+            assert self._mean is not None
+            before = moved(self._mean, motion)
+            self._mean = before + FOLLOWS * (picture - before)
+        self._newest = picture
+
+    def after(self, motion: Flow, others: Sequence[Weighted] = ()) -> Field | None:
+        """Predict the picture after a motion.
+
+        Args:
+            motion: most likely flow after the newest picture.
+            others: weighted alternative flows.
+
+        Returns:
+            float32 [H, W, 3] in grey levels, or None before the first picture.
+        """
+        if self._newest is None or self._mean is None:
+            return None
+        newest, mean = moved(self._newest, motion), moved(self._mean, motion)
+        of_others = [(weight, moved(self._newest, other)) for weight, other in others]
+        spread = weighted_mean(of_others) if of_others else newest
+        guesses = [self._newest, mean, blurred(newest, BLUR_PX), spread]
+        self._guesses = _Guesses(newest, [guess - newest for guess in guesses])
+        shares = self._shares.local(newest.shape)
+        expected = newest.copy()
+        for index, guess in enumerate(self._guesses.others):
+            expected += shares[..., index, None] * guess
+        return expected.clip(0, 255)
+
+
+def origin(motion: Flow) -> Flow:
+    """Invert a flow: return for each cell the displacement in pixels that brought its content
+    there.
+    """
+    came = motion
+    for _ in range(INVERSE_STEPS):
+        came = _looked_up(motion, np.asarray(came / CELL_PX, np.float32))
+    return came
+
+
+def moved(picture: Field, motion: Flow) -> Field:
+    """Warp a picture [h, w, channels] of any size by a flow."""
+    height, width = picture.shape[:2]
+    came_from = cv2.resize(origin(motion), (width, height), interpolation=cv2.INTER_LINEAR)
+    scale = width / (motion.shape[1] * CELL_PX)
+    return _looked_up(picture, np.asarray(came_from * scale, np.float32))
+
+
+def _looked_up(field: Field, back: Field) -> Field:
+    """Sample a field at positions displaced by -`back` [h, w, 2]."""
+    height, width = field.shape[:2]
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    looked_up = cv2.remap(
+        field, columns - back[..., 0], rows - back[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(looked_up, np.float32)
+
 
 REFERENCE_S = 1 / 30
 """Unit interval of stored motions in seconds."""
-SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, pull=4.0, ridge=0.2)
+MOTION_SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, pull=4.0, ridge=0.2)
 """Settings for the shares of the last motion and of motions after similar moments, in squared
 pixels.
 """
-
-
 COLOUR_STEPS = 16
 """Iterations of the colour fit of moved Gaussians to the expected picture."""
 
@@ -58,7 +338,7 @@ class LearnedPrior(FlowPrior):
         """See `MotionPrior.forget`."""
         super().forget()
         self._moments = SimilarMoments()
-        self._shares = LocalShares(SHARES)
+        self._shares = LocalShares(MOTION_SHARES)
         self._picture = ExpectedPicture()
         self._guesses: list[Flow] = []
         """Predictions of the next motion."""

@@ -1,29 +1,25 @@
-"""Training concurrent with a live stream: on the newest frame until its display time, then on
-earlier frames until the next one arrives.
-"""
+"""Training concurrent with a live stream: on the newest frame until its display time, then on earlier frames."""
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
-from gsplat_core.training.budget import Budget, Spending, StepsInFlight
-from gsplat_core.training.colour_correction import check_colours
+from gsplat_core.training.budget import Budget, ObserveReport, Spending, StepsInFlight
+from gsplat_core.training.colour_correction import MOST_RELAXATION, check_colours
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.into_view import fill_new_tissue, has_moved
-from gsplat_core.training.late_depth import MOST_LATE, LateDepth
-from gsplat_core.training.live_training import LiveTraining
 from gsplat_core.training.motion_prior import newest_state
+from gsplat_core.training.moving_view import OutOfView, fill_new_tissue, has_moved
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.observe_report import ObserveReport
-from gsplat_core.training.out_of_view import OutOfView
+from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import for_eyes
@@ -31,6 +27,70 @@ from gsplat_core.training.start_on_device import StartOnDevice
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.upkeep import Upkeep
 from gsplat_core.transfers import HostCopy
+
+REHEARSED_CORRECTION = 0.5
+"""Share of `colour_relaxation` in rehearsal steps. A correction at one time also affects
+neighbouring times, which are corrected themselves.
+"""
+DEPTH_EVERY = 4
+"""On a GPU, every n-th rehearsal step compares depth if its frame has it, and trains colours
+instead of correcting them. The right eye has odd numbers, so these steps are on the left eye. Steps
+of `observe` never compare depth, because their last changes are displayed.
+"""
+
+
+@dataclass(frozen=True)
+class LiveTraining:
+    """Settings of training steps during a live stream.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
+
+    first_rate: float = 2.0
+    """Factor of all learning rates in a frame's first step; large steps follow large motion."""
+    last_rate: float = 0.5
+    """Factor of all learning rates at the end; small steps converge."""
+    rate_steps: int = 30
+    """Number of steps from the first to the last factor in equal ratios; further steps use the last
+    factor.
+    """
+    recent_share: float = 0.6
+    """Share of the rehearsal steps on the newest frame; the others are spread evenly over the
+    window.
+    """
+    colour_relaxation: float = 0.0
+    """Above 0, colours are corrected by this multiple of the mean residual (`colour_correction`)
+    instead of trained with a learning rate, if the field has temporal colours. On a GPU this
+    requires spherical harmonics of degree 0, and depth is compared only in some rehearsal steps
+    (`DEPTH_EVERY`).
+    """
+
+    def __post_init__(self) -> None:
+        for name in ("first_rate", "last_rate"):
+            if not 0 < getattr(self, name) <= 100:
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be in (0, 100]")
+        if self.rate_steps < 1:
+            raise InvalidSetting(f"rate_steps is {self.rate_steps}; it must be at least 1")
+        if not 0 <= self.recent_share <= 1:
+            raise InvalidSetting(f"recent_share is {self.recent_share}; it must be between 0 and 1")
+        if not 0 <= self.colour_relaxation < MOST_RELAXATION:
+            raise InvalidSetting(
+                f"colour_relaxation is {self.colour_relaxation}; it must be at least 0 and below {MOST_RELAXATION:g}"
+            )
+
+    def rate_at(self, step: int) -> float:
+        """Return the factor of the learning rates in a frame's step, counted from 0."""
+        progress = min(1.0, step / max(1, self.rate_steps - 1))
+        return self.first_rate * (self.last_rate / self.first_rate) ** progress
+
+    def rehearsed_relaxation(self, number: int, or_depth: bool) -> float:
+        """Return the colour relaxation of a rehearsal step. `or_depth` is True if its frame has
+        depth and a step cannot correct colours and compare depth at once.
+        """
+        looks_at_depth = or_depth and number % DEPTH_EVERY == 0
+        return 0.0 if looks_at_depth else REHEARSED_CORRECTION * self.colour_relaxation
+
 
 REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU; the next frame's first step waits for them."""

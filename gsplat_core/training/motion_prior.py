@@ -1,8 +1,19 @@
-"""Prediction of motion after the newest frame, for display between frames and as start of training
-on the next frame.
+"""Prediction of motion after the newest frame, for display between frames and as start of training on the next one.
 
-A `MotionPrior` processes each frame before the model is trained on it, and predicts the velocity
-after it. Further priors are added as modules registered in `MOTION_PRIORS`.
+With known camera motion, optical flow also gives the depth of a scene without measured depth.
+
+Depth of the scene from known camera motion and optical flow, for a moving scope without measured depth.
+
+Without depth a scene starts on a plane at an arbitrary distance. With known poses that plane moves wrongly, and the
+field would have to learn the error of every frame. The position of a point in a second frame is linear in its inverse
+depth w (Hartley and Zisserman 2004, section 12.2), so every Gaussian has a least-squares w.
+
+A correction moves a Gaussian along its ray of the first camera, which sees the same picture as before.
+
+Prediction of motion after the newest frame, for display between frames and as start of training on the next frame.
+
+A `MotionPrior` processes each frame before the model is trained on it, and predicts the velocity after it. Further
+priors are added as modules registered in `MOTION_PRIORS`.
 """
 
 from __future__ import annotations
@@ -20,16 +31,169 @@ from torch import Tensor
 from gsplat_core.deformation.field import Continuation, DeformationField, NewestState, displaced
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import LOG_SCALE, POSITION, RAW_COLUMNS
+from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, RAW_COLUMNS, Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.damping import Damping
-from gsplat_core.training.depth_from_motion import DepthFromMotion
-from gsplat_core.training.image_motion import Flow, ImageMotion, revealed_px, typical_px
+from gsplat_core.training.image_motion import Flow, ImageMotion, SurfaceMotion, beside, revealed_px, typical_px
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
+
+AT_FIRST = 0.6
+"""Share before anything was learned. See benchmarks/notes/constants.md."""
+FOLLOWS = 0.15
+"""Weight of the newest frame in the moving average."""
+ONE_FRAME = (-0.5, 1.5)
+"""Bounds of the share observed in one frame, which limit outliers of the optical flow."""
+
+
+class Damping:
+    """Exponentially weighted mean of the least-squares share in realised = share * last. It stays
+    on the device without synchronisation.
+    """
+
+    def __init__(self) -> None:
+        self._share: Tensor | None = None
+
+    def learn(self, last: Tensor, realised: Tensor) -> None:
+        """Update the share with the velocities [N, 3] of the Gaussians in two successive intervals.
+        A frame without motion changes nothing.
+        """
+        # Summed in float64, where the order of summation does not affect the result.
+        last, realised = last.double(), realised.double()
+        share = self._share if self._share is not None else last.new_full((), AT_FIRST)
+        seen = (last * realised).sum() / (last * last).sum()
+        step = FOLLOWS * (seen.clamp(*ONE_FRAME) - share)
+        self._share = share + torch.where(seen.isfinite(), step, torch.zeros_like(step))
+
+    def damped(self, moved: Tensor) -> Tensor:
+        """Return the part of a motion [N, 3] that is expected to continue, between none and all of
+        it.
+        """
+        return moved * (AT_FIRST if self._share is None else self._share.clamp(0, 1).to(moved.dtype))
+
+
+FLOW_ERROR_PX = 1.0
+"""Standard deviation in pixels of motion that the camera does not explain: tissue motion and errors
+of flow and pose.
+"""
+RELATIVE_ERROR = 0.15
+"""Prior standard deviation of a Gaussian's inverse depth, relative to it."""
+LARGEST_STEP = 1.4
+"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is
+known.
+"""
+LEAST_PARALLAX_PX = 1.5
+"""Median parallax in pixels from which the scene's distance is estimated."""
+LEAST_EXPLAINED = 0.5
+"""Share of the motion remaining after camera rotation that a single distance must explain."""
+SMALLEST_SHIFT = 1e-9
+"""Smallest displacement of a camera along an axis in scene units; less is rounding."""
+ROUNDS = 4
+"""Rounds of reweighting, which reduce the influence of independently moving points on the distance.
+"""
+
+
+class DepthFromMotion:
+    """Estimates the distance of a scene once from camera motion, and refines the depth of each
+    Gaussian with every frame.
+    """
+
+    def __init__(self) -> None:
+        self._distance_is_known = False
+
+    def apply(self, step: TrainingStep, motion: SurfaceMotion, before_s: float) -> None:
+        """Correct the scene by the image motion since the frame at `before_s`, which it fits.
+
+        Nothing changes if the camera only rotated or was static. On a GPU the host synchronises
+        until the distance is known.
+        """
+        if not np.any(translation_between(motion.before, motion.after)):
+            return
+        with torch.no_grad():
+            deltas = step.field.deltas(before_s)[:, POSITION]
+            points = step.gaussians.means + deltas
+            seen = motion.seen_before(points)
+            target = seen.pixels + motion.at(seen.pixels)
+            measured, information = inverse_depths(seen.pixels, target, motion.before, motion.after)
+            information = torch.where(seen.inside[:, 0] & (measured > 0), information / FLOW_ERROR_PX**2, 0.0)
+            known = 1 / seen.depth[:, 0]
+            whole = torch.ones_like(known)
+            found = not self._distance_is_known
+            if found:
+                distance = self._distance(seen.pixels, target, motion, known, information)
+                if distance is None:
+                    return
+                self._distance_is_known = True
+                whole = whole * float(known.median()) * distance
+                known = known / whole
+            gain = information / (information + 1 / (RELATIVE_ERROR * known) ** 2)
+            refined = known + gain * (measured - known)
+            factor = whole * (known / refined).clamp(1 / LARGEST_STEP, LARGEST_STEP)
+            factor = torch.where(seen.inside[:, 0] & factor.isfinite() & (factor > 0), factor, whole)
+            step.scale_about(motion.before, factor)
+            if found:
+                step.take_distance(motion.after)
+
+    def _distance(
+        self, pixels: Tensor, target: Tensor, motion: SurfaceMotion, known: Tensor, information: Tensor
+    ) -> float | None:
+        """Return the distance of a plane that explains most of the motion, or None with too little
+        parallax or no such plane.
+        """
+        c, d = parallax_terms(pixels, target, motion.before, motion.after)
+        focal = float(motion.after.K[0, 0])
+        weight = (information > 0).to(c.dtype)
+        inverse = known.median()
+        for _ in range(ROUNDS):
+            inverse = (weight * (c * d).sum(1)).sum() / (weight * (c * c).sum(1)).sum().clamp(min=1e-20)
+            error_px = focal * (d - inverse * c).norm(dim=1)
+            weight = (information > 0) / (1 + (error_px / FLOW_ERROR_PX) ** 2)
+        counted = information > 0
+        parallax_px = focal * inverse * c.norm(dim=1)
+        explained = 1 - (d - inverse * c)[counted].square().sum() / d[counted].square().sum().clamp(min=1e-20)
+        enough = counted.any() and bool(parallax_px[counted].median() >= LEAST_PARALLAX_PX)
+        return float(1 / inverse) if enough and bool(explained >= LEAST_EXPLAINED) and float(inverse) > 0 else None
+
+
+def parallax_terms(pixels: Tensor, target: Tensor, before: Camera, after: Camera) -> tuple[Tensor, Tensor]:
+    """Return c and d [N, 2] of the equation w c = d for inverse depths w, in units of the focal
+    length.
+
+    Args:
+        pixels: positions before [N, 2].
+        target: positions after [N, 2].
+        before, after: cameras of both frames. c is 0 if only the rotation differs.
+    """
+    between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
+    rotation = beside(pixels, between[:3, :3])
+    tx, ty, tz = (float(value) for value in between[:3, 3])
+    first, second = _normalised(pixels, before), _normalised(target, after)
+    ray = torch.cat([first, torch.ones_like(first[:, :1])], dim=1) @ rotation.T
+    c = second * tz - beside(second, [tx, ty])
+    return c, ray[:, :2] - second * ray[:, 2:]
+
+
+def inverse_depths(pixels: Tensor, target: Tensor, before: Camera, after: Camera) -> tuple[Tensor, Tensor]:
+    """Return least-squares inverse depths [N] in the first camera, and their information [N]
+    (inverse variance for an error of one pixel).
+    """
+    c, d = parallax_terms(pixels, target, before, after)
+    squared = (c * c).sum(dim=1)
+    return (c * d).sum(dim=1) / squared.clamp(min=1e-20), squared * float(after.K[0, 0]) ** 2
+
+
+def translation_between(before: Camera, after: Camera) -> NDArray[np.float64]:
+    """Return the first camera's centre in coordinates of the second [3]; exactly 0 without
+    translation.
+    """
+    moved = before.position - after.position
+    return np.asarray(after.world_to_camera[:3, :3] @ np.where(np.abs(moved) < SMALLEST_SHIFT, 0.0, moved))
+
+
+def _normalised(pixels: Tensor, camera: Camera) -> Tensor:
+    focal = beside(pixels, [camera.K[0, 0], camera.K[1, 1]])
+    return (pixels - beside(pixels, [camera.K[0, 2], camera.K[1, 2]])) / focal
+
 
 HORIZON_S = 0.15
 """Longest time after the newest frame for which its motion is extrapolated, in seconds; then the

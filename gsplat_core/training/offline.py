@@ -1,6 +1,4 @@
-"""Training on all frames of a recording: frame order, decay of learning rates, temporal smoothing
-and densification.
-"""
+"""Training on all frames of a recording: frame order, decay of learning rates, temporal smoothing limited by how evenly the pictures change, and smoothing among nearest neighbours."""
 
 from __future__ import annotations
 
@@ -9,17 +7,76 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.geometry.registration import EXACT_KD_TREE
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import UNSEEN_PX, densify, on_tissue, shares_of
-from gsplat_core.training.nearest import nearest_others
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.steadiness import steadiness
 from gsplat_core.training.step import TrainingStep
+from gsplat_core.transfers import HostCopy, tensor_of
+
+NEIGHBOURS = 8
+"""Number of neighbours per point; fewer if there are fewer points."""
+
+
+def nearest_others(points: Tensor) -> Tensor:
+    """Return the indices of the nearest other points of `points` [N, 3], int64 [N, K]. Synchronises
+    with the device.
+
+    Ties are broken arbitrarily. A non-finite point has only itself as neighbour and is no neighbour
+    of others.
+    """
+    host = HostCopy(points.detach().float()).numpy()
+    finite = np.flatnonzero(np.isfinite(host).all(axis=1))
+    count = min(NEIGHBOURS, max(len(finite) - 1, 0))
+    others = np.repeat(np.arange(len(host))[:, None], count, axis=1)
+    if count:
+        there = np.ascontiguousarray(host[finite] - host[finite].mean(axis=0))
+        tree = cv2.flann_Index(there, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10})  # type: ignore[attr-defined]
+        found, _ = tree.knnSearch(there, count + 1, params={"checks": -1, "eps": 0.0, "sorted": True})
+        # A point is its own first result unless others coincide with it; then drop the last result
+        # instead.
+        itself = found == np.arange(len(there))[:, None]
+        itself[~itself.any(axis=1), -1] = True
+        others[finite] = finite[found[~itself].reshape(len(there), count)]
+    return tensor_of(np.ascontiguousarray(others.astype(np.int64)), points.device)
+
+
+NOISE_LEVELS = 2.5
+"""Standard deviation of noise in compressed video, in grey levels of 255."""
+MOST_FRAMES = 32
+"""Number of frames examined, spread over the recording."""
+
+
+def steadiness(observations: Sequence[Observation]) -> float:
+    """Return the ratio of noise to the deviation of frames from the interpolation of their
+    neighbours, 0 to 1.
+
+    The value is 1 if the deviation is at most noise, and decreases with its square. Temporal
+    smoothing removes this deviation, so the ratio is the admissible amount of smoothing. Only
+    tissue counts; without three frames with tissue it is 1. Integer sums make the result
+    independent of the order. Synchronises once.
+    """
+    inner = range(1, len(observations) - 1)
+    squared = torch.zeros(2, dtype=torch.int64, device=observations[0].image.device)
+    for number in inner[:: max(1, -(-len(inner) // MOST_FRAMES))]:
+        before, now, after = observations[number - 1 : number + 2]
+        span_s = after.time_s - before.time_s
+        share = (now.time_s - before.time_s) / span_s if span_s > 0 else 0.5
+        between = torch.lerp(before.image.float(), after.image.float(), share).round()
+        tissue = (before.mask != 0) & (now.mask != 0) & (after.mask != 0)
+        off = (now.image.float() - between).to(torch.int64).square().sum(-1) * tissue
+        squared += torch.stack([off.sum(), 3 * tissue.sum()])
+    total, values = squared.tolist()
+    # Noise of a frame plus that of the mean of two others.
+    noise = 1.5 * NOISE_LEVELS**2
+    return min(1.0, noise * values / total) if total else 1.0
+
 
 SMOOTH_EVERY = 20
 """Steps between two smoothings, which process all columns, unlike a step."""

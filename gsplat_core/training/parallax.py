@@ -13,13 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsplat_core.geometry.depth_agreement import UNCONFIRMED, Look, agree
-from gsplat_core.geometry.depth_map import DepthMap
-from gsplat_core.geometry.light_of_recording import frames_with_light
-from gsplat_core.geometry.matched_surface import with_matched_surface
-from gsplat_core.geometry.moving_tissue import MovingTissue
-from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
-from gsplat_core.geometry.pose_check import CONTRADICTED
+from gsplat_core.depth.light import frames_with_light
+from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Look, agree
+from gsplat_core.depth.moving_tissue import MovingTissue
+from gsplat_core.depth.multiview import CONTRADICTED, DEFORMS, depth_of_view, view_of
+from gsplat_core.depth.plane_fits import with_matched_surface
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.initialisation import possible_depth

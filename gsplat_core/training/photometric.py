@@ -1,9 +1,15 @@
-"""Loss of a rendered frame and its gradient at the Gaussians, computed directly by ops without
-autograd.
+"""Loss of a rendered frame and its gradient at the Gaussians, computed directly by ops without autograd, and the assignment of colour gradients to the eyes.
+
+Assignment of colour gradients to the eyes of a stereo scope.
+
+Both eyes train the geometry. Each eye's colours are trained by its own pictures only, because view-dependent
+differences such as highlights would otherwise pull every colour back and forth. Temporal colour changes are learned
+from the left eye and apply to both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,12 +20,24 @@ from gsplat_core.ops.image_loss.image_loss import STEEP_AS_L1, image_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.rendering.chain import Geometry, RenderedSplats, StepOperations, render_splats
+from gsplat_core.rendering.pipeline import Geometry, RenderedSplats, StepOperations, render_splats
 from gsplat_core.rendering.settings import EPS2D, RenderSettings
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.colour_correction import colour_correction
 from gsplat_core.training.observations import Observation
+
+LEFT, RIGHT = "sh", "right_sh"
+"""Tensor names in `Gaussians`. The right eye sees the sum of both."""
+
+
+def with_eye(gradients: Mapping[str, Tensor], of_right: bool) -> dict[str, Tensor]:
+    """Return the gradients of a picture extended to the colours of both eyes, with 0 for the other
+    eye.
+    """
+    nothing = torch.zeros_like(gradients[LEFT])
+    colours = (nothing, gradients[LEFT]) if of_right else (gradients[LEFT], nothing)
+    return {**gradients, **dict(zip((LEFT, RIGHT), colours, strict=True))}
 
 
 @dataclass(frozen=True)

@@ -1,31 +1,211 @@
 """Correction of the scene's geometry by the depth of frames.
 
-Pictures of one eye hardly constrain distance or motion along the line of sight, so the loss alone
-would need thousands of steps. Each Gaussian is therefore moved along its ray of the current camera,
-which sees the same picture as before. The first depth places the whole scene, which started on a
-plane. Later depth by parallax corrects all times, since it assumes static tissue. Later measured or
-stereo depth corrects a single time.
+Visible Gaussians are moved along their rays. On a GPU the correction is a CUDA graph, because a live stream has no time for its hundred launches. Depth may
+become available after its frame was trained on.
+
+Pictures of one eye hardly constrain distance or motion along the line of sight, so the loss alone would need
+thousands of steps. Each Gaussian is therefore moved along its ray of the current camera, which sees the same picture
+as before. The first depth places the whole scene, which started on a plane. Later depth by parallax corrects all
+times, since it assumes static tissue. Later measured or stereo depth corrects a single time.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from gsplat_core.deformation.basis import BasisField
+from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, FrameMode, View, render_frame
+from gsplat_core.rendering.frame_renderer import (
+    CapturedSequence,
+    FrameControls,
+    FrameStatusCopy,
+    GraphMemory,
+    capacity_for,
+)
 from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
-from gsplat_core.scene.layout import POSITION
-from gsplat_core.training.captured_correction import CapturedCorrection
-from gsplat_core.training.coverage import UNCOVERED_ALPHA
-from gsplat_core.training.depth_correction import LARGEST_STEP, SHARE, move_along_rays_, smooth_factor
+from gsplat_core.scene.gaussians import BASIS_CHANNELS, LOG_SCALE, POSITION, Gaussians
+from gsplat_core.training.growth import UNCOVERED_ALPHA
+from gsplat_core.training.hole_filling import filled
+from gsplat_core.training.image_motion import NEAREST, Seen, beside
 from gsplat_core.training.initialisation import possible_depth, tissue_depth
-from gsplat_core.training.late_depth import LateDepth
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.observations import Observation, known_depth, learned_depth
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_motion import Seen, beside
 from gsplat_core.transfers import tensor_of
+
+MOST_LATE = 30
+"""Largest number of newer frames for which late depth is still used."""
+
+
+@dataclass(frozen=True)
+class LateDepth:
+    """Depth of a frame as tensors on the training device, prepared concurrently with training."""
+
+    believed: Tensor | None
+    """Target of the depth loss, float32 [H, W], 0 where not confident; None if the loss ignores
+    this depth source.
+    """
+    possible: Tensor | None
+    """Depth for correcting the scene, float32 [H, W], 0 where unknown; None if unknown everywhere.
+    """
+    everywhere: Tensor | None
+    """`possible` extrapolated to all pixels, for placing a whole scene; None if not yet computed.
+    """
+
+    @staticmethod
+    def of(frame: Frame, device: torch.device | str, *, places: bool = False) -> LateDepth:
+        """Prepare the depth of a frame. `places` also computes `everywhere`.
+
+        Copies to a GPU are queued on the thread's current stream, which must be the training
+        stream.
+        """
+        possible = possible_depth(frame)
+        is_known = bool(possible.any())
+        return LateDepth(
+            learned_depth(frame, device),
+            known_depth(possible, device) if is_known else None,
+            tensor_of(tissue_depth(frame, 1.0), device) if places and is_known else None,
+        )
+
+    @staticmethod
+    def for_placement(frame: Frame, device: torch.device | str) -> LateDepth:
+        """Prepare only the correction of the scene, for a frame that was trained on with its depth."""
+        possible = possible_depth(frame)
+        return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)
+
+    def added_to(self, seen: Observation) -> Observation:
+        """Return the observation with the target of the depth loss."""
+        return replace(seen, depth=self.believed)
+
+
+LARGEST_STEP = 1.4
+"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is
+known.
+"""
+SHARE = 0.5
+"""Share of the correction (of log depth) applied by one frame, which averages the depth of several
+frames.
+"""
+CORRECTED_PX = 16
+"""Side of the picture blocks whose Gaussians move together, in pixels."""
+
+
+def smooth_factor(depth: Tensor, shown: Tensor, known: Tensor, pixels: Tensor) -> Tensor:
+    """Return a smooth factor [N] for the depth of Gaussians.
+
+    Neighbours get the same factor, since tissue moves smoothly and a changed order along the line
+    of sight would change the picture.
+
+    Args:
+        depth: target depth [H, W].
+        shown: depth of the scene [H, W].
+        known: bool [H, W], where both are known.
+        pixels: positions of the Gaussians [N, 2].
+    """
+    ratio = torch.where(known, depth / shown, 1.0).log()
+    smooth = filled(ratio[None], known[None].to(ratio.dtype), CORRECTED_PX)
+    height, width = ratio.shape
+    grid = torch.stack([2 * pixels[:, 0] / width - 1, 2 * pixels[:, 1] / height - 1], dim=1)
+    there = grid_sample(smooth[None], grid[None, None], padding_mode="border", align_corners=False)[0, 0, 0]
+    return (SHARE * there).exp().clamp(1 / LARGEST_STEP, LARGEST_STEP)
+
+
+def move_along_rays_(deltas: Tensor, means: Tensor, factor: Tensor, centre: Tensor) -> None:
+    """Change raw field rows so that Gaussians move along their rays and scale with the distance, in
+    place.
+
+    The camera at `centre` sees the same picture as before.
+
+    Args:
+        deltas: rows that the field adds.
+        means: canonical positions [N, 3].
+        factor: factor of the distance from the camera [N].
+        centre: camera position [3].
+    """
+    points = means + deltas[:, POSITION]
+    deltas[:, POSITION] += (factor - 1)[:, None] * (points - centre)
+    deltas[:, LOG_SCALE] += factor.log()[:, None]
+
+
+class CapturedCorrection:
+    """Depth correction of `Placement` at one time, captured for a scene whose tensors keep their
+    addresses.
+
+    A frame that overflows the tile lists corrects nothing; the lists are enlarged for the next one.
+    """
+
+    def __init__(self, rows: Gaussians, field: BasisField, camera: Camera) -> None:
+        """Prepare the correction.
+
+        Args:
+            rows: the scene's tensors with all allocated rows.
+            field: the scene's motion.
+            camera: camera with the size of every frame.
+        """
+        device, shape = rows.device, (camera.height_px, camera.width_px)
+        self._rows, self._field, self._weights, self._camera = rows, field, field.weights, camera
+        self._controls = FrameControls(device, rates=1)
+        self._depth = torch.zeros(shape, device=device)
+        self._mask = torch.zeros(shape, dtype=torch.uint8, device=device)
+        self._status = FrameStatusCopy()
+        self._memory = GraphMemory(device)
+        self._capacity = capacity_for(4 * rows.count)
+        self._captured: CapturedSequence[None] | None = None
+
+    def fits(self, rows: Gaussians, field: BasisField, camera: Camera) -> bool:
+        """Return True if the graph fits these tensors and this size."""
+        same_scene = rows is self._rows and field is self._field and field.weights is self._weights
+        size = self._camera.width_px, self._camera.height_px
+        return same_scene and size == (camera.width_px, camera.height_px)
+
+    def __call__(self, observation: Observation, depth: Tensor, shown_s: float) -> None:
+        """Queue the correction for an observation.
+
+        Args:
+            observation: camera, time and mask of the frame.
+            depth: float32 [H, W], 0 = unknown.
+            shown_s: time in seconds at which the scene is changed.
+        """
+        if (needs := self._status.wait()).overflowed:
+            self._capacity, self._captured = capacity_for(needs.instances), None
+        self._depth.copy_(depth)
+        self._mask.copy_(observation.mask)
+        field = self._field
+        self._controls.set(observation.camera, field.frame_time(observation.time_s), [field.frame_time(shown_s)])
+        with torch.no_grad():
+            if self._captured is None:
+                self._correct()
+                self._captured = CapturedSequence(self._correct, self._depth.device, self._memory, warm_up=False)
+            else:
+                self._captured.replay()
+        self._status.launched(self._depth.device)
+
+    def _correct(self) -> None:
+        scene, controls, camera = self._rows, self._controls, self._camera
+        deltas_at = self._field.frame_deltas(scene)
+        seen = deltas_at(controls.time)
+        view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px)
+        frame = render_frame(scene.left_tensors, seen, view, self._capacity, FrameMode.SHARED)
+        self._status.queue(frame.status)
+        known = (self._depth > 0) & (self._mask > 0) & (frame.alphas >= UNCOVERED_ALPHA)
+        known &= frame.status[STATUS_OVERFLOW] == 0
+        # `Seen` does the same but copies the camera from the host, which cannot be captured.
+        rotation, translation = controls.viewmat[:3, :3], controls.viewmat[:3, 3]
+        local = ((scene.means + seen[:, POSITION])[:, None, :] * rotation).sum(2) + translation
+        focal, middle = controls.intrinsics.diagonal()[:2], controls.intrinsics[:2, 2]
+        pixels = local[:, :2] / local[:, 2:].clamp(min=NEAREST) * focal + middle
+        factor = smooth_factor(self._depth, frame.image[..., 3], known, pixels)
+        factor = torch.where(scene.logit_opacities.isfinite(), factor, 1.0)  # unused rows keep their values
+        moved = deltas_at(controls.rates)[:, :BASIS_CHANNELS].contiguous()
+        move_along_rays_(moved, scene.means, factor, -(rotation * translation[:, None]).sum(0))
+        self._field.move_to_at(controls.rates, moved)
+
 
 CORRECTS_ALL_TIMES = (DepthOrigin.PARALLAX,)
 CORRECTS_ONE_TIME = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)

@@ -20,13 +20,12 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.scope_path import ScopePath
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
-from gsplat_core.training.budget import Budget, Spending, StepsInFlight
+from gsplat_core.training.budget import Budget, ObserveReport, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.covering import Covering
+from gsplat_core.training.growth import Covering
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.offline import FitSettings, OfflineTraining
 from gsplat_core.training.parallax import to_fit
 from gsplat_core.training.placement import Placement

@@ -18,6 +18,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.hole_filling import filled
+from gsplat_core.training.image_motion import beside
 from gsplat_core.training.initialisation import (
     FIRST_OPACITY,
     SIGMA_IN_SPACINGS,
@@ -30,7 +31,6 @@ from gsplat_core.training.initialisation import (
     unprojected,
 )
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.surface_motion import beside
 from gsplat_core.transfers import tensor_of
 
 

@@ -18,14 +18,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.geometry.depth_fill import filled_depth
+from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.scene.frames import DepthOrigin, Frame
-from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion
+from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
 from gsplat_core.training.initialisation import possible_depth
 from gsplat_core.training.motion_prior import followed
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
 from gsplat_core.transfers import tensor_of
 
 OF_ONE_PICTURE = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)

@@ -21,10 +21,9 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.densification import halves
 from gsplat_core.training.growth import grid_spacing
 from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
-from gsplat_core.training.neighbourhood import around_cells
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.unseen import LastSeen, depth_of, pixels_of, value_at
+from gsplat_core.training.unseen import LastSeen, around_cells, depth_of, pixels_of, value_at
 
 RELAX_EVERY = 128
 """Training steps between two relaxation rounds."""

@@ -6,11 +6,11 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_core.geometry.registry import check_depth, depth_inputs
+from gsplat_core.depth.registry import check_depth, depth_inputs
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveTraining
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.result import RunSettings
 from operators.display import DisplaySettings

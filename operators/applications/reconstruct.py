@@ -13,12 +13,12 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
-from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.budget import ObserveReport
 from gsplat_core.training.right_eye import BothEyes
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded

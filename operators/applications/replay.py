@@ -22,8 +22,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from gsplat_core.depth.registry import check_depth, depth_inputs
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.registry import check_depth, depth_inputs
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.rendering.registry import check_renderer

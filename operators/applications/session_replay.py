@@ -13,8 +13,7 @@ from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.io.sessions.records import ReconstructorMade, camera_of
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from operators.applications.device import seeded
 from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.compare_shown import CompareShownOp

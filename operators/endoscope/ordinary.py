@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gsplat_core.endoscope.ordinary import OrdinaryPictures
-from gsplat_core.endoscope.turns import Turns
+from gsplat_core.endoscope.ordinary import OrdinaryPictures, Turns
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.endoscope.stage import Stage, StageOp
 from operators.outcome import OutcomeBuilder

@@ -14,7 +14,7 @@ from typing import Any
 
 import typer
 
-from gsplat_core.geometry.registry import check_depth
+from gsplat_core.depth.registry import check_depth
 from operators.settings import JobOptions
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.cli.interrupt import ASKING

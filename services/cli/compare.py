@@ -10,9 +10,8 @@ import numpy as np
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.closest import ClosestPoints
 from gsplat_core.geometry.mesh import mesh_of
-from gsplat_core.geometry.registration import distances, from_pairs, moved_by, register
+from gsplat_core.geometry.registration import ClosestPoints, distances, from_pairs, moved_by, register
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.surface_files import read_surface
 from services.cli.exit_codes import BAD_INPUT, OK

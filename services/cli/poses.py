@@ -9,11 +9,11 @@ from pathlib import Path
 import typer
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
-from gsplat_core.geometry.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
-from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.recording import FileRecording
+from gsplat_core.poses.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
+from gsplat_core.poses.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.progress import Progress

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_core.endoscope.onnx_file import read_model
+from gsplat_core.endoscope.onnx import read_model
 from gsplat_core.errors import UserError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.camera_path import read_camera_path

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gsplat_core.depth import registry
+from gsplat_core.depth.maps import BELIEVED, DepthMap, doubted
+from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry import registry
-from gsplat_core.geometry.depth_map import BELIEVED, DepthMap, doubted
-from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, FrameStatus
 from gsplat_core.training.config import ReconstructorConfig

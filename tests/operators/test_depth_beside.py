@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.depth.maps import DepthMap, doubted
+from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.depth_map import DepthMap, doubted
-from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
-from gsplat_core.training.late_depth import LateDepth
+from gsplat_core.training.placement import LateDepth
 from operators.depth import FoundDepth
 from operators.depth_beside import FEW_CORES, DepthBeside, DepthBesideOp, share_of
 from operators.outcome import OutcomeBuilder

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.live_odometry import MOSTLY, LiveOdometry
+from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
 from operators.outcome import OutcomeBuilder

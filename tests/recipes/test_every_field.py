@@ -14,8 +14,7 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.upkeep import RENEW_EVERY
 from services.cli.app import run

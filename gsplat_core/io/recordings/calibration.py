@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.depth.rectification import Rectification, StereoCalibration
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.rectification import Rectification, StereoCalibration
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.plain_files import (

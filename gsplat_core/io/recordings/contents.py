@@ -15,8 +15,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.depth.rectification import Rectification
 from gsplat_core.errors import RecordingInvalid
-from gsplat_core.geometry.rectification import Rectification
 from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.io.recordings.calibration import Calibration
 from gsplat_core.io.recordings.findings import Findings, printable

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from gsplat_core.geometry.rectification import Rectification
+from gsplat_core.depth.rectification import Rectification
 from gsplat_core.io.recordings.calibration import (
     POSES_FILE,
     Calibration,

@@ -17,8 +17,8 @@ from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.scalars.scalars import store_scalars_
-from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
-from gsplat_core.scene.layout import RAW_COLUMNS
+from gsplat_core.scene.gaussians import BASIS_CHANNELS as CHANNELS
+from gsplat_core.scene.gaussians import RAW_COLUMNS
 
 RATES = 6
 """Number of learning rates: position, rotation, log-scale, colour, centres, widths."""

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.layout import BASIS_GROUPS, COLOUR, RAW_COLUMNS, width_of
+from gsplat_core.scene.gaussians import BASIS_GROUPS, COLOUR, RAW_COLUMNS, width_of
 
 BUMP_REACH = 4.0
 """Truncation radius of a bump in widths; its height there is exp(-16) = 1e-7."""

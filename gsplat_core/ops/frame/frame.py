@@ -117,7 +117,7 @@ def render_frame(
     Args:
         gaussians: float32 on CUDA: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3],
             logit_opacities [N], and sh [N, B, 3] with B = (degree + 1)², degree at most 4.
-        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.layout`, or
+        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.gaussians`, or
             None.
         view: camera with its tensors on the device.
         capacity: allocated instances, in all tiles together or, with segments, in each tile. If a

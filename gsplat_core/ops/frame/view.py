@@ -12,8 +12,7 @@ from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE
 from gsplat_core.scene.cameras import CAMERA_MODELS
-from gsplat_core.scene.gaussians import MAX_SH_DEGREE
-from gsplat_core.scene.layout import RAW_COLUMNS
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE, RAW_COLUMNS
 
 GAUSSIAN_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 """Names of the Gaussians' tensors in the order used by ops, moments and learning rates."""

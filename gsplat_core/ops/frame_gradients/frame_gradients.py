@@ -16,7 +16,7 @@ from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.frame.view import GAUSSIAN_TENSORS, View, check_inputs
-from gsplat_core.scene.layout import RAW_COLUMNS
+from gsplat_core.scene.gaussians import RAW_COLUMNS
 
 if TYPE_CHECKING:
     from gsplat_core.ops.frame.frame import Frame

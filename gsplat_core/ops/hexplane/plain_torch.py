@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.layout import COLOUR, HEAD_GROUPS, OPACITY, RAW_COLUMNS, width_of
+from gsplat_core.scene.gaussians import COLOUR, HEAD_GROUPS, OPACITY, RAW_COLUMNS, width_of
 
 
 def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:

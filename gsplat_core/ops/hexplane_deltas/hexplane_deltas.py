@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.scene.layout import RAW_COLUMNS
+from gsplat_core.scene.gaussians import RAW_COLUMNS
 
 
 def hexplane_deltas(

@@ -15,7 +15,7 @@ from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.rendering.settings import FAR_PLANE, NEAR_PLANE
-from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 TILE = 16

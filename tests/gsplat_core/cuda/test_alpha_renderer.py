@@ -9,7 +9,7 @@ import torch
 
 from gsplat_core import Camera, Model, SnapshotSlots, new_renderer, render
 from gsplat_core.deformation import BasisField, new_field
-from gsplat_core.rendering import capture
+from gsplat_core.rendering import frame_renderer
 
 pytestmark = pytest.mark.cuda
 
@@ -31,8 +31,8 @@ def scene(make_gaussians):
 def captures(monkeypatch):
     """Counts the graphs that are captured."""
     made = []
-    original = capture._capture
-    monkeypatch.setattr(capture, "_capture", lambda *arguments: made.append(1) or original(*arguments))
+    original = frame_renderer._capture
+    monkeypatch.setattr(frame_renderer, "_capture", lambda *arguments: made.append(1) or original(*arguments))
     return made
 
 

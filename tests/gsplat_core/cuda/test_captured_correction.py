@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from gsplat_core.scene.frames import DepthOrigin
-from gsplat_core.training.captured_correction import CapturedCorrection
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.placement import _correct_at
+from gsplat_core.training.placement import CapturedCorrection, _correct_at
 from tests.gsplat_core.training.test_late_depth import CAMERA, found, frame_at
 
 pytestmark = pytest.mark.cuda

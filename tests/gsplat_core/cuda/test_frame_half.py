@@ -20,7 +20,7 @@ from gsplat_core.ops.frame.frame import (
 )
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.rendering.settings import EPS2D
-from gsplat_core.scene.layout import COLOUR
+from gsplat_core.scene.gaussians import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import FrameScene, frame_scene
 
 pytestmark = pytest.mark.cuda

@@ -129,8 +129,7 @@ def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
 def test_the_right_eye_trains_its_own_colours_as_on_the_cpu(make_gaussians, observation, relaxation):
     """Several steps of both eyes by turns, whose pictures differ in colour: the same as without a captured graph."""
-    from gsplat_core.training.eye_gradients import with_eye
-    from gsplat_core.training.photometric import loss_and_gradients
+    from gsplat_core.training.photometric import loss_and_gradients, with_eye
 
     left = dataclasses.replace(observation, depth=None)
     right = dataclasses.replace(left, image=255 - left.image, of_right=True)

@@ -19,7 +19,7 @@ from gsplat_core import (
 )
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.rendering.view_colors import camera_centers
+from gsplat_core.rendering.pipeline import camera_centers
 
 pytestmark = pytest.mark.cuda
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from gsplat_core.endoscope import onnx_file
-from gsplat_core.endoscope.onnx_file import has_external_data, read_model
+from gsplat_core.endoscope import onnx
+from gsplat_core.endoscope.onnx import has_external_data, read_model
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.errors import InvalidSetting
 
@@ -76,7 +76,7 @@ def test_operators_of_other_libraries_are_refused(tmp_path):
 
 
 def test_a_file_that_is_too_large_is_not_read_whole(tmp_path, monkeypatch):
-    monkeypatch.setattr(onnx_file, "MOST_BYTES", 1000)
+    monkeypatch.setattr(onnx, "MOST_BYTES", 1000)
     path = tmp_path / "net.onnx"
     path.write_bytes(bytes(1001))
     with pytest.raises(InvalidSetting, match="it is larger than 1000 bytes"):

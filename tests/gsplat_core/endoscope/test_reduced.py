@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.median import median_of
-from gsplat_core.endoscope.reduced import averaged, enlarged, reduced_mask, sampled_mask
+from gsplat_core.endoscope.reduced import averaged, enlarged, median_of, reduced_mask, sampled_mask
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.tool_regions import Regions, mean_level, tool_regions, whole_tools
+from gsplat_core.endoscope.tools import Regions, mean_level, tool_regions, whole_tools
 
 HEIGHT, WIDTH = 100, 120
 TISSUE, TOOL = 0.5, 0.0

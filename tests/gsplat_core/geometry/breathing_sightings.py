@@ -6,9 +6,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.breathing_trajectory import Sightings
-from gsplat_core.geometry.moving_bundle import MovingBundle
-from gsplat_core.geometry.surface_field import SurfaceField
+from gsplat_core.poses.breathing import Sightings
+from gsplat_core.poses.moving_bundle import MovingBundle, SurfaceField
 from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swaying, tracks_of
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.affine_depth import LEAST_VALUES, MOST_SPAN, fitted, is_constant, with_assumed_zero
+from gsplat_core.depth.learned import LEAST_VALUES, MOST_SPAN, fitted, is_constant, with_assumed_zero
 
 COUNT = 2000
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsplat_core.geometry.bundle import Bundle, adjust, errors_px
-from gsplat_core.geometry.pose import exp, inverse
+from gsplat_core.poses.bundle import Bundle, adjust, errors_px
+from gsplat_core.poses.se3 import exp, inverse
 
 FOCAL = 300.0
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry import camera_placement
-from gsplat_core.geometry.bundle import Bundle, adjust
-from gsplat_core.geometry.camera_placement import moved, placed
-from gsplat_core.geometry.pose import exp
+from gsplat_core.poses import bundle
+from gsplat_core.poses.bundle import Bundle, adjust, moved, placed
+from gsplat_core.poses.se3 import exp
 
 FOCAL_PX = 300.0
 TWIST = np.array([3.0, -2.0, 1.0, 0.05, -0.03, 0.1])
@@ -84,16 +83,16 @@ def test_a_twist_is_the_matrix_exponential(size):
     for n in range(1, 40):
         term = term @ generator / n
         series = series + term
-    np.testing.assert_allclose(camera_placement.moved(np.eye(4), twist), series, atol=1e-12)
+    np.testing.assert_allclose(bundle.moved(np.eye(4), twist), series, atol=1e-12)
 
 
 def test_derivatives_by_a_twist_are_those_of_finite_differences():
     points = np.random.default_rng(0).uniform([-20, -15, 40], [20, 15, 70], (6, 3))
-    found = camera_placement._by_twist(points)
+    found = bundle._by_twist(points)
     for k in range(6):
         rays = []
         for step in (1e-6, -1e-6):
-            pose = camera_placement.moved(np.eye(4), step * np.eye(6)[k])
+            pose = bundle.moved(np.eye(4), step * np.eye(6)[k])
             local = points @ pose[:3, :3].T + pose[:3, 3]
             rays.append(local[:, :2] / local[:, 2:])
         np.testing.assert_allclose(found[:, :, k], (rays[0] - rays[1]) / 2e-6, atol=1e-7)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.depth_agreement import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, disagreement
-from gsplat_core.geometry.key_frames import ParallaxDepth
+from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, disagreement
+from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame

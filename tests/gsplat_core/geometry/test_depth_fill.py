@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.depth_fill import filled_depth, local_plane
+from gsplat_core.depth.plane_fits import filled_depth, local_plane
 
 HEIGHT, WIDTH = 96, 128
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry.disparity import Disparity, Span, enlarged, find_disparity, match, shrunk, smoothed
+from gsplat_core.depth.stereo import Disparity, Span, enlarged, find_disparity, match, shrunk, smoothed
 
 HEIGHT, WIDTH = 64, 96
 

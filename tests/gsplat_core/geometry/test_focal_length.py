@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry import focal_length
-from gsplat_core.geometry.focal_length import (
+from gsplat_core.geometry.tracks import Observations
+from gsplat_core.poses import focal_length
+from gsplat_core.poses.focal_length import (
     LEAST_POINTS,
     LONGEST,
     SHORTEST,
@@ -16,9 +17,8 @@ from gsplat_core.geometry.focal_length import (
     trajectory_without_calibration,
     with_focal_length,
 )
-from gsplat_core.geometry.odometry import Trajectory
-from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.tracks import Observations
+from gsplat_core.poses.odometry import Trajectory
+from gsplat_core.poses.se3 import exp
 from gsplat_core.scene.cameras import Camera
 
 WIDTH, HEIGHT, COUNT, POINTS = 320, 256, 12, 70

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from gsplat_core.depth.learned import AGAINST, DISTANCE, FLAT, GIVEN, NOT_FINITE, UNLIKE, UNSEEN, LearnedDepth
+from gsplat_core.depth.maps import BELIEVED
+from gsplat_core.depth.registry import DepthFinder, check_depth, new_estimator
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.depth_map import BELIEVED
-from gsplat_core.geometry.learned import AGAINST, DISTANCE, FLAT, GIVEN, NOT_FINITE, UNLIKE, UNSEEN, LearnedDepth
-from gsplat_core.geometry.registry import DepthFinder, check_depth, new_estimator
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from tests.gsplat_core.endoscope.networks import conv, external_weights, write

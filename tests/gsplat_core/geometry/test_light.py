@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import light
-from gsplat_core.geometry.light import FLAT, UNSEEN, LightDepth
-from gsplat_core.geometry.registry import DEPTHS
-from gsplat_core.geometry.relief import Grid, Places
-from gsplat_core.geometry.shading import shading_of
+from gsplat_core.depth import light
+from gsplat_core.depth.light import FLAT, UNSEEN, LightDepth
+from gsplat_core.depth.registry import DEPTHS
+from gsplat_core.depth.relief import Grid, Places
+from gsplat_core.depth.shading import shading_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, PINK, WIDTH, error, facing_and_distance, rays

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.light_of_recording import frames_with_light
+from gsplat_core.depth.light import frames_with_light
 from gsplat_core.scene.frames import DepthOrigin
 from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, WIDTH, error, frame, pigment, rays
 

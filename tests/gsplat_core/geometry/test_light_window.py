@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import light_window
-from gsplat_core.geometry.light_window import LightWindow
+from gsplat_core.depth import light
+from gsplat_core.depth.light import LightWindow
 
 
 def look(name, followed=True):
@@ -32,9 +32,9 @@ def solved(monkeypatch):
         counts.append(len(shadings))
         return SimpleNamespace(key=np.array([10.0]), changes=np.arange(len(shadings), dtype=float)[:, None])
 
-    monkeypatch.setattr(light_window, "Follower", Follower)
-    monkeypatch.setattr(light_window, "find_reliefs", find_reliefs)
-    monkeypatch.setattr(light_window, "find_change", lambda grid, key, change: np.array([0.5]))
+    monkeypatch.setattr(light, "Follower", Follower)
+    monkeypatch.setattr(light, "find_reliefs", find_reliefs)
+    monkeypatch.setattr(light, "find_change", lambda grid, key, change: np.array([0.5]))
     return counts
 
 

@@ -10,12 +10,12 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
-from gsplat_core.geometry import live_odometry, local_map
-from gsplat_core.geometry.live_odometry import LiveOdometry
-from gsplat_core.geometry.odometry import DISTANCE
 from gsplat_core.geometry.stream_tracks import StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.poses import live_odometry, local_map
+from gsplat_core.poses.live_odometry import LiveOdometry
+from gsplat_core.poses.odometry import DISTANCE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 

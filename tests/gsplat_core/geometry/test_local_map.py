@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry.local_map import KeyFrame, LocalMap, position_of, scaled, unprojected
+from gsplat_core.poses.local_map import KeyFrame, LocalMap, position_of, scaled, unprojected
 
 
 def key(x, numbers=(), y=0.0):

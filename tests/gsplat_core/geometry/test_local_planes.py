@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.local_planes import at_middles, terms_of
+from gsplat_core.depth.plane_fits import at_middles, terms_of
 
 
 def summed(x, y, values, weight) -> tuple[np.ndarray, ...]:

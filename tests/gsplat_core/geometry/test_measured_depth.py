@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.measured_depth import measured_confidence
-from gsplat_core.geometry.registry import DepthFinder
+from gsplat_core.depth.maps import measured_confidence
+from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 

@@ -8,12 +8,11 @@ from itertools import pairwise
 import pytest
 import torch
 
-from gsplat_core.geometry.breathing_frequencies import waves
-from gsplat_core.geometry.bundle import Bundle, errors_px
-from gsplat_core.geometry.bundle import adjust as adjust_still
-from gsplat_core.geometry.moving_bundle import _cost, _step, adjust, with_waves
-from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.trajectory_prior import learned_from
+from gsplat_core.poses.breathing import waves
+from gsplat_core.poses.bundle import Bundle, errors_px
+from gsplat_core.poses.bundle import adjust as adjust_still
+from gsplat_core.poses.moving_bundle import _cost, _step, adjust, learned_from, with_waves
+from gsplat_core.poses.se3 import exp
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
 from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
 

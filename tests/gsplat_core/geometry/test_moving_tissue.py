@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import moving_tissue
-from gsplat_core.geometry.depth_map import BELIEVED
-from gsplat_core.geometry.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
+from gsplat_core.depth import moving_tissue
+from gsplat_core.depth.maps import BELIEVED
+from gsplat_core.depth.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import moving_tissue
-from gsplat_core.geometry.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
-from gsplat_core.geometry.pull import Pull
+from gsplat_core.depth import moving_tissue
+from gsplat_core.depth.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue, Pull
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.depth_map import BELIEVED, DepthMap
-from gsplat_core.geometry.multiview import MOST_VIEWS, chosen_views, depth_of_view, view_of
+from gsplat_core.depth.maps import BELIEVED, DepthMap
+from gsplat_core.depth.multiview import MOST_VIEWS, chosen_views, depth_of_view, view_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from tests.gsplat_core.geometry.moving_scope import (

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import multiview
-from gsplat_core.geometry.multiview import chosen_views
+from gsplat_core.depth import multiview
+from gsplat_core.depth.multiview import chosen_views
 
 
 def view(x, turn=0.0):

@@ -10,10 +10,10 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
-from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.geometry.tracks import FeatureTracks
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.poses.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

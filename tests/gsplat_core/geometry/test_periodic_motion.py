@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.frequencies import found_in
+from gsplat_core.depth.periodic_motion import PeriodicMotion, fitted, found_in, in_cameras, off_px, waves
 from gsplat_core.geometry.grid_tracks import GridTracks
-from gsplat_core.geometry.periodic_motion import PeriodicMotion, fitted, in_cameras, off_px, waves
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
 
 TRUE = BREATHING_HZ, HEART_HZ

@@ -8,7 +8,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.photometric_pose import refine_pose
-from gsplat_core.geometry.pose import exp
+from gsplat_core.poses.se3 import exp
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians

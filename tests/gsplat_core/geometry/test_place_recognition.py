@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry import live_odometry
-from gsplat_core.geometry.live_odometry import LiveOdometry
-from gsplat_core.geometry.local_map import KeyFrame, LocalMap
-from gsplat_core.geometry.place_recognition import PlaceRecognition, seen_again
-from gsplat_core.geometry.pose import exp
 from gsplat_core.geometry.stream_tracks import SmallPicture, SmallPictures, StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.poses import live_odometry
+from gsplat_core.poses.live_odometry import LiveOdometry
+from gsplat_core.poses.local_map import KeyFrame, LocalMap, PlaceRecognition, seen_again
+from gsplat_core.poses.se3 import exp
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, depth_of_surface, seen_from

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.geometry.pose import between, exp, hat, inverse, log
+from gsplat_core.poses.se3 import between, exp, hat, inverse, log
 
 TWISTS = [
     [0.0] * 6,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import plane_sweep, pose_check
+from gsplat_core.depth import multiview
 from gsplat_core.scene.cameras import Camera
 
 FOCAL_PX = 100.0
@@ -23,15 +23,15 @@ def sightings(inverse, off_px=0.0):
 
 def test_weights_are_those_of_the_sum_of_distances_from_half_a_pixel_on():
     c, d, _ = sightings([0.02] * 4, [0.0, 0.5, 1.0, 5.0])
-    found = pose_check._agreement(c, d, FOCAL_PX, np.full(4, 0.02))
+    found = multiview._agreement(c, d, FOCAL_PX, np.full(4, 0.02))
     np.testing.assert_allclose(found, [[1, 1, 0.5, 0.1]] * 2)
 
 
 def test_one_corner_that_moves_by_itself_hardly_moves_the_plane():
     c, d, seen = sightings([0.02] * 9, [0.0] * 8 + [30.0])
-    assert pose_check._plane(c, d, seen, FOCAL_PX) == pytest.approx(0.02, abs=4e-4)
+    assert multiview._plane(c, d, seen, FOCAL_PX) == pytest.approx(0.02, abs=4e-4)
     seen[:, -1] = False
-    assert pose_check._plane(c, d, seen, FOCAL_PX) == pytest.approx(0.02)
+    assert multiview._plane(c, d, seen, FOCAL_PX) == pytest.approx(0.02)
 
 
 def test_depth_of_a_corner_is_pulled_to_the_plane_by_its_prior():
@@ -39,18 +39,18 @@ def test_depth_of_a_corner_is_pulled_to_the_plane_by_its_prior():
     c, d, seen = sightings([0.0215])
     information, prior = 5 * 200.0**2, 1 / 0.01**2
     expected = (information * 0.0215 + prior * 0.02) / (information + prior)
-    assert pose_check._relief(c, d, seen, FOCAL_PX, 0.02) == pytest.approx([expected])
-    assert pose_check._relief(c, d, ~seen, FOCAL_PX, 0.02) == pytest.approx([0.02])
+    assert multiview._relief(c, d, seen, FOCAL_PX, 0.02) == pytest.approx([expected])
+    assert multiview._relief(c, d, ~seen, FOCAL_PX, 0.02) == pytest.approx([0.02])
 
 
 @pytest.mark.parametrize(("inverse", "bound"), [(10.0, 0.08), (-10.0, 0.005)])
 def test_nothing_is_four_times_nearer_or_farther_than_the_plane(inverse, bound):
     c, d, seen = sightings([inverse])
-    assert pose_check._relief(1000 * c, 1000 * d, seen, FOCAL_PX, 0.02) == pytest.approx([bound])
+    assert multiview._relief(1000 * c, 1000 * d, seen, FOCAL_PX, 0.02) == pytest.approx([bound])
 
 
 def test_medians_are_of_the_corners_that_were_followed():
-    found = pose_check._medians(np.array([[1.0, 2, 9], [4, 5, 6]]), np.array([[1, 1, 0], [1, 1, 1]], bool))
+    found = multiview._medians(np.array([[1.0, 2, 9], [4, 5, 6]]), np.array([[1, 1, 0], [1, 1, 1]], bool))
     assert found.tolist() == [1.5, 5.0]
 
 
@@ -68,31 +68,31 @@ def test_where_another_view_sees_a_point_at_an_inverse_depth():
     pixel = first.K @ point
     there = second.K @ (second.world_to_camera[:3, :3] @ point + second.world_to_camera[:3, 3])
     expected = there[:2] / there[2] - 0.5
-    warped = plane_sweep._plane_homography(first, second, 1 / 50) @ [*(pixel[:2] / pixel[2] - 0.5), 1]
+    warped = multiview._plane_homography(first, second, 1 / 50) @ [*(pixel[:2] / pixel[2] - 0.5), 1]
     np.testing.assert_allclose(warped[:2] / warped[2], expected)
     # The same point by the terms of the check: w c = d.
     corners = np.array([pixel[:2] / pixel[2] - 0.5])
-    c, d = pose_check._terms(corners, expected[None], first, second)
+    c, d = multiview._terms(corners, expected[None], first, second)
     np.testing.assert_allclose(c / 50, d, atol=1e-12)
 
 
 @pytest.mark.parametrize(("gain", "cost"), [(1.0, 0.0), (0.5, 0.0), (-1.0, 1.0)])
 def test_the_cost_does_not_depend_on_brightness_and_an_inverted_picture_costs_most(gain, cost):
     grey = np.random.default_rng(0).uniform(60, 190, (20, 24)).astype(np.float32)
-    mean, variance = plane_sweep._moments(grey)
-    found = plane_sweep._cost(grey, mean, variance, (gain * (grey - 125) + 100).astype(np.float32))
+    mean, variance = multiview._moments(grey)
+    found = multiview._cost(grey, mean, variance, (gain * (grey - 125) + 100).astype(np.float32))
     assert found[10, 12] == pytest.approx(cost, abs=0.01)
 
 
 def test_contrast_below_noise_does_not_correlate():
     """A contrast of 2 grey levels, as the noise has, correlates by one half with itself."""
     pattern = np.where(np.indices((40, 40)).sum(0) % 2, 2.0, -2.0).astype(np.float32) + 100
-    mean, variance = plane_sweep._moments(pattern)
-    assert plane_sweep._cost(pattern, mean, variance, pattern)[20, 20] == pytest.approx(0.25, abs=0.01)
+    mean, variance = multiview._moments(pattern)
+    assert multiview._cost(pattern, mean, variance, pattern)[20, 20] == pytest.approx(0.25, abs=0.01)
 
 
 def test_patches_count_where_all_of_seven_pixels_are_tissue():
     tissue = np.ones((20, 20), np.uint8)
     tissue[10, 10] = 0
-    whole = plane_sweep._whole_patches(tissue)
+    whole = multiview._whole_patches(tissue)
     assert not whole[7:14, 7:14].any() and whole[6, 10] and whole[14, 14] and whole[10, 6]

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gsplat_core.depth.rectification import Rectification, StereoCalibration
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.rectification import Rectification, StereoCalibration
 
 SIZE = (320, 256)
 CALIBRATION = StereoCalibration(

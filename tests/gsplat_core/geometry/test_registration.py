@@ -10,9 +10,15 @@ import pytest
 
 from gsplat_core import Camera
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.closest import ClosestPoints, closest_on_triangles
 from gsplat_core.geometry.mesh import mesh_of_depth
-from gsplat_core.geometry.registration import distances, from_pairs, moved_by, register
+from gsplat_core.geometry.registration import (
+    ClosestPoints,
+    closest_on_triangles,
+    distances,
+    from_pairs,
+    moved_by,
+    register,
+)
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
 

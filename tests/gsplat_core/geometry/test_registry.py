@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsplat_core.depth import registry
+from gsplat_core.depth.registry import DepthFinder, Sentences
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry import registry
-from gsplat_core.geometry.registry import DepthFinder, Sentences
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import relief_fit
-from gsplat_core.geometry.light_change import Change
-from gsplat_core.geometry.relief import Grid, Places, appearance
-from gsplat_core.geometry.relief_fit import Equations, find_change, find_reliefs
-from gsplat_core.geometry.shading import LEAST_DETAIL, Shading
+from gsplat_core.depth import relief as relief_module
+from gsplat_core.depth.relief import Equations, Grid, Places, appearance, find_change, find_reliefs
+from gsplat_core.depth.shading import LEAST_DETAIL, Change, Shading
 from gsplat_core.scene.cameras import Camera
 
 GRID = Grid.of(Camera.from_focal(140.0, 160, 128), (32, 40))
@@ -158,7 +156,7 @@ def equations(monkeypatch):
         given.append(dict(own=own, relief=relief, off=off, weight=weight, prior=prior, away=away, tell=tell))
         return Equations(own, relief, off, weight, prior, away, tell)
 
-    monkeypatch.setattr(relief_fit, "Equations", record)
+    monkeypatch.setattr(relief_module, "Equations", record)
     return given
 
 
@@ -168,7 +166,7 @@ FLAT = np.zeros(len(GRID.half_waves))
 def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_three_tenths(equations):
     share = 0.5 * ONES
     brighter = np.where(np.arange(40) < 20, 0.0, 0.06) * ONES
-    relief_fit.Followed(GRID, Change(brighter, share, np.zeros((32, 40, 2)), 1.0)).equations(FLAT, FLAT)
+    relief_module.Followed(GRID, Change(brighter, share, np.zeros((32, 40, 2)), 1.0)).equations(FLAT, FLAT)
     (one,) = equations
     # An error of three deviations weighs 1 / sqrt(10) of one that is none.
     np.testing.assert_allclose(one["weight"].reshape(32, 40)[0, [0, 39]], [1250, 1250 / np.sqrt(10)])
@@ -183,7 +181,7 @@ def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_thre
 def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coarse(equations):
     seen = np.where(np.arange(40) < 20, 0.0, 0.2) * ONES
     seen[:, 19] = 0.0
-    brightness = relief_fit.Brightness(GRID, [Shading(seen, ONES, 0.1, NOTHING, NOTHING)] * 2, [0, 1], 0.5)
+    brightness = relief_module.Brightness(GRID, [Shading(seen, ONES, 0.1, NOTHING, NOTHING)] * 2, [0, 1], 0.5)
     brightness.equations(FLAT, np.zeros((2, len(FLAT))), 0.0)
     (one,) = equations
     expected = 0.5 * (2 / 0.1**2) / 2 / np.sqrt(1 + one["off"] ** 2 * 2 / 0.1**2)
@@ -196,7 +194,7 @@ def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coa
 
 
 def test_glints_become_rarer_by_a_twelfth_radian(equations):
-    found = relief_fit.Glints(GRID, [Shading(NOTHING, ONES, 0.1, 0.1 * ONES, ONES)] * 8)
+    found = relief_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, 0.1 * ONES, ONES)] * 8)
     found.equations(FLAT, np.zeros((8, len(FLAT))))
     (one,) = equations
     angle = np.tile(appearance(PLACES, FLAT).angle, 8)
@@ -213,7 +211,7 @@ def test_glints_become_rarer_by_a_twelfth_radian(equations):
 
 def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
     wet = np.where(np.arange(40) < 20, 0.4, 0.6) * ONES
-    relief_fit.Glints(GRID, [Shading(NOTHING, ONES, 0.1, NOTHING, wet)]).equations(FLAT, FLAT[None])
+    relief_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, NOTHING, wet)]).equations(FLAT, FLAT[None])
     weight = equations[0]["weight"].reshape(32, 40)
     assert not weight[:, :20].any() and weight[:, 20:].all()
 
@@ -228,7 +226,9 @@ def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
     ],
 )
 def test_the_width_of_a_prior_is_that_of_what_was_found_and_of_a_hundred_expected(scaled, undecided, width):
-    found = relief_fit._width(scaled, undecided, relief_fit.RELIEF, relief_fit.RELIEF_COUNT, relief_fit.RELIEF_LIMITS)
+    found = relief_module._width(
+        scaled, undecided, relief_module.RELIEF, relief_module.RELIEF_COUNT, relief_module.RELIEF_LIMITS
+    )
     assert found == pytest.approx(width)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry import stereo
-from gsplat_core.geometry.stereo import StereoDepth
+from gsplat_core.depth import stereo
+from gsplat_core.depth.stereo import StereoDepth
 from gsplat_core.scene.frames import DepthOrigin
 from tests.gsplat_core.geometry.pairs import (
     BASELINE_MM,
@@ -212,7 +212,7 @@ def test_another_scene_is_looked_at_anew(left, right):
 
 
 def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
-    monkeypatch.setattr("gsplat_core.geometry.stereo.MARGIN_PX", 200)
+    monkeypatch.setattr("gsplat_core.depth.stereo.MARGIN_PX", 200)
     assert "range of distances is too large: 432 disparities" in estimate(frame(left, right)).doubt
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.stereo import StereoDepth
+from gsplat_core.depth.stereo import StereoDepth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsplat_core.geometry.surface_field import APART, SurfaceField
+from gsplat_core.poses.moving_bundle import APART, SurfaceField
 
 
 def sheet(count: int = 400) -> torch.Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsplat_core.geometry.surface_through import surface_through
+from gsplat_core.depth.plane_fits import surface_through
 
 SIZE = 90, 121
 

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry import bundle, moving_bundle
-from gsplat_core.geometry.breathing_frequencies import waves
-from gsplat_core.geometry.breathing_trajectory import _bundle, refined
 from gsplat_core.geometry.photometric_pose import refine_pose
-from gsplat_core.geometry.surface_field import SurfaceField
-from gsplat_core.geometry.trajectory_lines import is_told
-from gsplat_core.geometry.trajectory_prior import learned_from
+from gsplat_core.poses import bundle, moving_bundle
+from gsplat_core.poses.breathing import _bundle, is_told, refined, waves
+from gsplat_core.poses.moving_bundle import SurfaceField, learned_from
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
@@ -87,7 +84,7 @@ def test_priors_and_fields(breathing):
 
 
 def test_the_trajectory_before_breathing_tissue(breathing, monkeypatch):
-    monkeypatch.setattr("gsplat_core.geometry.breathing_trajectory.STAGES", ((0.007, 2, 0.06),))
+    monkeypatch.setattr("gsplat_core.poses.breathing.STAGES", ((0.007, 2, 0.06),))
     _, sightings = breathing
 
     def found():

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry.breathing_frequencies import waves
-from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.trajectory_lines import is_told
-from gsplat_core.geometry.trajectory_prior import coordinates, learned_from
+from gsplat_core.poses.breathing import is_told, waves
+from gsplat_core.poses.moving_bundle import coordinates, learned_from
+from gsplat_core.poses.se3 import exp
 
 TIMES_S = torch.arange(0, 20, 0.2, dtype=torch.float64)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.geometry.breathing_frequencies import waves
-from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.trajectory_prior import coordinates, learned_from
+from gsplat_core.poses.breathing import waves
+from gsplat_core.poses.moving_bundle import coordinates, learned_from
+from gsplat_core.poses.se3 import exp
 from tests.gsplat_core.geometry.breathing_points import DISTANCE, swaying
 
 

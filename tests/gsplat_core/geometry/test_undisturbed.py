@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsplat_core.depth.periodic_motion import PeriodicMotion, fitted, fitted_undisturbed, off_px, together_px
 from gsplat_core.geometry.grid_tracks import GridTracks
-from gsplat_core.geometry.periodic_motion import PeriodicMotion, fitted, off_px
-from gsplat_core.geometry.undisturbed import fitted_undisturbed, together_px
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
 
 TIMES_S = np.arange(0, 5, 0.08)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsplat_core.rendering.sheen import Sheen, half_directions
+from gsplat_core.rendering.elsewhere import Sheen, half_directions
 
 TIMES = np.linspace(0, 4, 20)
 

@@ -10,8 +10,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference, render
 from gsplat_core.rendering.settings import EPS2D
-from gsplat_core.rendering.splat_planes import LEAST_VARIANCE
-from gsplat_core.rendering.surface import COVERED, certainty, render_surface
+from gsplat_core.rendering.surface import COVERED, LEAST_VARIANCE, certainty, render_surface
 from gsplat_core.scene.model import Model
 
 CAMERA = Camera.from_focal(50.0, 45, 37)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.scene.bilinear import at_positions
+from gsplat_core.scene.tangents import at_positions
 
 
 @pytest.mark.parametrize("shape", [(7, 9), (1, 5), (6, 1), (1, 1)])

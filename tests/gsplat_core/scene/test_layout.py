@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import gsplat_core
-from gsplat_core.scene import layout
+from gsplat_core.scene import gaussians
 
 HEADER = Path(gsplat_core.__file__).parent / "native" / "raw_layout.h"
 
@@ -22,27 +22,27 @@ def constants():
 
 def test_the_kernels_header_has_the_same_columns(constants):
     assert constants == {
-        "kRawColumns": layout.RAW_COLUMNS,
-        "kRawPosition": layout.POSITION.start,
-        "kRawRotation": layout.ROTATION.start,
-        "kRawLogScale": layout.LOG_SCALE.start,
-        "kRawColor": layout.COLOUR.start,
-        "kRawOpacity": layout.OPACITY.start,
-        "kRawUsed": layout.OPACITY.stop,
-        "kRawBasisChannels": layout.BASIS_CHANNELS,
-        "kHeadOutputs": len(layout.HEAD_COLUMNS),
+        "kRawColumns": gaussians.RAW_COLUMNS,
+        "kRawPosition": gaussians.POSITION.start,
+        "kRawRotation": gaussians.ROTATION.start,
+        "kRawLogScale": gaussians.LOG_SCALE.start,
+        "kRawColor": gaussians.COLOUR.start,
+        "kRawOpacity": gaussians.OPACITY.start,
+        "kRawUsed": gaussians.OPACITY.stop,
+        "kRawBasisChannels": gaussians.BASIS_CHANNELS,
+        "kHeadOutputs": len(gaussians.HEAD_COLUMNS),
     }
 
 
 def test_groups_follow_each_other_without_gap_or_overlap():
-    groups = [layout.POSITION, layout.ROTATION, layout.LOG_SCALE, layout.COLOUR, layout.OPACITY]
+    groups = [gaussians.POSITION, gaussians.ROTATION, gaussians.LOG_SCALE, gaussians.COLOUR, gaussians.OPACITY]
     assert [group.start for group in groups] == [0, *(group.stop for group in groups[:-1])]
-    assert [layout.width_of(group) for group in groups] == [3, 4, 3, 3, 1]
-    assert layout.width_of(*groups) <= layout.RAW_COLUMNS and layout.RAW_COLUMNS % 4 == 0
+    assert [gaussians.width_of(group) for group in groups] == [3, 4, 3, 3, 1]
+    assert gaussians.width_of(*groups) <= gaussians.RAW_COLUMNS and gaussians.RAW_COLUMNS % 4 == 0
 
 
 def test_the_hexplane_head_has_log_scales_before_the_rotation():
-    assert layout.HEAD_COLUMNS == (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
+    assert gaussians.HEAD_COLUMNS == (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
 
 
 def test_kernels_spell_no_column_of_the_layout_themselves():

@@ -11,7 +11,7 @@ import torch
 from gsplat_core.deformation.basis import BasisField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.covering import Covering
+from gsplat_core.training.growth import Covering
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep

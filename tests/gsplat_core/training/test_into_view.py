@@ -12,12 +12,11 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.into_view import NewTissue, entered, has_moved
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.neighbourhood import around_cells
+from gsplat_core.training.moving_view import NewTissue, entered, has_moved
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.unseen import around_cells
 
 WIDTH, HEIGHT, FOCAL, DEPTH_MM = 48, 40, 50.0, 60.0
 CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)

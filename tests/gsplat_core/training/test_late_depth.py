@@ -13,8 +13,8 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.late_depth import MOST_LATE
 from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.placement import MOST_LATE
 
 WIDTH, HEIGHT = 48, 40
 CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)

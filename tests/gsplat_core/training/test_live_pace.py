@@ -8,8 +8,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 
 
 def test_rates_fall_from_2_to_a_half_within_thirty_steps_in_equal_ratios():

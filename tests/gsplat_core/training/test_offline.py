@@ -12,10 +12,9 @@ import torch
 from gsplat_core.deformation import BasisField
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.scene.layout import POSITION
+from gsplat_core.scene.gaussians import POSITION
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.nearest import nearest_others
-from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, FitSettings
+from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, FitSettings, nearest_others
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
 

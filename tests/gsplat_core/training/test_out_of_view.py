@@ -14,8 +14,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import RowMoves
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.unseen import Archive, LastSeen, pixels_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.depth_map import BELIEVED
+from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training import parallax

@@ -12,8 +12,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.places import MOST_PLACES, Places, likeness_of
 

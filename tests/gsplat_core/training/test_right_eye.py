@@ -9,8 +9,7 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
-from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.offline import FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes, right_tissue

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.steadiness import MOST_FRAMES, NOISE_LEVELS, steadiness
+from gsplat_core.training.offline import MOST_FRAMES, NOISE_LEVELS, steadiness
 
 WIDTH, HEIGHT = 24, 20
 CAMERA = Camera.from_focal(20.0, WIDTH, HEIGHT)

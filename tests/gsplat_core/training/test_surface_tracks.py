@@ -14,11 +14,11 @@ from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.image_motion import Seen
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_motion import Seen
 from gsplat_core.training.surface_tracks import SurfaceDepth, SurfaceTracks, between_known, steady_course
 
 FRAMES, FPS = 12, 8.0

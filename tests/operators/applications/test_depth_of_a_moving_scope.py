@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import registry
-from gsplat_core.geometry.key_frames import ParallaxDepth
+from gsplat_core.depth import registry
+from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import write_poses
 from operators.applications.reconstruct import reconstruct

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
-from gsplat_core.geometry import focal_length
-from gsplat_core.geometry.focal_length import FocalLength
-from gsplat_core.geometry.odometry import Breathing
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.poses import focal_length
+from gsplat_core.poses.focal_length import FocalLength
+from gsplat_core.poses.odometry import Breathing
 from services.cli import poses
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK

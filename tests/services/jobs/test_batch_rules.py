@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.registry import DEPTHS
 from operators.output_folder import OutputFolder
 from operators.settings import CallerJobOptions, JobOptions
 from services.jobs.batch import Batch, recordings_in

@@ -1,0 +1,1 @@
+"""Depth of frames: stereo, parallax, shading and networks, with confidence."""

@@ -1,0 +1,217 @@
+"""Depth maps with confidence, as depth estimators return them, and checks of them.
+
+Measured depth is doubted at edges and where it is noisy. Estimated depth is compared with that of other views of the same tissue.
+
+Confidence of measured depth maps.
+
+Sensors, renderers and resizing produce edge pixels that belong to neither side, near-zero values next to unknown
+depth, and wrong rows or columns along the border. Gaussians initialised there float in front of the tissue and
+occlude it when they move.
+
+Validation of depth by parallax: two depth maps of the same tissue, from other poses and times, must show the same
+relief.
+
+The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a while looks like
+static tissue at another distance, and a warp by the wrong depth fits as well as one by the true depth. The tissue's
+motion changes over time, however, and so does the depth error that it causes. If two depth maps differ by a fair
+share of the relief that they show, a level plane is as accurate as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.projection import moved, pixel_rays, pixels_of
+
+BELIEVED = 0.5
+"""Confidence from which a depth is used where it can only be used or rejected."""
+POSSIBLE = 0.03
+"""Confidence from which a stereo depth is a better start value than one extrapolated from its
+neighbourhood.
+"""
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth estimated for one picture.
+
+    Raises:
+        InvalidInput: for planes that are not float32 [H, W] of one shape, or a rejected map with
+            non-zero confidence.
+    """
+
+    depth: NDArray[np.float32]
+    """Depth along the optical axis, float32 [H, W]; 0 = unknown. In millimetres if `metric`."""
+    confidence: NDArray[np.float32]
+    """Probability that the depth is right, float32 [H, W], 0 to 1; 0 where the depth is unknown."""
+    origin: DepthOrigin
+    metric: bool
+    """True if the depth is in millimetres; otherwise it is known up to one factor."""
+    doubt: str | None = None
+    """Reason why the whole map is rejected, as a sentence, or None. A rejected map has zero
+    confidence everywhere.
+    """
+
+    remark: str | None = None
+    """Information for the user about the whole map, as a sentence, or None. Like `doubt`, its text
+    up to the first colon does not depend on numbers, so repeated messages can be recognised.
+    """
+
+    def __post_init__(self) -> None:
+        for name in ("depth", "confidence"):
+            plane = getattr(self, name)
+            if plane.ndim != 2 or plane.dtype != np.float32 or plane.shape != self.depth.shape:
+                raise InvalidInput(
+                    f"{name} must be float32 {list(self.depth.shape)}, got {plane.dtype} {list(plane.shape)}"
+                )
+        if self.doubt is not None and np.any(self.confidence):
+            raise InvalidInput("a depth map with a doubt must have confidence 0 everywhere")
+
+    @property
+    def believed(self) -> NDArray[np.float32]:
+        """Depth where its confidence is at least `BELIEVED`, 0 elsewhere."""
+        return np.where(self.confidence >= BELIEVED, self.depth, np.float32(0))
+
+    @property
+    def kept(self) -> NDArray[np.float32]:
+        """Depth that is stored with the frame, 0 elsewhere: confident depth, for stereo also depth
+        of at least `POSSIBLE` confidence.
+        """
+        least = POSSIBLE if self.origin is DepthOrigin.STEREO else BELIEVED
+        return np.where(self.confidence >= least, self.depth, np.float32(0))
+
+
+def doubted(shape: tuple[int, int], origin: DepthOrigin, doubt: str) -> DepthMap:
+    """Return a rejected depth map [H, W] without depth, with the reason."""
+    nothing = np.zeros(shape, np.float32)
+    return DepthMap(nothing, nothing, origin, metric=False, doubt=doubt)
+
+
+ALIKE = 0.1
+"""Largest relative depth difference of neighbours on one surface, as a share of the farther one."""
+NEAREST = 0.1
+"""Share of the median depth below which a value is noise around zero."""
+STRIDE = 4
+"""Subsampling of rows and columns for the median."""
+PAIRS = (
+    (np.s_[:, :-1], np.s_[:, 1:]),
+    (np.s_[:-1, :], np.s_[1:, :]),
+    (np.s_[:-1, :-1], np.s_[1:, 1:]),
+    (np.s_[:-1, 1:], np.s_[1:, :-1]),
+)
+"""Slices that pair every pixel with four of its neighbours; the other four are covered by symmetry.
+"""
+
+
+def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the confidence of measured depth.
+
+    A pixel gets 0 if its depth is not finite and positive, if it is far below the median, or if
+    most of its known neighbours differ from it. Other pixels get 1, including those without known
+    neighbours.
+
+    Args:
+        depth: floating [H, W].
+
+    Returns:
+        float32 [H, W], 0 or 1.
+    """
+    known = np.isfinite(depth) & (depth > 0)
+    values = np.where(known, depth, 0).astype(np.float32)
+    known &= values >= NEAREST * _median(values)
+    balance = np.zeros(depth.shape, np.int8)
+    for one, other in PAIRS:
+        here, there = values[one], values[other]
+        alike = np.abs(here - there) <= ALIKE * np.maximum(here, there)
+        vote = np.where(alike, np.int8(1), np.int8(-1)) * (known[one] & known[other])
+        balance[one] += vote
+        balance[other] += vote
+    return (known & (balance >= 0)).astype(np.float32)
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    """Return the median of the non-zero values, or 0 if there are none."""
+    for some in (values[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE], values):
+        if np.any(some):
+            return float(np.median(some[some > 0]))
+    return 0.0
+
+
+LONGEST_PX = 160
+"""Longest side of the compared depth maps, in pixels."""
+MOST_DISAGREEMENT = 0.25
+"""Largest accepted median difference of two depth maps, as a share of their median relief."""
+LEAST_SHARED = 0.1
+"""Share of the picture that both depth maps must cover."""
+UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level plane may be as accurate"
+"""Reason given for depth that no second depth map confirms."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Depth map at reduced size with its camera."""
+
+    inverse: NDArray[np.float32]
+    """Inverse depth [h, w]."""
+    believed: NDArray[np.float32]
+    """Validity [h, w]: 1 where the depth is confident, 0 elsewhere."""
+    camera: Camera
+    """Camera with its pose, scaled to the size of the map."""
+
+    @classmethod
+    def of(cls, depth: NDArray[np.float32], confidence: NDArray[np.float32] | None, camera: Camera) -> Look:
+        """Return the reduced depth map. Without a confidence, every known depth counts as
+        confident.
+
+        Args:
+            depth: float32 [H, W], 0 = unknown.
+            confidence: float32 [H, W], 0 to 1, or None.
+            camera: camera at full size, with its pose.
+        """
+        known = (depth > 0) if confidence is None else (depth > 0) & (confidence >= BELIEVED)
+        small = camera.scaled(min(1.0, LONGEST_PX / max(depth.shape)))
+        size = small.width_px, small.height_px
+        inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0).astype(np.float32)
+        return cls(
+            np.asarray(cv2.resize(inverse, size, interpolation=cv2.INTER_NEAREST), np.float32),
+            np.asarray(cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_NEAREST), np.float32),
+            small,
+        )
+
+
+def disagreement(first: Look, second: Look) -> float:
+    """Return the median relative depth difference over the median relief of the second map;
+    infinite if they share too little tissue.
+
+    Differences of the overall distance count as well, since the poses determine it.
+    """
+    inverse = np.where(first.inverse > 0, first.inverse, 1)
+    points = pixel_rays(first.camera) / inverse[..., None]
+    between = second.camera.world_to_camera @ np.linalg.inv(first.camera.world_to_camera)
+    seen = moved(between, points)
+    pixels = np.nan_to_num(pixels_of(second.camera, seen) - 0.5, nan=-1e6, posinf=1e6, neginf=-1e6).astype(np.float32)
+    there, known = (
+        cv2.remap(
+            plane, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
+        for plane in (second.inverse, second.believed)
+    )
+    shared = (first.believed > 0) & (known > 0.99) & (there > 0) & (seen[..., 2] > 0)
+    if shared.mean() < LEAST_SHARED:
+        return np.inf
+    found = np.log(there[shared])
+    relief = float(np.median(np.abs(found - np.median(found))))
+    off = float(np.median(np.abs(found + np.log(seen[shared][:, 2]))))
+    return off / relief if relief > 0 else np.inf
+
+
+def agree(first: Look, second: Look) -> bool:
+    """Return True if two depth maps confirm each other."""
+    return disagreement(first, second) <= MOST_DISAGREEMENT

@@ -1,0 +1,598 @@
+"""Depth by parallax of a moving scope from known poses.
+
+Poses are first checked against the observed image motion. A plane sweep (Collins 1996) gives matching costs, semi-global matching (Hirschmüller 2008)
+selects distances, and other views confirm them. Streams are compared with earlier key frames.
+
+Consistency check between given camera poses and the observed image motion.
+
+For given poses, the position of a point in another picture is linear in its inverse depth w (triangulation; Hartley
+and Zisserman 2004, section 12.2). A tracked corner therefore gives a least-squares w and a residual that no w
+removes. The residual is small if the poses are right.
+
+Depth of one picture of a moving scope from other pictures with known poses.
+
+Tracked corners are first checked against the poses, which also gives the range of distances. That
+range is swept and regularised. Each pixel's confidence reflects how well and how
+uniquely the views match. Deforming or textureless tissue gets no confidence, and its depth is a smooth extrapolation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.depth.maps import BELIEVED, UNCONFIRMED, DepthMap, Look, agree, doubted
+from gsplat_core.geometry.tracks import followed
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame
+
+WINDOW_PX = 7
+"""Side of the correlation window in pixels."""
+NOISE_GREY = 2.0
+"""Standard deviation of image noise in grey levels, added to variances so that patches without
+contrast do not correlate.
+"""
+DISAGREES = 0.5
+"""Cost of uncorrelated patches, also the upper bound, so that an occluded view cannot outvote the
+others.
+"""
+AGREES = 0.2
+"""Cost below which a view votes for a distance, corresponding to a correlation of 0.6."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Grey picture with its camera."""
+
+    grey: NDArray[np.float32]
+    """Grey levels 0 to 255, float32 [H, W]."""
+    tissue: NDArray[np.uint8]
+    """Validity uint8 [H, W]; 1 on tissue that can be tracked."""
+    camera: Camera
+
+
+def sweep(
+    reference: View, others: Sequence[View], inverse_depths: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Compute matching costs by zero-mean normalised cross-correlation, which is invariant to the
+    brightness changes of a moving light.
+
+    Args:
+        reference: picture whose depth is wanted.
+        others: views to compare with.
+        inverse_depths: float64 [D].
+
+    Returns:
+        Mean costs float32 [H, W, D] from 0 to `DISAGREES`, and numbers of agreeing views uint8 [H,
+            W, D].
+    """
+    height, width = reference.grey.shape
+    cost = np.empty((len(inverse_depths), height, width), np.float32)
+    votes = np.empty((len(inverse_depths), height, width), np.uint8)
+    mean, variance = _moments(reference.grey)
+    whole = _whole_patches(reference.tissue)
+    stacks = [np.dstack([view.grey, _whole_patches(view.tissue)]) for view in others]
+    for index, inverse in enumerate(inverse_depths):
+        total = np.zeros((height, width), np.float32)
+        seen, agree = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint8)
+        for view, stack in zip(others, stacks, strict=True):
+            moved: Any = cv2.warpPerspective(
+                stack, _plane_homography(reference.camera, view.camera, inverse), (width, height),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            )  # fmt: skip
+            grey, usable = moved[..., 0], (moved[..., 1] > 0.99) & (whole > 0)
+            each = np.minimum(_cost(reference.grey, mean, variance, grey), np.float32(DISAGREES))
+            total += np.where(usable, each, 0)
+            seen += usable
+            agree += usable & (each < AGREES)
+        cost[index] = np.where(seen > 0, total / np.maximum(seen, 1), DISAGREES)
+        votes[index] = agree
+    return np.ascontiguousarray(cost.transpose(1, 2, 0)), np.ascontiguousarray(votes.transpose(1, 2, 0))
+
+
+def _plane_homography(reference: Camera, view: Camera, inverse_depth: float) -> NDArray[np.float64]:
+    """Return the homography from `reference` to `view` for a fronto-parallel plane, in OpenCV pixel
+    coordinates (pixel centres at integers).
+    """
+    between = view.world_to_camera @ np.linalg.inv(reference.world_to_camera)
+    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    plane = between[:3, :3] + np.outer(between[:3, 3], [0, 0, inverse_depth])
+    return np.asarray(np.linalg.inv(centre) @ view.K @ plane @ np.linalg.inv(reference.K) @ centre)
+
+
+def _mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.boxFilter(values, -1, (WINDOW_PX, WINDOW_PX)), np.float32)
+
+
+def _moments(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    mean = _mean(grey)
+    return mean, np.maximum(_mean(grey * grey) - mean * mean, 0) + np.float32(NOISE_GREY**2)
+
+
+def _whole_patches(tissue: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return 1 where the whole correlation window is tissue."""
+    return np.asarray(cv2.erode((tissue != 0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)), np.float32)
+
+
+def _cost(
+    grey: NDArray[np.float32], mean: NDArray[np.float32], variance: NDArray[np.float32], other: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return (1 - ZNCC) / 2 [H, W]."""
+    sums = _mean(np.dstack([other, other * other, grey * other]))
+    other_mean = sums[..., 0]
+    other_variance = np.maximum(sums[..., 1] - other_mean * other_mean, 0) + np.float32(NOISE_GREY**2)
+    correlation = (sums[..., 2] - mean * other_mean) / np.sqrt(variance * other_variance)
+    return np.asarray(0.5 - 0.5 * correlation, np.float32)
+
+
+SMALL_STEP = 0.02
+"""Penalty P1 for a difference of one label between neighbours."""
+LARGE_STEP = 0.1
+"""Penalty P2 for any larger difference."""
+
+
+def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Aggregate matching costs [H, W, D] over paths from four directions."""
+    total = np.zeros_like(cost)
+    _add_paths(cost, total)
+    sideways, across = (
+        np.ascontiguousarray(cost.transpose(1, 0, 2)),
+        np.zeros((cost.shape[1], cost.shape[0], cost.shape[2]), np.float32),
+    )
+    _add_paths(sideways, across)
+    return total + across.transpose(1, 0, 2)
+
+
+def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
+    """Accumulate path costs along the first axis in both directions."""
+    for rows in (range(len(cost)), range(len(cost) - 1, -1, -1)):
+        before: NDArray[np.float32] | None = None
+        for row in rows:
+            path = cost[row]
+            if before is not None:
+                least = before.min(axis=1, keepdims=True)
+                best = np.minimum(before, least + np.float32(LARGE_STEP))
+                np.minimum(best[:, 1:], before[:, :-1] + np.float32(SMALL_STEP), out=best[:, 1:])
+                np.minimum(best[:, :-1], before[:, 1:] + np.float32(SMALL_STEP), out=best[:, :-1])
+                path = path + (best - least)
+            total[row] += path
+            before = path
+
+
+def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Select the best labels.
+
+    Args:
+        total: aggregated costs float32 [H, W, D].
+
+    Returns:
+        Labels [H, W] with sub-label precision by a parabola fit, and their uniqueness [H, W]: the
+            relative cost increase of the best label more than two steps away.
+    """
+    labels = total.shape[2]
+    best = total.argmin(axis=2)
+    inner = np.clip(best, 1, labels - 2)[..., None]
+    below, here, above = (np.take_along_axis(total, inner + step, 2)[..., 0] for step in (-1, 0, 1))
+    bend = below - 2 * here + above
+    shift = np.where(bend > 1e-6, 0.5 * (below - above) / np.maximum(bend, 1e-6), 0.0)
+    shift = np.where(best == inner[..., 0], np.clip(shift, -0.5, 0.5), 0.0)
+    least = total.min(axis=2)
+    near = np.abs(np.arange(labels) - best[..., None]) <= 2
+    second = np.where(near, np.inf, total).min(axis=2)
+    unique = (second - least) / np.maximum(least, 1e-6)
+    return np.asarray(best + shift, np.float32), np.asarray(unique, np.float32)
+
+
+POINTS = 400
+"""Largest number of tracked corners."""
+APART_PX = 5
+"""Smallest distance between corners in pixels."""
+RETURNS_PX = 0.5
+"""Largest accepted forward-backward error in pixels."""
+FEWEST_POINTS = 24
+"""Fewest tracked corners from which a view is used."""
+TRACK_ERROR_PX = 0.5
+"""Standard deviation of a tracked position in pixels."""
+RELIEF = 0.5
+"""Prior standard deviation of inverse depth, relative to that of the best-fitting plane."""
+LARGEST_RELIEF = 4.0
+"""Bound of the ratio between a point's inverse depth and that of the plane."""
+LEAST_PARALLAX_PX = 1.5
+"""Smallest median parallax in pixels, in the view with the most parallax; with less, depth is
+noise.
+"""
+MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
+"""A view contradicts its pose if its median residual exceeds both this many pixels and this share
+of its parallax.
+"""
+POSE_ERROR_PX = 0.6
+"""Residual of static tissue in pixels, from errors of poses and tracking."""
+FEWEST_AGREEING = 0.6
+"""Share of the views whose poses must explain their pictures."""
+CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
+"""Reason given if fewer views agree with their poses."""
+ROUNDS = 6
+"""Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving
+objects.
+"""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """Depth of tracked corners and consistency of the poses for one picture."""
+
+    inverse_depths: Array
+    """Inverse depths of the corners that agree with the poses, [n]."""
+    plane: float
+    """Inverse depth of the best-fitting fronto-parallel plane."""
+    views: tuple[int, ...]
+    """Indices of the views that agree with their poses."""
+    parallax_px: float
+    """Median parallax in pixels in the view with the most parallax."""
+    own_motion: float
+    """Median residual that no depth explains, as a share of the parallax: the tissue's own motion.
+    Motion along the parallax direction is mistaken for depth, so the relative depth error is about
+    this share, or up to twice as large.
+    """
+
+
+def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | str:
+    """Check poses with corners tracked from `reference` to the other views.
+
+    Returns:
+        The corners' depths and the agreeing views, or the reason for rejection as a sentence.
+    """
+    corners = _corners(reference)
+    tracks = [_followed(reference, view, corners) for view in others]
+    usable = [number for number, (_, found) in enumerate(tracks) if found.sum() >= FEWEST_POINTS]
+    if not usable:
+        return "too few points of the tissue can be tracked"
+    terms = [_terms(corners, tracks[number][0], reference.camera, others[number].camera) for number in usable]
+    c, d = (np.stack(each) for each in zip(*terms, strict=True))
+    seen = np.stack([tracks[number][1] for number in usable])
+    focal = float(reference.camera.K[0, 0])
+    kept = list(range(len(usable)))
+    while True:
+        plane = _plane(c[kept], d[kept], seen[kept], focal)
+        moved = _medians(focal * abs(plane) * np.linalg.norm(c[kept], axis=2), seen[kept])
+        shown = _medians(focal * np.linalg.norm(d[kept], axis=2), seen[kept])
+        if moved.max() < LEAST_PARALLAX_PX and shown.max() < 2 * LEAST_PARALLAX_PX:
+            return "the poses move but the pictures hardly do: there is no parallax to estimate depth from"
+        inverse = _relief(c[kept], d[kept], seen[kept], focal, max(plane, 1e-12))
+        off = _medians(_off_px(c[kept], d[kept], focal, inverse), seen[kept])
+        excess = off / np.maximum(MOST_LEFT_PX, MOST_LEFT * moved)
+        worst = int(excess.argmax())
+        if plane > 0 and excess[worst] <= 1:
+            break
+        kept.pop(worst)
+        if len(kept) < max(1, FEWEST_AGREEING * len(usable)):
+            return CONTRADICTED
+    if moved.max() < LEAST_PARALLAX_PX:
+        return "there is too little parallax to estimate depth from"
+    agree = (seen[kept] & (_off_px(c[kept], d[kept], focal, inverse) < 3 * MOST_LEFT_PX)).any(0)
+    own = np.sqrt(np.maximum(off**2 - POSE_ERROR_PX**2, 0)) / np.maximum(moved, LEAST_PARALLAX_PX)
+    views = tuple(usable[number] for number in kept)
+    return Parallax(inverse[agree], plane, views, float(moved.max()), float(np.median(own)))
+
+
+def _corners(view: View) -> NDArray[np.float32]:
+    """Return trackable corners of the tissue in OpenCV pixel coordinates [n, 2]."""
+    found = cv2.goodFeaturesToTrack(
+        view.grey.astype(np.uint8), POINTS, 0.005, APART_PX, mask=cv2.erode(view.tissue, np.ones((9, 9), np.uint8))
+    )
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
+
+
+def _followed(
+    reference: View, view: View, corners: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the position of each corner in the other picture [n, 2], and which were found on
+    tissue [n].
+    """
+    first, second = (each.grey.astype(np.uint8) for each in (reference, view))
+    there, misses_px = followed(first, second, corners, window_px=15, levels=4)
+    height, width = view.tissue.shape
+    column, row = (
+        np.clip(np.nan_to_num(there[:, axis]), 0, size - 1).astype(int) for axis, size in ((0, width), (1, height))
+    )
+    return there, (misses_px < RETURNS_PX) & (view.tissue[row, column] > 0)
+
+
+def _terms(
+    corners: NDArray[np.float32], target: NDArray[np.float32], before: Camera, after: Camera
+) -> tuple[Array, Array]:
+    """Return c and d [n, 2] of the equation w c = d for the corners' inverse depths w, in units of
+    the focal length.
+    """
+    between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
+    first, second = _normalised(corners, before), _normalised(target, after)
+    ray = np.concatenate([first, np.ones((len(first), 1))], 1) @ between[:3, :3].T
+    return second * between[2, 3] - between[:2, 3], ray[:, :2] - second * ray[:, 2:]
+
+
+def _normalised(pixels: NDArray[np.float32], camera: Camera) -> Array:
+    """Convert OpenCV pixel coordinates to rays."""
+    return np.asarray((pixels.astype(np.float64) + 0.5 - camera.K[:2, 2]) / np.diag(camera.K)[:2])
+
+
+def _medians(values: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return the median over each view's tracked points [views]."""
+    return np.array([float(np.median(row[mask])) for row, mask in zip(values, seen, strict=True)])
+
+
+def _plane(c: Array, d: Array, seen: NDArray[np.bool_], focal: float) -> float:
+    """Return one inverse depth that robustly fits w c = d; c and d are [views, points, 2]."""
+    weight, inverse = seen.astype(np.float64), 0.0
+    for _ in range(ROUNDS):
+        inverse = float((weight * (c * d).sum(-1)).sum() / max((weight * (c * c).sum(-1)).sum(), 1e-20))
+        weight = seen * _agreement(c, d, focal, np.full(c.shape[1], inverse))
+    return inverse
+
+
+def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: float) -> Array:
+    """Return each point's inverse depth [points] by robust least squares over all views, with the
+    plane as prior mean.
+    """
+    prior = 1 / (RELIEF * plane) ** 2
+    inverse = np.full(c.shape[1], plane)
+    for _ in range(ROUNDS):
+        weight = seen * _agreement(c, d, focal, inverse) * (focal / TRACK_ERROR_PX) ** 2
+        evidence, information = (weight * (c * d).sum(-1)).sum(0), (weight * (c * c).sum(-1)).sum(0)
+        inverse = np.clip(
+            (evidence + prior * plane) / (information + prior), plane / LARGEST_RELIEF, plane * LARGEST_RELIEF
+        )
+    return np.asarray(inverse)
+
+
+def _agreement(c: Array, d: Array, focal: float, inverse: Array) -> Array:
+    """Return weights [views, points] for iteratively reweighted least squares that minimise the
+    robust L1 norm.
+    """
+    return np.asarray(TRACK_ERROR_PX / np.maximum(_off_px(c, d, focal, inverse), TRACK_ERROR_PX))
+
+
+def _off_px(c: Array, d: Array, focal: float, inverse: Array) -> Array:
+    return np.asarray(focal * np.linalg.norm(d - inverse[..., None] * c, axis=-1))
+
+
+WORKING_PX = 320
+"""Longest side in pixels of the compared pictures, when there is no real-time limit."""
+MOST_VIEWS = 6
+"""Largest number of other views compared with one picture."""
+SHORTEST_BASELINE = 0.1
+"""Share of the longest baseline below which a view is ignored because it adds noise."""
+WIDEST_TURN = 0.7
+"""Smallest cosine between the optical axes of two cameras that are compared."""
+LABEL_PX = 0.75
+"""Parallax between neighbouring distances of the sweep, in pixels of the view with the most
+parallax.
+"""
+LABELS = 24, 96
+"""Fewest and most distances of a sweep."""
+MARGIN = 1.6
+"""Factor by which the sweep extends the range of the corners' distances at both ends."""
+WORST_COST, BEST_COST = 0.35, 0.15
+"""Mean matching cost ((1 - ZNCC) / 2) at which the confidence is 0, and below which it is not
+reduced.
+"""
+UNIQUE = 0.2
+"""Relative cost margin to any other depth from which the confidence is not reduced."""
+SMALLEST_PATCH = 0.0014
+"""Smallest connected patch of confident depth, as a share of the picture; smaller ones are chance
+matches.
+"""
+MOST_OWN_MOTION = 0.06
+"""Tissue motion relative to parallax at which the confidence is 0; it decreases from half this
+value.
+"""
+DEFORMS = "the tissue moves too much relative to the scope for depth by parallax"
+"""Reason given if no pixel has confident depth."""
+FILLED = 0.2
+"""Confidence of extrapolated depth."""
+
+
+def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
+    """Reduce a frame so that no side is longer than `longest_px`. `camera` is the frame's camera
+    with its pose.
+    """
+    height, width = frame.image.shape[:2]
+    scale = min(1.0, longest_px / max(height, width))
+    small = camera.scaled(scale)
+    size = small.width_px, small.height_px
+    grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+    tissue = np.ones((height, width), np.uint8)
+    for mask in (frame.mask, frame.loss_mask, frame.rehearsal_mask):
+        if mask is not None:
+            tissue &= (mask != 0).astype(np.uint8)
+    return View(
+        np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32),
+        np.asarray(cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST), np.uint8),
+        small,
+    )
+
+
+def chosen_views(reference: View, candidates: Sequence[View]) -> list[View]:
+    """Select at most `MOST_VIEWS` candidates facing the same way, evenly spread from the shortest
+    useful baseline to the longest.
+    """
+    axis = reference.camera.world_to_camera[2, :3]
+    position = reference.camera.position
+    facing = [view for view in candidates if float(axis @ view.camera.world_to_camera[2, :3]) >= WIDEST_TURN]
+    far = [float(np.linalg.norm(view.camera.position - position)) for view in facing]
+    longest = max(far, default=0.0)
+    useful = sorted(
+        (each, number) for number, each in enumerate(far) if each > 0 and each >= SHORTEST_BASELINE * longest
+    )
+    if not useful:
+        return []
+    picked = np.linspace(0, len(useful) - 1, min(MOST_VIEWS, len(useful))).round().astype(int).tolist()
+    return [facing[useful[index][1]] for index in picked]
+
+
+def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, int]) -> DepthMap:
+    """Estimate the depth of a picture.
+
+    Args:
+        reference: picture whose depth is wanted.
+        candidates: other pictures with poses.
+        size: height and width of the result.
+
+    Returns:
+        Depth in the unit of the poses. The map is rejected if the poses contradict the pictures. If
+            the tissue itself moves too much, all confidences are low and the depth is only a rough
+            start value.
+    """
+    others = chosen_views(reference, candidates)
+    if not others:
+        return doubted(size, DepthOrigin.PARALLAX, "the scope does not move")
+    found = explained_by_poses(reference, others)
+    if isinstance(found, str):
+        return doubted(size, DepthOrigin.PARALLAX, found)
+    inverse_depths = _distances(found)
+    cost, votes = sweep(reference, [others[number] for number in found.views], inverse_depths)
+    labels, unique = best_labels(aggregated(cost))
+    inverse = np.interp(labels, np.arange(len(inverse_depths)), inverse_depths).astype(np.float32)
+    nearest = np.rint(labels).astype(np.intp)[..., None]
+    costs = np.take_along_axis(cost, nearest, 2)[..., 0]
+    agreeing = np.take_along_axis(votes, nearest, 2)[..., 0]
+    confidence = np.minimum((WORST_COST - costs) / (WORST_COST - BEST_COST), unique / UNIQUE)
+    # The end labels also collect everything beyond the range.
+    inside = (nearest[..., 0] > 0) & (nearest[..., 0] < len(inverse_depths) - 1)
+    confidence = np.clip(confidence, 0, 1) * float(np.clip(2 - 2 * found.own_motion / MOST_OWN_MOTION, 0, 1))
+    confidence = confidence * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
+    confidence = _without_speckles(labels, confidence.astype(np.float32))
+    return _at_full_size(*_filled(inverse, confidence, found), size)
+
+
+def _distances(found: Parallax) -> NDArray[np.float64]:
+    """Return evenly spaced inverse depths over the tissue's range; parallax is linear in inverse
+    depth.
+    """
+    low, high = np.percentile(found.inverse_depths, [2, 98])
+    low, high = low / MARGIN, high * MARGIN
+    span_px = found.parallax_px * (high - low) / found.plane
+    return np.linspace(low, high, int(np.clip(round(span_px / LABEL_PX), *LABELS)))
+
+
+def _without_speckles(labels: NDArray[np.float32], confidence: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Reduce the confidence of small patches of depth that differ from their surroundings."""
+    steps = np.where(confidence >= BELIEVED, labels * 16, -16).astype(np.int16)
+    cv2.filterSpeckles(steps, -16, round(SMALLEST_PATCH * steps.size), 24)
+    return np.where((steps == -16) & (confidence >= BELIEVED), np.float32(FILLED), confidence)
+
+
+def _filled(
+    inverse: NDArray[np.float32], confidence: NDArray[np.float32], found: Parallax
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Replace unconfident depth by a smooth continuation of the confident depth around it, and far
+    from any by the mean plane.
+    """
+    height, width = inverse.shape
+    believed = (confidence >= BELIEVED).astype(np.float32)
+    smooth = np.full_like(inverse, found.plane)
+    for sigma in (max(height, width) / share for share in (10, 20, 40, 80, 160)):
+        weight = cv2.GaussianBlur(believed, (0, 0), sigma)
+        near = cv2.GaussianBlur(inverse * believed, (0, 0), sigma)
+        smooth = (near + np.float32(0.05) * smooth) / (weight + np.float32(0.05))
+    return np.where(believed > 0, inverse, smooth), np.where(
+        believed > 0, confidence, np.minimum(confidence, np.float32(FILLED))
+    )
+
+
+def _at_full_size(inverse: NDArray[np.float32], confidence: NDArray[np.float32], size: tuple[int, int]) -> DepthMap:
+    full = size[1], size[0]
+    depth = 1 / np.asarray(cv2.resize(inverse, full, interpolation=cv2.INTER_LINEAR), np.float32)
+    sure = np.asarray(cv2.resize(confidence, full, interpolation=cv2.INTER_LINEAR), np.float32)
+    return DepthMap(depth.astype(np.float32), sure, DepthOrigin.PARALLAX, metric=False)
+
+
+STREAM_PX = 160
+"""Longest side of the compared pictures in pixels; smaller than offline to keep up with the stream.
+"""
+MOST_KEY_FRAMES = 8
+"""Largest number of key frames. When it is exceeded, one of the two closest key frames is removed.
+"""
+LONGEST_S = 3.0
+"""Largest age of a key frame in seconds, limited because tissue deforms."""
+EVERY_S = 0.2
+"""Time between two depth estimates in seconds; until the first one every frame is tried."""
+
+
+class ParallaxDepth:
+    """Depth estimator by parallax for streams, with bounded memory and time per frame.
+
+    Depth is estimated every `EVERY_S` and not for the frames between. A depth map is returned only
+    if it agrees with the previous one (`depth_agreement`). Frames without a pose, and cameras other
+    than pinholes, get no depth.
+    """
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[float, View]] = []
+        self._found_s: float | None = None
+        self._look: Look | None = None
+        """Depth map found at `_found_s`."""
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """See `Estimator`."""
+        if frame.new_scene is not None:
+            self._kept, self._found_s, self._look = [], None, None
+        if frame.pose is None or camera.model != "pinhole":
+            return None
+        now_s = frame.time_s
+        self._kept = [(time_s, view) for time_s, view in self._kept if 0 <= now_s - time_s <= LONGEST_S]
+        due = self._found_s is None or not 0 <= now_s - self._found_s < EVERY_S
+        if self._kept and not due and not self._is_elsewhere(camera):
+            return None
+        view = view_of(frame, camera, STREAM_PX)
+        others = [each for _, each in self._kept if each.grey.shape == view.grey.shape]
+        found = None
+        if due and any(_apart(each, view) > 0 for each in others):
+            found = depth_of_view(view, others, (frame.height_px, frame.width_px))
+            if found.doubt is None and not np.any(found.believed):
+                found = doubted(found.depth.shape, found.origin, DEFORMS)
+            if found.doubt is None:
+                found = self._confirmed(found, camera, now_s)
+        if self._is_elsewhere(camera):
+            self._keep(now_s, view)
+        return found
+
+    def _confirmed(self, found: DepthMap, camera: Camera, now_s: float) -> DepthMap | None:
+        """Return the depth if it agrees with the previous depth map, a rejected map if not, or None
+        for the first one.
+        """
+        is_first = self._found_s is None or not 0 <= now_s - self._found_s <= LONGEST_S
+        before, self._look = self._look, Look.of(found.depth, found.confidence, camera)
+        self._found_s = now_s
+        if is_first or before is None:
+            return None
+        return found if agree(before, self._look) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
+
+    def _is_elsewhere(self, camera: Camera) -> bool:
+        """Return True if the scope is farther from every key frame than the closest two key frames
+        are from each other, or if there are still few key frames.
+        """
+        if not self._kept:
+            return True
+        nearest = min(float(np.linalg.norm(view.camera.position - camera.position)) for _, view in self._kept)
+        return nearest > 0 and (len(self._kept) < MOST_KEY_FRAMES or nearest > min(self._gaps()))
+
+    def _keep(self, now_s: float, view: View) -> None:
+        self._kept.append((now_s, view))
+        if len(self._kept) > MOST_KEY_FRAMES:
+            # argmin returns the older of the two closest key frames.
+            self._kept.pop(int(np.argmin(self._gaps())))
+
+    def _gaps(self) -> list[float]:
+        """Return the distance of each key frame to its nearest neighbour."""
+        views = [view for _, view in self._kept]
+        return [min(_apart(one, other) for other in views if other is not one) for one in views]
+
+
+def _apart(one: View, other: View) -> float:
+    return float(np.linalg.norm(one.camera.position - other.camera.position))

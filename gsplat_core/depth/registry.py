@@ -1,0 +1,205 @@
+"""Creation of depth sources by name, and the selection of a source for each frame of a stream."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from gsplat_core.choices import DEPTHS
+from gsplat_core.choices import DEPTHS_WITH_ADDRESS as WITH_ADDRESS
+from gsplat_core.depth.maps import DepthMap, measured_confidence
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+
+
+class Estimator(Protocol):
+    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The
+    same frames give the same bytes.
+    """
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """Estimate the depth of a frame.
+
+        Args:
+            frame: frame; `new_scene` marks a cut after which earlier frames are unrelated.
+            camera: camera of the frame, with its pose if known.
+
+        Returns:
+            The depth map, or None if the frame contains nothing to estimate depth from.
+        """
+        ...
+
+
+@runtime_checkable
+class OnDevice(Protocol):
+    """Estimator that can run on a device other than the CPU."""
+
+    def work_on(self, device: str) -> None:
+        """Run on this device from now on, concurrently with other work there."""
+        ...
+
+
+class RecordedDepth:
+    """Depth that is part of the frame. Without a confidence in the frame, outlier pixels are
+    rejected (`measured_confidence`).
+    """
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """See `Estimator`."""
+        if frame.depth is None:
+            return None
+        confidence = frame.depth_confidence
+        if confidence is None:
+            confidence = measured_confidence(frame.depth)
+        return DepthMap(frame.depth, confidence, frame.depth_origin or DepthOrigin.MEASURED, frame.depth_is_metric)
+
+
+class NoDepth:
+    """Depth source that ignores all depth, including the frame's own."""
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """See `Estimator`."""
+        return None
+
+
+def _always(frame: Frame) -> bool:
+    return True
+
+
+def _has_calibrated_eyes(frame: Frame) -> bool:
+    return frame.right_camera is not None
+
+
+def _has_pose(frame: Frame) -> bool:
+    return frame.pose is not None
+
+
+AUTO: dict[str, Callable[[Frame], bool]] = {"recorded": _always, "stereo": _has_calibrated_eyes}
+"""Sources tried by `auto` in real-time use, in order, with the condition that a frame must meet."""
+AUTO_WITH_TIME: dict[str, Callable[[Frame], bool]] = {**AUTO, "parallax": _has_pose}
+"""Sources tried by `auto` without a real-time limit."""
+
+
+def check_depth(choice: str) -> None:
+    """Check a depth source name, and the address if there is one.
+
+    Raises:
+        InvalidSetting: for an unknown name, a missing address, or an address that the estimator
+            rejects.
+    """
+    name, colon, address = choice.partition(":")
+    if name in WITH_ADDRESS and not address:
+        raise InvalidSetting(f"depth is {choice!r}; it needs an address: {WITH_ADDRESS[name]}")
+    if choice != "auto" and (name not in DEPTHS or (colon and name not in WITH_ADDRESS)):
+        names = (WITH_ADDRESS.get(each, each) for each in DEPTHS)
+        raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(names)}")
+    if name in WITH_ADDRESS:
+        new_estimator(choice)
+
+
+def depth_inputs(choice: str) -> tuple[Path, ...]:
+    """Return the files that a depth source reads."""
+    name, _, address = choice.partition(":")
+    path = address.partition("?")[0]
+    return (Path(path),) if name in WITH_ADDRESS and path else ()
+
+
+def new_estimator(choice: str) -> Estimator:
+    """Create the estimator `choice` for one stream. Raises like `check_depth`."""
+    name, _, address = choice.partition(":")
+    return DEPTHS[name](address) if name in WITH_ADDRESS else DEPTHS[name]()
+
+
+class Sentences:
+    """Counter of messages about frames. Messages with the same text before the first colon count as
+    one kind.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[str, str] = {}
+        self._frames: Counter[str] = Counter()
+
+    def add(self, sentence: str | None) -> None:
+        """Count a message about one frame; None is ignored."""
+        if sentence is not None:
+            kind = sentence.partition(":")[0]
+            self._first.setdefault(kind, sentence)
+            self._frames[kind] += 1
+
+    def counted(self) -> dict[str, int]:
+        """Return the first message of each kind with its number of frames."""
+        return {self._first[kind]: frames for kind, frames in sorted(self._frames.items())}
+
+
+class DepthFinder:
+    """Selects the depth of each frame of one stream according to a setting."""
+
+    def __init__(self, choice: str, camera: Camera, *, has_time: bool = False, device: str = "cpu") -> None:
+        """Create the estimators of a stream.
+
+        Args:
+            choice: `auto` or a name for `new_estimator`.
+            camera: camera of the frames.
+            has_time: let `auto` use slow estimators as well.
+            device: device for estimators that support one.
+
+        Raises:
+            InvalidSetting: like `check_depth`.
+        """
+        check_depth(choice)
+        self._camera = camera
+        auto = AUTO_WITH_TIME if has_time else AUTO
+        asked = auto if choice == "auto" else {choice: _always}
+        self._asked = [(new_estimator(name), suits) for name, suits in asked.items()]
+        for estimator, _ in self._asked:
+            if isinstance(estimator, OnDevice):
+                estimator.work_on(device)
+        self.doubts, self.remarks = Sentences(), Sentences()
+        """Reasons for rejected depth maps, and remarks about used ones."""
+
+    def seeks_in(self, frame: Frame) -> bool:
+        """Return True if any source other than the frame's own depth applies to a frame."""
+        return any(
+            suits(frame) for estimator, suits in self._asked if not isinstance(estimator, RecordedDepth | NoDepth)
+        )
+
+    def find(self, frame: Frame, *, shown_only: bool = False) -> DepthMap | None:
+        """Return the first depth map that is not rejected, or None.
+
+        Args:
+            frame: frame to find depth for.
+            shown_only: the frame is displayed but not used for training, so only its own depth is
+                returned.
+        """
+        camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
+        if (camera.width_px, camera.height_px) != (frame.width_px, frame.height_px):  # a stream may change its size
+            camera = camera.resized(frame.width_px, frame.height_px)
+        # Frames that are not trained on need no estimated depth; their own depth is free.
+        shown_only = shown_only or frame.status is FrameStatus.DAMAGED or frame.withheld is not None
+        for estimator, suits in self._asked:
+            if not suits(frame) or (shown_only and not isinstance(estimator, RecordedDepth)):
+                continue
+            found = estimator.estimate(frame, camera)
+            if found is None:
+                continue
+            self.remarks.add(found.remark)
+            self.doubts.add(found.doubt)
+            if found.doubt is None:
+                return found
+        return None
+
+    def with_depth(self, frame: Frame, *, shown_only: bool = False) -> Frame:
+        """Return the frame with the selected depth, or without depth if there is none."""
+        found = self.find(frame, shown_only=shown_only)
+        if found is None:
+            return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
+        if found.depth is frame.depth:
+            # A second plane is stored only if some known depth is rejected.
+            doubts = bool(np.any((found.confidence == 0) & (frame.depth > 0)))
+            return frame.with_fields(depth_confidence=found.confidence) if doubts else frame
+        return frame.with_fields(depth=found.kept, depth_confidence=found.confidence, depth_origin=found.origin)

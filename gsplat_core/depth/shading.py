@@ -1,0 +1,320 @@
+"""Separation of illumination and pigment in a picture, and the brightness change of each piece of tissue between two pictures.
+
+Light that weakens with distance reduces red, green and blue alike, while pigment absorbs them unequally. Fine detail
+is mostly pigment, since distance and slope change slowly. Log brightness is therefore the weighted sum of the
+channels' logarithms, with weights summing to 1, that has the least fine detail (best linear unbiased estimate; Aitken
+1936).
+
+Wet tissue also reflects the lamp, which adds white. The excess of red over green and blue is free of reflections. The
+excess of a pixel's white over its surroundings reveals highlights.
+
+Brightness change of each piece of tissue between two pictures. Pigment is constant, so the change depends on light
+and slope alone.
+
+Tissue is tracked from a key picture by optical flow with a forward-backward check. Specular reflections are removed
+beforehand (`log_diffuse`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.highlights import without_highlights
+from gsplat_core.geometry.grid_tracks import TexturedPicture, seen_by
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+
+LONG_SIDE_PX = 320
+"""Longest side of the analysed pictures, in pixels."""
+CELLS = 40
+"""Number of cells along the longer side of the brightness grid."""
+BRIGHTEST, DARKEST = 249, 20
+"""Levels of the brightest channel above which a pixel is clipped and below which it is noise."""
+DARKEST_CHANNEL = 5
+"""Level of any channel below which its logarithm is noise."""
+SHOULDER = 0.8
+"""Strength of the camera's highlight compression: linear light x is recorded as (1 - exp(-SHOULDER
+x)) / SHOULDER. It differs between cameras.
+"""
+BESIDE_TOOLS = 0.07
+"""Margin around tools excluded because of shadows, as a share of the longer side."""
+LEAST_KNOWN = 0.3
+"""Share of a cell's pixels that must be tissue that is neither under- nor overexposed."""
+LEAST_DETAIL = 0.01
+"""Lower bound of `Shading.detail`, the least noise of any picture."""
+LEAST_RED = 0.1
+"""Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable.
+"""
+GLINT = 0.35
+"""Smallest excess of white over the surroundings of a highlight, relative to the surroundings'
+brightness.
+"""
+SURROUNDINGS = 0.025
+"""Standard deviation of the window for a highlight's surroundings, as a share of the longer side.
+"""
+BESIDE_TOOL_EDGE = 0.0125
+"""Margin around tools excluded from the search for highlights, as a share of the longer side."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Brightness of a picture's cells."""
+
+    brightness: NDArray[np.float64]
+    """Log brightness without pigment up to an offset, [h, w]; meaningless where `share` is too
+    small.
+    """
+    share: NDArray[np.float64]
+    """Share of usable pixels in each cell, [h, w]."""
+    detail: float
+    """Standard deviation of brightness between neighbouring cells caused by remaining pigment and
+    noise.
+    """
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Cells with enough usable pixels, bool [h, w]."""
+        return self.share >= LEAST_KNOWN
+
+
+@dataclass(frozen=True)
+class Shading(Cells):
+    """Shading of a picture; its brightness is from the mixture of channels."""
+
+    glints: NDArray[np.float64]
+    """Share of each cell's pixels in highlights of wet tissue, [h, w]."""
+    wet_share: NDArray[np.float64]
+    """Share of each cell's pixels in which highlights are detectable, [h, w]."""
+    diffuse: Cells | None = None
+    """Brightness of the diffuse part (`log_diffuse`), whose errors differ from those of the
+    mixture. None if no cell has any.
+    """
+
+
+@dataclass(frozen=True)
+class SmallPicture:
+    """Picture reduced for the analysis of its light."""
+
+    levels: NDArray[np.uint8]
+    """RGB levels [H, W, 3]."""
+    usable: NDArray[np.float32]
+    """Weights [H, W]: 1 on tissue that is well exposed and away from tool shadows, else 0."""
+    tissue: NDArray[np.uint8]
+    """Mask [H, W]: 0 on and near tools and where it is too dark."""
+
+    @classmethod
+    def of(cls, frame: Frame) -> SmallPicture:
+        """Reduce a frame. Exposure is ignored since it is uniform over the picture."""
+        return _reduced(frame)
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the brightness grid."""
+        height, width = self.levels.shape[:2]
+        return max(2, round(width * CELLS / max(height, width))), max(2, round(height * CELLS / max(height, width)))
+
+    def averaged(
+        self, values: NDArray[np.float32], weight: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Average values [H, W] or [H, W, C] with weights [H, W] over the cells; also returns the
+        mean weights [h, w].
+        """
+        share = cv2.resize(weight, self.cells, interpolation=cv2.INTER_AREA).astype(np.float64)
+        weighted = values * (weight if values.ndim == 2 else weight[..., None])
+        total = cv2.resize(weighted, self.cells, interpolation=cv2.INTER_AREA).astype(np.float64)
+        least = np.maximum(share, 1e-6)
+        return np.asarray(total / (least if values.ndim == 2 else least[..., None])), share
+
+
+def shading_of(frame: Frame) -> Shading:
+    """Compute the shading of a frame's tissue."""
+    return shading_in(SmallPicture.of(frame))
+
+
+def shading_in(picture: SmallPicture) -> Shading:
+    """Compute the shading of a reduced picture."""
+    cells, share = picture.averaged(_LOG_LIGHT[picture.levels], picture.usable)
+    weights = _least_pigment(_steps(cells, share))
+    glints, wet_share = picture.averaged(_glints(picture), picture.tissue.astype(np.float32))
+    diffuse, known = log_diffuse(picture)
+    red, red_share = picture.averaged(diffuse, known.astype(np.float32))
+    return Shading(
+        cells @ weights,
+        share,
+        _spread(_steps(cells, share) @ weights),
+        glints * wet_share,
+        wet_share,
+        Cells(red, red_share, _spread(_steps(red, red_share))) if np.any(red_share >= LEAST_KNOWN) else None,
+    )
+
+
+def _steps(cells: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return differences of neighbouring known cells, [N] or [N, channels]."""
+    known = share >= LEAST_KNOWN
+    across = (cells[:, 1:] - cells[:, :-1])[known[:, 1:] & known[:, :-1]]
+    return np.concatenate([across, (cells[1:] - cells[:-1])[known[1:] & known[:-1]]])
+
+
+def _spread(steps: NDArray[np.float64]) -> float:
+    return max(1.4826 * float(np.median(np.abs(steps))), LEAST_DETAIL) if len(steps) else LEAST_DETAIL
+
+
+def log_diffuse(picture: SmallPicture) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the logarithm of the diffuse light [H, W] without specular reflections, and where it
+    is known. It relies on tissue being red.
+    """
+    light = np.exp(_LOG_LIGHT[picture.levels])
+    diffuse = light[..., 0] - 0.5 * (light[..., 1] + light[..., 2])
+    known = (picture.usable > 0) & (diffuse > LEAST_RED * light[..., 0])
+    return np.log(np.maximum(diffuse, 1e-4)).astype(np.float32), known
+
+
+def _glints(picture: SmallPicture) -> NDArray[np.float32]:
+    light = np.exp(_LOG_LIGHT[picture.levels])
+    white = light.min(axis=2)
+    sigma = SURROUNDINGS * max(white.shape)
+    around, brightest = (cv2.GaussianBlur(each, (0, 0), sigma) for each in (white, light.max(axis=2)))
+    return (white - around > GLINT * brightest).astype(np.float32)
+
+
+def _least_pigment(steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return channel weights [3], summing to 1, that minimise the mean square of the weighted
+    `steps` [N, 3].
+    """
+    covariance = steps.T @ steps / max(len(steps), 1) + 1e-5 * np.eye(3)
+    weights = np.linalg.solve(covariance, np.ones(3))
+    return np.asarray(weights / weights.sum())
+
+
+def _reduced(frame: Frame) -> SmallPicture:
+    height, width = frame.image.shape[:2]
+    usable = np.ones((height, width), np.uint8)
+    for kept in (without_highlights(frame.image), frame.loss_mask):
+        if kept is not None:
+            usable &= (kept != 0).astype(np.uint8)
+    image = frame.image
+    scale = min(1.0, LONG_SIDE_PX / max(height, width))
+    size = round(width * scale), round(height * scale)
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        usable = np.asarray(cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    brightest, darkest = image.max(axis=2), image.min(axis=2)
+    lit = (brightest > DARKEST).astype(np.uint8)
+    usable &= ((brightest <= BRIGHTEST) & (lit > 0) & (darkest >= DARKEST_CHANNEL)).astype(np.uint8)
+    if frame.mask is None:
+        return SmallPicture(image, usable.astype(np.float32), lit)
+    tissue = cv2.resize((frame.mask != 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    unshaded, beside = (_shrunk(tissue, margin * max(size)) for margin in (BESIDE_TOOLS, BESIDE_TOOL_EDGE))
+    return SmallPicture(image, (usable & unshaded).astype(np.float32), beside & lit)
+
+
+def _shrunk(tissue: NDArray[np.uint8], margin_px: float) -> NDArray[np.uint8]:
+    side = 2 * round(margin_px) + 1
+    return np.asarray(cv2.erode(tissue, np.ones((side, side), np.uint8)), np.uint8)
+
+
+def _log_light() -> NDArray[np.float32]:
+    """Return the log light of each level [256]: inverse sRGB curve (IEC 61966-2-1), then inverse
+    shoulder.
+    """
+    level = np.arange(256) / 255
+    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    return np.log(np.maximum(-np.log1p(-SHOULDER * linear) / SHOULDER, 1e-4)).astype(np.float32)
+
+
+_LOG_LIGHT = _log_light()
+RETURN_PX = 1.0
+"""Largest accepted forward-backward error of the flow, in pixels."""
+MOST = 0.5
+"""Largest accepted change of a pixel's log brightness; larger changes are errors or shadows."""
+LEAST_FOUND = 0.6
+"""Share of the key picture's tissue that must be found again for a view to count as tracked."""
+WIDEST = 0.15
+"""Largest standard deviation of the change of log brightness for a view to count as tracked; a
+moving scope changes the light more.
+"""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Shading and texture of one picture, as input of the comparison with others."""
+
+    shading: Shading
+    picture: SmallPicture
+    texture: TexturedPicture
+    diffuse: NDArray[np.float32]
+    known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Change:
+    """Change of the tissue in each cell of a key picture relative to another picture."""
+
+    brighter: NDArray[np.float64]
+    """Change of log brightness, float64 [h, w], mean over the cell."""
+    share: NDArray[np.float64]
+    """Share of the cell's pixels found again, float64 [h, w]."""
+    moved: NDArray[np.float64]
+    """Displacement in cells (columns, rows), float64 [h, w, 2]."""
+    found: float
+    """Share of the key picture's tissue found again."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Cells of which enough pixels were found again, bool [h, w]."""
+        return self.share >= LEAST_KNOWN
+
+    @property
+    def is_followed(self) -> bool:
+        """True if the other picture shows the same tissue with little change."""
+        known = self.known
+        return self.found >= LEAST_FOUND and bool(known.any()) and float(np.std(self.brighter[known])) <= WIDEST
+
+
+def look_at(frame: Frame, camera: Camera) -> Look:
+    """Compute shading and texture of a frame."""
+    picture = SmallPicture.of(frame)
+    return Look(shading_in(picture), picture, seen_by(frame, camera), *log_diffuse(picture))
+
+
+class Follower:
+    """Tracks the tissue of one key picture to other pictures of the same size. Pictures are best
+    passed in temporal order away from the key, since each flow starts from the previous one.
+    """
+
+    def __init__(self, key: Look) -> None:
+        self._key = key
+        self._there: Any = None
+        self._back: Any = None
+        self._method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def change_to(self, look: Look) -> Change:
+        """Compute the change from the key picture to another one."""
+        key = self._key
+        first, second = key.texture.texture, look.texture.texture
+        self._there = self._method.calc(first, second, self._there)
+        self._back = self._method.calc(second, first, self._back)
+        height, width = first.shape
+        column, row = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        x, y = column + self._there[..., 0], row + self._there[..., 1]
+        read = lambda plane, how=cv2.INTER_LINEAR: cv2.remap(plane, x, y, how, borderMode=cv2.BORDER_CONSTANT)
+        returned = self._there + read(self._back)
+        found = np.hypot(returned[..., 0], returned[..., 1]) < RETURN_PX
+        tissue = key.known & (key.texture.usable > 0)
+        found &= tissue
+        for usable in (look.known.astype(np.uint8), look.texture.usable):
+            found &= read(usable, cv2.INTER_NEAREST) > 0
+        brighter = read(look.diffuse) - key.diffuse
+        found &= np.abs(brighter) <= MOST
+        weight = found.astype(np.float32)
+        mean, share = key.picture.averaged(np.asarray(brighter, np.float32), weight)
+        moved, _ = key.picture.averaged(self._there, weight)
+        columns, rows = key.picture.cells
+        return Change(
+            mean, share, moved * [columns / width, rows / height], float(found.sum() / max(int(tissue.sum()), 1))
+        )

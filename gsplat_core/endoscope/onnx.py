@@ -1,0 +1,329 @@
+"""Loading, checking and running of a user's ONNX model that takes one picture, on the CPU.
+
+Files are read without the onnx package, bounded in size and self-contained. Input and output conventions come from the model's metadata or from a JSON file
+next to it.
+
+Safe reading of ONNX files without the onnx package: bounded in size and self-contained.
+
+A model can store weights in other files named by path. Loading them would let a foreign model read any file of the
+machine, so such models are rejected and the runtime gets bytes instead of a path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.io.files import read_regular
+
+MOST_BYTES = 512 * 2**20
+MOST_NESTING = 64
+_EXTERNAL_DATA, _DATA_LOCATION, _EXTERNAL = 13, 14, 1
+"""Field numbers of a tensor in onnx.proto, and the value of the second field that marks external
+data.
+"""
+_PARTS: dict[str, dict[int, str]] = {
+    "model": {7: "graph", 20: "training", 25: "function"},
+    "training": {1: "graph", 2: "graph"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "function": {7: "node", 11: "attribute"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+}
+"""Fields of each message type that lead to tensors (onnx.proto, IR version 13)."""
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+"""Protobuf wire types."""
+
+
+def read_model(path: Path, what: str) -> bytes:
+    """Read an ONNX file.
+
+    Args:
+        path: the file.
+        what: description of the model for error messages, such as "tool network".
+
+    Raises:
+        InvalidSetting: for an unreadable or invalid file, one that is too large, or one with
+            external data.
+    """
+    try:
+        data = read_regular(path, MOST_BYTES)
+    except OSError as error:
+        raise InvalidSetting(f"{what} {path} cannot be read ({error.strerror or error}); give an ONNX file") from error
+    try:
+        external = has_external_data(data)
+    except ValueError as error:
+        raise InvalidSetting(f"{what} {path} is no ONNX model ({error}); export it again") from error
+    if external:
+        raise InvalidSetting(
+            f"{what} {path} keeps data in other files, which are not opened;"
+            " export it as one file (torch.onnx.export(..., external_data=False))"
+        )
+    return data
+
+
+def has_external_data(data: bytes) -> bool:
+    """Return True if a tensor of a model has external data.
+
+    Raises:
+        ValueError: for bytes that are not a protobuf message.
+    """
+    waiting: list[tuple[str, memoryview, int]] = [("model", memoryview(data), 0)]
+    while waiting:
+        kind, message, depth = waiting.pop()
+        if depth > MOST_NESTING:
+            raise ValueError(f"graphs inside each other more than {MOST_NESTING} deep")
+        for field, value in _fields(message):
+            if kind == "tensor":
+                if field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value == _EXTERNAL):
+                    return True
+            elif field in _PARTS[kind] and isinstance(value, memoryview):
+                waiting.append((_PARTS[kind][field], value, depth + 1))
+    return False
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Yield number and value of a message's fields: integers, and bytes of length-delimited fields."""
+    at = 0
+    while at < len(message):
+        tag, at = _varint(message, at)
+        field, wire = tag >> 3, tag & 7
+        if wire == _VARINT:
+            number, at = _varint(message, at)
+            yield field, number
+            continue
+        if wire == _BYTES:
+            length, at = _varint(message, at)
+        elif wire in (_FIXED64, _FIXED32):
+            length = 8 if wire == _FIXED64 else 4
+        else:
+            raise ValueError(f"wire type {wire}")
+        if field == 0 or at + length > len(message):
+            raise ValueError("it ends too early")
+        if wire == _BYTES:
+            yield field, message[at : at + length]
+        at += length
+
+
+def _varint(message: memoryview, at: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if at >= len(message):
+            raise ValueError("it ends too early")
+        byte = message[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+    raise ValueError("a number of more than 64 bits")
+
+
+METADATA_KEY = "intrasplat"
+"""Metadata key whose value is a JSON object with the fields of the settings."""
+MOST_SETTINGS_BYTES = 1 << 16
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Side = Annotated[int, Field(ge=16, le=4096)]
+ClassIndex = Annotated[int, Field(ge=0, lt=4096)]
+
+
+class PictureSettings(BaseModel):
+    """Settings of any picture network that its tensor shapes do not reveal."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    white: Positive = 1.0
+    """Value of a white pixel before normalisation by `mean` and `std`, usually 1 or 255."""
+    mean: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Mean per channel, red first."""
+    std: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    channels: Literal["rgb", "bgr"] = "rgb"
+    """Channel order of the network's input."""
+    size: tuple[Side, Side] | None = None
+    """Input height and width in pixels if the network has no fixed size."""
+    output: str | None = None
+    """Name of the output; None for the first one."""
+    threads: Annotated[int, Field(ge=1, le=64)] = 1
+    """Number of CPU threads."""
+
+
+class ToolSettings(PictureSettings):
+    """Settings of a tool segmentation network."""
+
+    values: Literal["auto", "logits", "probability"] = "auto"
+    """Kind of a single-channel output. `auto` is probability if three trial pictures give no value
+    outside 0..1.
+    """
+    tool_classes: Annotated[tuple[ClassIndex, ...], Field(min_length=1)] | None = None
+    """Tool classes; None for all but 0. A single channel is the score of class 1; [0] declares it
+    as tissue.
+    """
+    threshold: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """Probability from which a pixel is tool. With several classes it compares the most likely tool
+    class with the most likely other class. Below 0.5 fewer tools are missed and more tissue is
+    lost.
+    """
+
+
+Settings = TypeVar("Settings", bound=PictureSettings)
+
+
+def read_settings(path: Path, metadata: Mapping[str, str], kind: type[Settings]) -> Settings:
+    """Read the settings of the network at `path` from `path` + `.json`, else from its metadata,
+    else return defaults.
+
+    Raises:
+        InvalidSetting: for unreadable or invalid settings.
+    """
+    beside = path.with_name(path.name + ".json")
+    if beside.exists():
+        try:
+            text = read_regular(beside, MOST_SETTINGS_BYTES)
+        except OSError as error:
+            raise InvalidSetting(f"{beside} cannot be read ({error.strerror or error})") from error
+        where = str(beside)
+    elif METADATA_KEY in metadata:
+        text, where = metadata[METADATA_KEY].encode(), f"{path}: metadata {METADATA_KEY!r}"
+    else:
+        return kind()
+    if len(text) > MOST_SETTINGS_BYTES:
+        raise InvalidSetting(f"{where} is larger than {MOST_SETTINGS_BYTES >> 10} KiB; it should be a few lines")
+    try:
+        return kind.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the object"
+        raise InvalidSetting(f"{where}: {place}: {first['msg']}") from error
+
+
+LONG_SIDE_PX = 640
+"""Longest side in pixels for networks without a fixed or configured input size."""
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+class OnnxNetwork(Generic[Settings]):
+    """ONNX model with one input, a float picture [1, 3, h, w]. Callers check the output.
+
+    Pictures are RGB uint8 arrays [H, W, 3] of any size.
+    """
+
+    def __init__(self, path: Path, what: str, settings: type[Settings], *, multiple_px: int = 32) -> None:
+        """Load a model.
+
+        Args:
+            path: the file.
+            what: description for error messages, such as "tool network".
+            settings: type of the settings.
+            multiple_px: granularity of the input size for models that accept any size.
+
+        Raises:
+            InvalidSetting: for a model that cannot be used.
+        """
+        self.path, self.what, self.multiple_px = path, what, multiple_px
+        self._session, self.settings = self._load(settings)
+        self._input = self._checked_input()
+        self._output = self._checked_output()
+
+    def run(self, image: NDArray[np.uint8]) -> NDArray[Any]:
+        """Run the network on a picture and return its raw output.
+
+        Raises:
+            InvalidInput: for an array that is no picture.
+            InvalidSetting: if the network fails on it.
+        """
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+            raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+        height, width = self._size(*image.shape[:2])
+        smaller = height * width < image.shape[0] * image.shape[1]
+        picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+        settings = self.settings
+        values = picture.astype(np.float32) * np.float32(settings.white / 255)
+        scaled: Any = (values - np.array(settings.mean, np.float32)) / np.array(settings.std, np.float32)
+        if settings.channels == "bgr":
+            scaled = scaled[..., ::-1]
+        planes = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None], _TYPES[self._input.type])
+        try:
+            (output,) = self._session.run([self._output], {self._input.name: planes})
+        except Exception as error:
+            raise self.refused(f"failed on a picture of {height}x{width} ({_first_line(error)})") from error
+        return np.asarray(output)
+
+    def refused(self, why: str) -> InvalidSetting:
+        """Return the error for an unusable network; `why` continues the sentence after its name."""
+        return InvalidSetting(f"{self.what} {self.path} {why}")
+
+    def _size(self, height: int, width: int) -> tuple[int, int]:
+        """Return the height and width to which a picture is resized."""
+        fixed = self._input.shape[2:]
+        if all(isinstance(side, int) and side > 0 for side in fixed):
+            return fixed[0], fixed[1]
+        if self.settings.size is not None:
+            return self.settings.size
+        scale, step = min(1.0, LONG_SIDE_PX / max(height, width)), self.multiple_px
+        rows, columns = (max(1, round(side * scale / step)) * step for side in (height, width))
+        return rows, columns
+
+    def _checked_input(self) -> Any:
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1:
+            raise self.refused(f"has {len(inputs)} inputs; it must have one, the picture")
+        (only,) = inputs
+        shape = list(only.shape)
+        fits = len(shape) == 4 and shape[0] in (1, None) + ((shape[0],) if isinstance(shape[0], str) else ())
+        if not fits or (isinstance(shape[1], int) and shape[1] != 3) or only.type not in _TYPES:
+            raise self.refused(f"takes {only.type} {shape}; it must take one picture, float [1, 3, height, width]")
+        if any(isinstance(side, int) and side > 4096 for side in shape[2:]):
+            raise self.refused(f"takes pictures of {shape[2]}x{shape[3]}; at most 4096x4096 are supported")
+        return only
+
+    def _checked_output(self) -> str:
+        names = [output.name for output in self._session.get_outputs()]
+        wanted = self.settings.output
+        if wanted is not None and wanted not in names:
+            raise self.refused(f"has no output {wanted!r}, only {', '.join(names)}")
+        return str(wanted or names[0])
+
+    def _load(self, kind: type[Settings]) -> tuple[Any, Settings]:
+        """Create a runtime session and read the settings."""
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise InvalidSetting(
+                f"a {self.what} needs the package onnxruntime ({error}); install intrasplat with the extra `onnx`"
+            ) from error
+        data = read_model(self.path, self.what)
+        try:
+            # The settings, including the number of threads, may be inside the model, so it is first
+            # opened with one thread.
+            session = _session(onnxruntime, data, 1)
+            settings = read_settings(self.path, session.get_modelmeta().custom_metadata_map, kind)
+            if settings.threads > 1:
+                session = _session(onnxruntime, data, settings.threads)
+        except InvalidSetting:
+            raise
+        except Exception as error:
+            raise self.refused(f"cannot be loaded ({_first_line(error)}); export it again") from error
+        return session, settings
+
+
+def _session(onnxruntime: Any, data: bytes, threads: int) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    # Waiting threads sleep, since the CPU is shared with training.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Named explicitly, because one of the default providers sends its input to a remote service.
+    return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]

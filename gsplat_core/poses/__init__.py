@@ -1,0 +1,1 @@
+"""Camera poses of a moving scope from its pictures."""

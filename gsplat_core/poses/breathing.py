@@ -1,0 +1,466 @@
+"""Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the tissue.
+
+The breathing and heart frequencies are searched for without a known trajectory. A test shows whether the scope's own motion can be separated from
+breathing at all.
+
+Test of whether the scope's own motion can be separated from breathing.
+
+The trajectory prior attributes to the tissue the part of a motion at the breathing frequency that a smooth trajectory
+does not have (`trajectory_prior`). At neighbouring frequencies, half a cycle per recording away, the tissue has no
+motion. Anything attributed to it there is scope motion, and an error of the same size is expected at the breathing
+frequency. A scope that moves nearly as fast as the tissue breathes shows at both neighbours.
+
+Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the points.
+
+Poses estimated for static tissue contain its breathing. This module searches for breathing and heart frequencies that
+explain the observations better. It then optimises cameras, points and periodic motion
+together (`moving_bundle`). A prior of the scope's trajectory (`trajectory_prior`) is re-estimated as the trajectory
+improves.
+
+There is no result if no frequency explains the observations clearly better, if the recording shows less than one and
+a half breaths, or if the scope itself moves nearly as fast as the tissue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsplat_core.poses.bundle import Bundle
+from gsplat_core.poses.bundle import adjust as adjust_still
+from gsplat_core.poses.moving_bundle import (
+    MOST_NODES,
+    PLACES,
+    MovingBundle,
+    SurfaceField,
+    TrajectoryPrior,
+    adjust,
+    coordinates,
+    learned_from,
+    with_waves,
+)
+from gsplat_core.poses.se3 import exp, inverse, log
+from gsplat_core.threads import one_thread
+
+BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
+LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5
+"""Breathing cycles that the recording must contain for a frequency to be accepted, and to be tried.
+A smooth scope trajectory explains less than `LEAST_CYCLES` equally well. Slower frequencies are
+still tried, because otherwise their double would win.
+"""
+STEP_CYCLES = 0.25
+"""Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the
+heart.
+"""
+SPREAD = 0.007
+"""Cauchy scale of ray errors (x / z)."""
+ROUNDS = 2
+UNEXPLAINED = 1.0
+"""Mean robust cost per observation below which the static model is sufficient. Observations with
+only the expected noise cost 0.5 to 1.
+"""
+BREATHES, BEATS = 0.75, 0.94
+"""Largest accepted ratio of the cost with a frequency to the reference cost. The reference of
+breathing is the static model. The reference of the heart is the median over all tried heart
+frequencies, because any extra frequency lowers the cost a little.
+"""
+
+
+@dataclass(frozen=True)
+class _Try:
+    """Result of adjusting the bundle with one set of frequencies."""
+
+    hz: tuple[float, ...]
+    bundle: MovingBundle
+    cost: float
+
+
+def waves(times_s: Tensor, frequencies_hz: Sequence[float]) -> Tensor:
+    """Return cosine and sine of each frequency at each time, [T, 2 F]."""
+    angles = 2 * torch.pi * times_s[:, None] * torch.tensor(frequencies_hz, dtype=times_s.dtype)
+    return torch.stack([angles.cos(), angles.sin()], 2).flatten(1)
+
+
+@one_thread()
+def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEART_HZ[1]) -> tuple[float, ...]:
+    """Find the frequencies that best explain the observations.
+
+    Args:
+        start: static bundle (no motion amplitudes).
+        times_s: float64 [T], time of each camera in seconds.
+        fastest_hz: upper limit of the search in Hz, set by the frame rate.
+
+    Returns:
+        The breathing frequency, the breathing and heart frequencies, or an empty tuple if static
+            tissue explains the observations nearly as well.
+    """
+    length_s = float(times_s[-1] - times_s[0])
+    step = STEP_CYCLES / length_s
+    still, cost = adjust(start, SPREAD, 3 * ROUNDS)
+    slowest = max(BREATHING_HZ[0], FEWEST_TRIED / length_s)
+    breaths = [
+        _tried(still, times_s, (hz,), ROUNDS) for hz in _frequency_grid(slowest, min(BREATHING_HZ[1], fastest_hz), step)
+    ]
+    if cost < UNEXPLAINED * len(start.point) or not breaths or (best := _best(breaths)).cost > BREATHES * cost:
+        return ()
+    if best.hz[0] * length_s < LEAST_CYCLES:
+        return ()
+    # One step per heart frequency is enough, since the bundle is already adjusted for breathing.
+    beats = [
+        _tried(best.bundle, times_s, (*best.hz, hz), 1)
+        for hz in _frequency_grid(HEART_HZ[0], min(HEART_HZ[1], fastest_hz), 2 * step)
+    ]
+    alone = _tried(best.bundle, times_s, best.hz, 1)
+    usual = float(np.median([each.cost for each in beats])) if beats else 0.0
+    best = _best([alone, *(each for each in _local_minima(beats) if each.cost < BEATS * usual)])
+    bundle, hz = best.bundle, best.hz
+    for part in (1.0, 0.5, 0.25, 0.125):
+        bundle, hz = sharpened(bundle, times_s, hz, part * STEP_CYCLES, SPREAD)
+    return hz
+
+
+def sharpened(
+    bundle: MovingBundle,
+    times_s: Tensor,
+    hz: tuple[float, ...],
+    cycles: float,
+    spread: float,
+    prior: TrajectoryPrior | None = None,
+) -> tuple[MovingBundle, tuple[float, ...]]:
+    """Refine each frequency in turn by comparing it with its neighbours at ± `cycles`.
+
+    Args:
+        bundle: bundle adjusted with the frequencies `hz`.
+        times_s: float64 [T], time of each camera in seconds.
+        hz: frequencies to refine, in Hz.
+        cycles: distance of the neighbours, in cycles over the recording.
+        spread: Cauchy scale of ray errors.
+        prior: prior of the scope's trajectory.
+
+    Returns:
+        The bundle after one adjustment step per frequency, and the refined frequencies in Hz.
+    """
+    part = cycles / float(times_s[-1] - times_s[0])
+    for which in range(len(hz)):
+        around = [_changed(hz, which, change) for change in (-part, 0.0, part)]
+        best = _best([_tried(bundle, times_s, each, 1, spread, prior) for each in around])
+        bundle, hz = best.bundle, best.hz
+    return bundle, hz
+
+
+def _tried(
+    start: MovingBundle,
+    times_s: Tensor,
+    hz: tuple[float, ...],
+    rounds: int,
+    spread: float = SPREAD,
+    prior: TrajectoryPrior | None = None,
+) -> _Try:
+    """Adjust a start bundle that already contains all of these frequencies, or all but the last
+    one.
+    """
+    return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, prior))
+
+
+def _best(tries: Sequence[_Try]) -> _Try:
+    return min(tries, key=lambda each: each.cost)
+
+
+def _local_minima(tries: Sequence[_Try]) -> list[_Try]:
+    """Return the tries with a lower cost than both neighbours. A minimum at the end of the band
+    belongs to a frequency outside it.
+    """
+    inner = zip(tries, tries[1:], tries[2:], strict=False)
+    return [each for before, each, after in inner if each.cost <= min(before.cost, after.cost)]
+
+
+def _frequency_grid(slowest: float, fastest: float, step: float) -> list[float]:
+    return [float(hz) for hz in np.arange(slowest, fastest, step)]
+
+
+def _changed(hz: tuple[float, ...], which: int, change: float) -> tuple[float, ...]:
+    return tuple(each + change * (number == which) for number, each in enumerate(hz))
+
+
+BESIDE_CYCLES = 0.5
+"""Distance of the neighbouring frequencies, in cycles over the recording."""
+CLEARLY = 2.0
+"""Smallest ratio of the motion attributed to the tissue to that at the neighbouring frequencies;
+below it poses may get worse.
+"""
+
+
+@one_thread()
+def is_told(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
+    """Compare the motion attributed to the tissue with its expected error.
+
+    Args:
+        before: poses estimated for static tissue [C, 4, 4].
+        poses: poses after separating the breathing [C, 4, 4].
+        times_s: times in seconds [C].
+        hz: breathing frequency, and heart frequency if found.
+
+    Returns:
+        True if `poses` are more reliable than `before`, and the root mean square scope motion that
+            may be attributed to the tissue.
+    """
+    length_s = float(times_s[-1] - times_s[0])
+    apart = BESIDE_CYCLES / length_s
+    beside = [(hz[0] + change, *hz[1:]) for change in (-apart, apart)]
+    mistaken = min(_given_to_tissue(poses, poses, times_s, each) for each in beside)
+    return _given_to_tissue(before, poses, times_s, hz) > CLEARLY * mistaken, mistaken
+
+
+def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[float]) -> float:
+    """Return the root mean square motion at the first frequency beyond that of a trajectory like
+    `like`.
+    """
+    swings = waves(times_s, hz)
+    prior = learned_from(like, times_s, swings)
+    y, _ = coordinates(poses)
+    part = torch.stack([_line(prior, swings, y[:, axis], axis) for axis in range(PLACES.stop)], 1)
+    return float((part - part.mean(0)).square().sum(1).mean().sqrt())
+
+
+def _line(prior: TrajectoryPrior, swings: Tensor, y: Tensor, axis: int) -> Tensor:
+    """Return the first frequency's part of a coordinate [C] by generalised least squares."""
+    pushed = swings.T @ prior.precision[axis]
+    return swings[:, :2] @ torch.linalg.solve(pushed @ swings, pushed @ y)[:2]
+
+
+EVERY_S = 0.4
+"""Average time between the frames that are used, in seconds."""
+FEWEST_FRAMES, MOST_FRAMES = 40, 150
+LONGEST_S = MOST_FRAMES * EVERY_S
+POINTS, LEAST_SEEN = 600, 5
+"""Number of points used, most often observed first, and the least number of observations of each.
+"""
+FEWEST_POINTS = 60
+NEAREST, FARTHEST = 0.5, 2.0
+"""Accepted initial depths relative to the median; points outside this range start at the median
+depth.
+"""
+FINEST = 0.0017
+STAGES = (
+    (0.014, 3, 0.0),
+    (0.007, 3, 0.06),
+    (0.0035, 3, 0.04),
+    (FINEST, 3, 0.03),
+    (FINEST, 3, 0.02),
+    (FINEST, 3, 0.015),
+    *((FINEST, 4, 0.0),) * 9,
+)
+"""Optimisation stages: Cauchy scale of ray errors (x / z), number of steps, and the frequency
+spacing in cycles over the recording for the refinement that follows (0 = none). The trajectory
+prior is re-estimated before each stage.
+"""
+FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 40, 16
+"""Size of the reduced problem on which frequencies are searched."""
+SAMPLED = 0.4
+"""Highest frequency searched, as a share of the frame rate."""
+LEAST_SHARED, PLACE_ROUNDS = 24, 10
+"""Observations of moving points that an intermediate frame needs to be placed by them, and the
+number of adjustment steps for it.
+"""
+GOLDEN = 0.5 * (5**0.5 - 1)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Point observations of all frames with a static reconstruction. The unit of length is about
+    the points' distance.
+    """
+
+    frame: Tensor
+    """Frame index of each observation, int64 [K], ascending."""
+    point: Tensor
+    """Point index of each observation, int64 [K]."""
+    rays: Tensor
+    """Observed rays as x / z and y / z, [K, 2]."""
+    times_s: Tensor
+    """Time of every frame in seconds, [N]."""
+    poses: Tensor
+    """World-to-camera poses of the static reconstruction, [N, 4, 4]."""
+    points: Tensor
+    """Point positions of the static reconstruction, [P, 3]."""
+
+
+@dataclass(frozen=True)
+class BreathingTrajectory:
+    """Trajectory and periodic motion found for a recording."""
+
+    poses: Tensor
+    """World-to-camera poses of all frames, [N, 4, 4]. The first one is the identity. The unit of
+    length is the median depth of the points.
+    """
+    points: Tensor
+    """Rest positions of the points used, [P, 3]."""
+    frequencies_hz: tuple[float, ...]
+    """Breathing frequency, or breathing and heart frequencies."""
+    uncertain: float
+    """Root mean square share of the trajectory that may be tissue motion instead of scope motion,
+    in units of the median depth.
+    """
+    error: float
+    """Median ray error (x / z)."""
+
+
+@one_thread()
+def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTrajectory | None:
+    """Estimate the scope's trajectory in front of breathing tissue.
+
+    Args:
+        sightings: observations and the static reconstruction.
+        placed: bool [N], frames with a known pose.
+
+    Returns:
+        The trajectory, or None if the recording is unsuitable or no periodic motion is found.
+    """
+    length_s = float(sightings.times_s[-1] - sightings.times_s[0])
+    known = torch.nonzero(placed)[:, 0]
+    if not LEAST_CYCLES / BREATHING_HZ[1] <= length_s <= LONGEST_S or len(known) < FEWEST_FRAMES:
+        return None
+    frames = _some(known, max(FEWEST_FRAMES, min(MOST_FRAMES, round(length_s / EVERY_S) + 1)))
+    few = _some(frames, FEW_FRAMES)
+    fewer = _bundle(sightings, few, FEW_POINTS, FEW_NODES)
+    if fewer is None:
+        return None
+    fastest_hz = SAMPLED * (len(sightings.times_s) - 1) / length_s
+    frequencies_hz = frequencies_of(fewer[0], sightings.times_s[few], fastest_hz)
+    start = _bundle(sightings, frames, POINTS, MOST_NODES)
+    if not frequencies_hz or start is None:
+        return None
+    found, frequencies_hz, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
+    separable, mistaken = is_told(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
+    if not separable:
+        return None
+    poses = _all_placed(sightings, frames, found, start[1], frequencies_hz)
+    error = float(found.off().norm(dim=1).median())
+    return BreathingTrajectory(poses, found.rest, frequencies_hz, max(prior.uncertain, mistaken), error)
+
+
+@one_thread()
+def refined(
+    start: MovingBundle, times_s: Tensor, frequencies_hz: tuple[float, ...]
+) -> tuple[MovingBundle, tuple[float, ...], TrajectoryPrior]:
+    """Optimise cameras, tissue and periodic motion from a static start.
+
+    Args:
+        start: static bundle.
+        times_s: float64 [T], time of each camera in seconds.
+        frequencies_hz: start values of the frequencies.
+
+    Returns:
+        The adjusted bundle, the refined frequencies in Hz, and the trajectory prior learned from
+            the result.
+    """
+    bundle, hz = with_waves(start, waves(times_s, frequencies_hz)), frequencies_hz
+    for spread, rounds, cycles in STAGES:
+        prior = learned_from(bundle.poses, times_s, bundle.waves)
+        bundle, _ = adjust(bundle, spread, rounds, prior)
+        if cycles:
+            bundle, hz = sharpened(bundle, times_s, hz, cycles, spread, prior)
+        bundle = _with_new_nodes(bundle)
+    return bundle, hz, learned_from(bundle.poses, times_s, bundle.waves)
+
+
+def _some(frames: Tensor, most: int) -> Tensor:
+    """Select at most `most` frames, including the first and the last. The spacing is irregular to
+    avoid aliasing of fast motion.
+    """
+    if len(frames) <= most:
+        return frames
+    shift = (torch.arange(most, dtype=torch.float64) * GOLDEN) % 1 - 0.5
+    shift[0] = shift[-1] = 0
+    at = torch.linspace(0, len(frames) - 1, most, dtype=torch.float64) + 0.8 * shift * (len(frames) / most)
+    return frames[torch.unique(at.round().long().clamp(0, len(frames) - 1))]
+
+
+def _bundle(sightings: Sightings, frames: Tensor, most: int, nodes: int) -> tuple[MovingBundle, Tensor] | None:
+    """Build a static bundle from the given frames and their most observed points.
+
+    Returns:
+        The bundle and the point numbers, or None with fewer than `FEWEST_POINTS` points.
+    """
+    chosen = torch.isin(sightings.frame, frames)
+    times = torch.bincount(sightings.point[chosen], minlength=len(sightings.points))
+    often = torch.argsort(times, descending=True, stable=True)[:most]
+    often = often[times[often] >= LEAST_SEEN]
+    if len(often) < FEWEST_POINTS:
+        return None
+    chosen &= torch.isin(sightings.point, often)
+    numbers, point = torch.unique(sightings.point[chosen], return_inverse=True)
+    camera, rays = torch.searchsorted(frames, sightings.frame[chosen]), sightings.rays[chosen]
+    start = sightings.poses[frames[0]]
+    poses = sightings.poses[frames] @ inverse(start)
+    seen_from_start = sightings.points[numbers] @ start[:3, :3].T + start[:3, 3]
+    rest = _limited(poses, seen_from_start, camera, point, rays)
+    unit = rest[:, 2].median()
+    poses[:, :3, 3] /= unit
+    rest = rest / unit
+    field = SurfaceField.over(rest, nodes)
+    none = torch.zeros(len(frames), 0, dtype=torch.float64)
+    amplitudes = torch.zeros(len(field.nodes), 3, 0, dtype=torch.float64)
+    bundle = MovingBundle(poses, rest, amplitudes, camera, point, rays, none, field.influence(rest), field)
+    return bundle, numbers
+
+
+def _limited(poses: Tensor, rest: Tensor, camera: Tensor, point: Tensor, rays: Tensor) -> Tensor:
+    """Return the points on their first observed rays, with depths outside `NEAREST` to `FARTHEST`
+    replaced by the median.
+    """
+    number = torch.arange(len(point))
+    first = torch.zeros(len(rest), dtype=torch.int64).scatter_reduce(0, point, number, "amin", include_self=False)
+    pose = poses[camera[first]]
+    depth = (pose[:, 2, :3] * rest).sum(1) + pose[:, 2, 3]
+    middle = depth.median()
+    depth = torch.where((depth > NEAREST * middle) & (depth < FARTHEST * middle), depth, middle)
+    local = torch.cat([rays[first], torch.ones_like(depth)[:, None]], 1) * depth[:, None]
+    return (pose[:, :3, :3].transpose(1, 2) @ (local - pose[:, :3, 3])[:, :, None])[:, :, 0]
+
+
+def _with_new_nodes(bundle: MovingBundle) -> MovingBundle:
+    """Resample the motion field on nodes placed among the points' current rest positions."""
+    field = SurfaceField.over(bundle.rest, len(bundle.field.nodes))
+    amplitudes = torch.einsum("nm,mjb->njb", bundle.field.influence(field.nodes), bundle.amplitudes)
+    return replace(bundle, field=field, amplitudes=amplitudes, influence=field.influence(bundle.rest))
+
+
+def _all_placed(
+    sightings: Sightings, frames: Tensor, found: MovingBundle, numbers: Tensor, frequencies_hz: Sequence[float]
+) -> Tensor:
+    """Return poses of all frames. Frames between the adjusted ones are interpolated and then
+    aligned to the moving points.
+    """
+    poses = _between(frames, found.poses, len(sightings.times_s))
+    chosen = torch.isin(sightings.point, numbers) & ~torch.isin(sightings.frame, frames)
+    shared = torch.bincount(sightings.frame[chosen], minlength=len(poses))
+    chosen &= shared[sightings.frame] >= LEAST_SHARED
+    rest = torch.searchsorted(numbers, sightings.point[chosen])
+    amplitudes_at = torch.einsum("pm,mjb->pjb", found.influence, found.amplitudes)
+    moved = torch.einsum(
+        "kjb,kb->kj", amplitudes_at[rest], waves(sightings.times_s, frequencies_hz)[sightings.frame[chosen]]
+    )
+    at = torch.arange(len(rest))
+    between = Bundle(poses, found.rest[rest] + moved, sightings.frame[chosen], at, sightings.rays[chosen], 1 / FINEST)
+    fixed = shared < LEAST_SHARED
+    fixed[frames] = True
+    if fixed.all():
+        return poses
+    return adjust_still(between, fixed=fixed, rounds=PLACE_ROUNDS, points_move=False).poses
+
+
+def _between(frames: Tensor, poses: Tensor, count: int) -> Tensor:
+    """Interpolate poses of all frames [count, 4, 4] along screw motions. Poses are constant before
+    the first and after the last given frame.
+    """
+    number = torch.arange(count)
+    after = torch.searchsorted(frames, number).clamp(1, len(frames) - 1)
+    first, second = frames[after - 1], frames[after]
+    share = ((number - first) / (second - first)).clamp(0, 1)[:, None].double()
+    start = poses[after - 1]
+    return exp(share * log(poses[after] @ inverse(start))) @ start

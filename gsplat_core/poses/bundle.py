@@ -1,0 +1,285 @@
+"""Bundle adjustment of camera poses and static points by minimising the reprojection error.
+
+Contains the Levenberg-Marquardt iteration that all adjustments share, and a fast pose of a single camera from known static points.
+
+Levenberg-Marquardt iteration, projection derivatives and segment sums shared by the bundle adjustments.
+
+Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, section 4.2.
+
+Pose of a single camera from known static points, fast enough to run on every frame of a stream.
+
+Gauss-Newton with Cauchy's robust weights. The Cauchy scale follows the current median error, so a start that is off
+by many pixels converges as well as a good one. `bundle.adjust` solves the same problem for many cameras.
+
+Levenberg-Marquardt with Cauchy's robust weights. The points are eliminated by the Schur complement, so the linear
+system has six unknowns per camera. Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, sections 4.3 and
+6.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.poses.se3 import exp
+from gsplat_core.threads import one_thread
+
+State = TypeVar("State")
+DONE = 1e-6
+"""Relative decrease of the cost below which the iteration ends."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e4
+EASIER, HARDER = 5, 8
+"""Divisor of the damping after a successful step, and its factor after a rejected one."""
+
+
+def descend(
+    start: State, step: Callable[[State, float], State], cost_of: Callable[[State], float], rounds: int
+) -> tuple[State, float]:
+    """Minimise a cost with damped steps.
+
+    Args:
+        start: start state.
+        step: returns the state after one step with the given damping.
+        cost_of: returns the cost of a state.
+        rounds: maximum number of steps, including rejected ones.
+
+    Returns:
+        The best state and its cost, which is at most that of the start.
+    """
+    state, cost, damping = start, cost_of(start), FIRST_DAMPING
+    for _ in range(rounds):
+        tried = step(state, damping)
+        new_cost = cost_of(tried)
+        if new_cost < cost:
+            done = cost - new_cost < DONE * cost
+            state, cost, damping = tried, new_cost, max(damping / EASIER, LEAST_DAMPING)
+            if done:
+                break
+        else:
+            damping *= HARDER
+            if damping > MOST_DAMPING:
+                break
+    return state, cost
+
+
+def ray_derivatives(local: Tensor) -> tuple[Tensor, Tensor]:
+    """Return derivatives for points [M, 3] in camera coordinates.
+
+    Returns:
+        Derivatives of the rays (x / z, y / z) by the point [M, 2, 3], and of the point by the
+            rotation of a twist [M, 3, 3]. A twist (t, w) moves a point p by t + w x p.
+    """
+    x, y, z = local.unbind(1)
+    zero = torch.zeros_like(z)
+    by_point = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], 1).reshape(-1, 2, 3)
+    by_rotation = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    return by_point, by_rotation
+
+
+def summed(parts: Tensor, index: Tensor, count: int) -> Tensor:
+    """Return sums [count, …] of the parts [M, …] that have the same index [M]."""
+    return torch.zeros(count, *parts.shape[1:], dtype=parts.dtype).index_add_(0, index, parts)
+
+
+def diagonal_of(blocks: Tensor) -> Tensor:
+    """Return the diagonals of square blocks [N, k, k] as diagonal blocks, offset to be non-zero.
+    Levenberg-Marquardt scales them by the damping.
+    """
+    return torch.diag_embed(blocks.diagonal(dim1=-2, dim2=-1) + 1e-9)
+
+
+SPREAD_PX = 1.0
+"""Smallest Cauchy scale in pixels, used in the last rounds."""
+ROUNDS, LAST_ROUNDS = 8, 3
+PLACEMENT_DONE = 1e-5
+"""Step length, in radians plus translation relative to the median depth, below which the iteration
+ends.
+"""
+Array = NDArray[np.float64]
+
+
+def placed(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Array, Array]:
+    """Estimate a camera pose from points and their observed rays.
+
+    Args:
+        pose: start value, world to camera [4, 4].
+        points: world positions [N, 3].
+        rays: observed rays [N, 2] as x / z and y / z.
+        focal_px: focal length in pixels.
+
+    Returns:
+        The pose [4, 4] and the reprojection error of each point [N] in pixels.
+    """
+    left, pose = 0, pose.copy()
+    # Orthonormalise: rounding errors in products of poses accumulate from frame to frame.
+    u, _, v = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = u @ v
+    for _ in range(ROUNDS):
+        local, residual = _seen(pose, points, rays, focal_px)
+        off = np.linalg.norm(residual, axis=1)
+        spread = max(SPREAD_PX, float(np.median(off)))
+        left = left + 1 if spread == SPREAD_PX else 0
+        weight = 1 / (1 + (off / spread) ** 2)
+        jacobian = _by_twist(local) * focal_px
+        weighted = jacobian * weight[:, None, None]
+        matrix = np.einsum("nki,nkj->ij", weighted, jacobian) + 1e-9 * np.eye(6)
+        twist = -np.linalg.solve(matrix, np.einsum("nki,nk->i", weighted, residual))
+        pose = moved(pose, twist)
+        distance = float(np.median(local[:, 2]))
+        if left > LAST_ROUNDS or (
+            left and np.abs(twist[3:]).max() + np.abs(twist[:3]).max() / distance < PLACEMENT_DONE
+        ):
+            break
+    return pose, np.linalg.norm(_seen(pose, points, rays, focal_px)[1], axis=1)
+
+
+def moved(pose: Array, twist: Array) -> Array:
+    """Apply a small twist (translation [3], rotation vector [3]) in camera coordinates: `exp(twist)
+    @ pose`.
+    """
+    along, turn = twist[:3], twist[3:]
+    angle = max(float(np.linalg.norm(turn)), 1e-12)
+    cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
+    small = angle < 1e-4
+    a = 1 - angle**2 / 6 if small else np.sin(angle) / angle
+    b = 0.5 - angle**2 / 24 if small else (1 - np.cos(angle)) / angle**2
+    c = 1 / 6 - angle**2 / 120 if small else (angle - np.sin(angle)) / angle**3
+    step = np.eye(4)
+    step[:3, :3] += a * cross + b * cross @ cross
+    step[:3, 3] = (np.eye(3) + b * cross + c * cross @ cross) @ along
+    return np.asarray(step @ pose)
+
+
+def _seen(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Array, Array]:
+    """Return points in camera coordinates [N, 3] and their residuals [N, 2] in pixels."""
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    nearest = 1e-3 * abs(float(np.median(local[:, 2]))) + 1e-12
+    local[:, 2] = np.maximum(local[:, 2], nearest)
+    return local, focal_px * (local[:, :2] / local[:, 2:] - rays)
+
+
+def _by_twist(local: Array) -> Array:
+    """Return the derivatives of rays by a twist of the camera, [N, 2, 6]."""
+    x, y, z = local.T
+    result = np.zeros((len(local), 2, 6))
+    result[:, 0, 0] = result[:, 1, 1] = 1 / z
+    result[:, 0, 2], result[:, 1, 2] = -x / z**2, -y / z**2
+    result[:, 0, 3], result[:, 0, 4], result[:, 0, 5] = -x * y / z**2, 1 + x**2 / z**2, -y / z
+    result[:, 1, 3], result[:, 1, 4], result[:, 1, 5] = -1 - y**2 / z**2, x * y / z**2, x / z
+    return result
+
+
+NEAREST = 1e-3
+"""Smallest depth used in projections, as a share of the median depth. Points nearer than this or
+behind the camera are clamped to it.
+"""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Cameras, points and observations; all float64."""
+
+    poses: Tensor
+    """World-to-camera poses [C, 4, 4]."""
+    points: Tensor
+    """World positions [P, 3]."""
+    camera: Tensor
+    """Camera index of each observation, int64 [M]."""
+    point: Tensor
+    """Point index of each observation, int64 [M]."""
+    rays: Tensor
+    """Observed ray of each observation as x / z and y / z, [M, 2]."""
+    focal_px: float
+    """Focal length in pixels; converts ray errors to pixels."""
+
+
+def errors_px(bundle: Bundle) -> Tensor:
+    """Return the reprojection error of each observation [M] in pixels."""
+    residual, _, _ = _residuals(bundle)
+    return residual.norm(dim=1)
+
+
+@one_thread()
+def adjust(
+    bundle: Bundle, *, fixed: Tensor, rounds: int = 15, spread_px: float = 1.0, points_move: bool = True
+) -> Bundle:
+    """Minimise the robust reprojection error.
+
+    Args:
+        bundle: start values.
+        fixed: bool [C], cameras that keep their pose. At least one must be fixed, or the whole
+            scene may drift.
+        rounds: maximum number of Levenberg-Marquardt steps.
+        spread_px: Cauchy scale in pixels; errors well above it have little influence.
+        points_move: optimise the points as well. If False, each camera is optimised independently.
+
+    Returns:
+        The adjusted bundle. Its robust error is never larger than that of the input.
+    """
+    step = lambda bundle, damping: _step(bundle, fixed, spread_px, damping, points_move)
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread_px), rounds)[0]
+
+
+def _cost(bundle: Bundle, spread_px: float) -> float:
+    residual, _, _ = _residuals(bundle)
+    return float(torch.log1p((residual / spread_px).square().sum(1)).sum())
+
+
+def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
+    """Return residuals [M, 2] in pixels, points in camera coordinates [M, 3] and camera rotations
+    [M, 3, 3].
+    """
+    pose = bundle.poses[bundle.camera]
+    rotation = pose[:, :3, :3]
+    local = (rotation @ bundle.points[bundle.point][:, :, None])[:, :, 0] + pose[:, :3, 3]
+    depth = local[:, 2:].clamp(min=NEAREST * float(local[:, 2].median().abs()))
+    local = torch.cat([local[:, :2], depth], 1)
+    return bundle.focal_px * (local[:, :2] / depth - bundle.rays), local, rotation
+
+
+def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, points_move: bool) -> Bundle:
+    residual, local, rotation = _residuals(bundle)
+    weight = 1 / (1 + (residual / spread_px).square().sum(1))
+    by_local, by_rotation = ray_derivatives(local)
+    by_local = bundle.focal_px * by_local
+    by_pose = torch.cat([by_local, by_local @ by_rotation], 2)
+    weighted = by_pose * weight[:, None, None]
+    cameras, points = bundle.poses.shape[0], bundle.points.shape[0]
+    H = summed(weighted.transpose(1, 2) @ by_pose, bundle.camera, cameras)
+    g = summed((weighted.transpose(1, 2) @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
+    H = H + damping * diagonal_of(H)
+    free = ~fixed
+    if not points_move:
+        twist = -torch.linalg.solve(H[free], g[free][:, :, None])[:, :, 0]
+        return replace(bundle, poses=_moved(bundle.poses, free, twist))
+    by_point = by_local @ rotation
+    weighted_point = (by_point * weight[:, None, None]).transpose(1, 2)
+    V = summed(weighted_point @ by_point, bundle.point, points)
+    h = summed((weighted_point @ residual[:, :, None])[:, :, 0], bundle.point, points)
+    V = V + damping * diagonal_of(V)
+    inverse = torch.linalg.inv(V)
+    # Dense camera-by-point blocks: small enough for a few hundred cameras and a few thousand
+    # points.
+    W = torch.zeros(cameras * points, 6, 3, dtype=local.dtype)
+    W.index_add_(0, bundle.camera * points + bundle.point, weighted.transpose(1, 2) @ by_point)
+    W = W.view(cameras, points, 6, 3)[free]
+    count = int(free.sum())
+    eliminated = torch.einsum("cpij,pjk->cpik", W, inverse)
+    rows = W.permute(0, 2, 1, 3).reshape(count * 6, points * 3)
+    S = torch.block_diag(*H[free]) - eliminated.permute(0, 2, 1, 3).reshape(count * 6, points * 3) @ rows.T
+    right = g[free] - torch.einsum("cpij,pj->ci", eliminated, h)
+    twist = -torch.linalg.solve(S, right.reshape(-1, 1)).view(count, 6)
+    shift = -(inverse @ (h + torch.einsum("cpij,ci->pj", W, twist))[:, :, None])[:, :, 0]
+    return replace(bundle, poses=_moved(bundle.poses, free, twist), points=bundle.points + shift)
+
+
+def _moved(poses: Tensor, free: Tensor, twist: Tensor) -> Tensor:
+    poses = poses.clone()
+    poses[free] = exp(twist) @ poses[free]
+    return poses

@@ -1,0 +1,426 @@
+"""Bundle adjustment of cameras in front of periodically moving tissue.
+
+The trajectory has a prior: smooth, and without a component at the breathing and heart frequencies. Tissue motion is a smooth vector field over the
+surface.
+
+Prior of a scope's trajectory: smooth, and without a component at the breathing and heart frequencies.
+
+Pictures show the scope relative to the tissue. Rigid motion of both at a breathing frequency is ambiguous. It is
+resolved by modelling the trajectory as a Gaussian process with a Matérn kernel of order 7/2. The kernel's length and
+noise are learned from the trajectory by restricted maximum likelihood, excluding the component at the given
+frequencies. A trajectory without that component is then more likely. The remaining uncertainty decreases with the
+length of the recording.
+
+Smooth vector field over a tissue surface, given by vectors at nodes among its points.
+
+The prior is a Gaussian random field with a linear part, which includes rigid motion, and a local part with a
+correlation length (kriging with a linear trend). Lengths are in units of the tissue's distance.
+
+The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. The vectors vary
+smoothly over the surface. Cameras, rest positions and vectors are estimated together by
+Levenberg-Marquardt with Cauchy weights, with rest positions eliminated (Schur complement). Rigid motion common to
+tissue and scope is unobservable from pictures; the trajectory prior decides it. The unit of
+length is the tissue's median distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsplat_core.poses.bundle import descend, diagonal_of, ray_derivatives, summed
+from gsplat_core.poses.se3 import exp, hat, log
+from gsplat_core.threads import one_thread
+
+LENGTHS_S = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0, 8.0, 12.0)
+"""Candidate kernel lengths in seconds."""
+NOISES = (0.003, 0.01, 0.03, 0.1)
+"""Candidate noise levels relative to the amplitude of the trajectory."""
+PLACES, TURNS = slice(0, 3), slice(3, 6)
+"""Slices of the coordinates that share a kernel: positions and rotations."""
+
+
+@dataclass(frozen=True)
+class TrajectoryPrior:
+    """Gaussian prior of camera coordinates: positions, and rotation vectors relative to the middle
+    camera, in units of the tissue's distance.
+    """
+
+    precision: Tensor
+    """Precision matrix of each coordinate, [6, C, C]."""
+    uncertain: float
+    """Root mean square uncertainty of the trajectory along the given frequencies."""
+
+    @one_thread()
+    def cost(self, poses: Tensor) -> float:
+        """Return the negative log prior of poses [C, 4, 4], up to a constant."""
+        y, _ = coordinates(poses)
+        return 0.5 * float(torch.einsum("tj,jts,sj->", y, self.precision, y))
+
+    @one_thread()
+    def terms(self, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the Gauss-Newton matrix [6 C, 6 C] and gradient [6 C] of the cost by twists of the
+        cameras.
+        """
+        y, by_twist = coordinates(poses)
+        pushed = torch.einsum("jts,sj->tj", self.precision, y)
+        matrix = torch.einsum("jts,tja,sjb->tasb", self.precision, by_twist, by_twist)
+        slope = torch.einsum("tj,tja->ta", pushed, by_twist)
+        return matrix.reshape(6 * len(poses), -1), slope.reshape(-1)
+
+
+def coordinates(poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Return camera coordinates [C, 6] and their derivatives by twists of the cameras [C, 6, 6], in
+    units of the tissue's distance.
+    """
+    turned = poses[:, :3, :3].transpose(1, 2)
+    place = -(turned @ poses[:, :3, 3:])[:, :, 0]
+    relative = torch.eye(4, dtype=poses.dtype).repeat(len(poses), 1, 1)
+    relative[:, :3, :3] = turned[len(poses) // 2].T @ turned
+    vector = log(relative)[:, 3:]
+    cross = hat(vector)
+    by_twist = torch.zeros(len(poses), 6, 6, dtype=poses.dtype)
+    by_twist[:, :3, :3] = -turned
+    by_twist[:, 3:, 3:] = -(torch.eye(3, dtype=poses.dtype) + 0.5 * cross + cross @ cross / 12)
+    return torch.cat([place, vector], 1), by_twist
+
+
+@one_thread()
+def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPrior:
+    """Learn the prior from a trajectory.
+
+    Args:
+        poses: world-to-camera poses [C, 4, 4].
+        times_s: times in seconds [C].
+        waves: cosines and sines [C, B] whose component is excluded.
+    """
+    y, _ = coordinates(poses)
+    one = torch.ones(len(y), 1, dtype=y.dtype)
+    apart = (times_s[:, None] - times_s).abs()
+    best: list[_Smoothness | None] = [None, None]
+    for length_s in LENGTHS_S:
+        smooth = _matern(apart / length_s)
+        for noise in NOISES:
+            factor = torch.linalg.cholesky(smooth + noise**2 * torch.eye(len(y), dtype=y.dtype))
+            lines, both = (
+                torch.linalg.solve_triangular(factor, part, upper=False) for part in (torch.cat([one, waves], 1), y)
+            )
+            basis, triangle = torch.linalg.qr(lines)
+            left = both - basis @ (basis.T @ both)
+            free = len(y) - lines.shape[1]
+            scale = (left.square().sum(0) / free).clamp(min=1e-16)
+            shared = factor.diagonal().log().sum() + triangle.diagonal().abs().log().sum()
+            likelihood = -0.5 * free * scale.log() - shared
+            for kind, which in enumerate((PLACES, TURNS)):
+                likely = float(likelihood[which].sum())
+                before = best[kind]
+                if before is None or likely > before.likelihood:
+                    best[kind] = _Smoothness(likely, factor, triangle, scale)
+    places, turns = best
+    assert places is not None and turns is not None
+    along = torch.cat([0 * one, waves], 1)
+    return TrajectoryPrior(
+        torch.cat([places.precision(one)[PLACES], turns.precision(one)[TURNS]]),
+        float(places.variance(along)[PLACES].sum().sqrt()),
+    )
+
+
+@dataclass(frozen=True)
+class _Smoothness:
+    """Kernel with its restricted likelihood for a trajectory."""
+
+    likelihood: float
+    factor: Tensor
+    """Cholesky factor of the kernel matrix [C, C]."""
+    triangle: Tensor
+    """Triangular QR factor of the whitened constant and waves."""
+    scale: Tensor
+    """Variance of each coordinate, [6]."""
+
+    def precision(self, one: Tensor) -> Tensor:
+        """Return the precision matrices [6, C, C] with a free constant offset."""
+        inverse = torch.cholesky_inverse(self.factor)
+        inverse = inverse - (inverse @ one) @ (one.T @ inverse) / inverse.sum()
+        return inverse / self.scale[:, None, None]
+
+    def variance(self, along: Tensor) -> Tensor:
+        """Return the mean variance over time of each coordinate's component along the waves [6]."""
+        projected = torch.linalg.solve_triangular(self.triangle.T, along.T, upper=False)
+        return self.scale * projected.square().sum(0).mean()
+
+
+def _matern(apart: Tensor) -> Tensor:
+    r = 7**0.5 * apart
+    return (1 + r + 0.4 * r**2 + r**3 / 15) * torch.exp(-r)
+
+
+LINEAR = 0.2
+"""Prior standard deviation of the linear part."""
+LOCAL = 0.03
+"""Prior standard deviation of the local part."""
+LENGTH = 0.3
+"""Correlation length of the local part."""
+APART = 0.13
+"""Smallest distance between nodes; larger if it would give more than `MOST_NODES`."""
+MOST_NODES = 48
+JITTER = 1e-6
+"""Diagonal regularisation as a share of the mean variance."""
+
+
+@dataclass(frozen=True)
+class SurfaceField:
+    """Nodes of a vector field with its prior."""
+
+    nodes: Tensor
+    """Node positions [M, 3]."""
+    middle: Tensor
+    """Median position of the points [3]."""
+    stiffness: Tensor
+    """Inverse covariance [M, M]; v' stiffness v / 2 is the negative log prior of values v at the
+    nodes.
+    """
+
+    @classmethod
+    @one_thread()
+    def over(cls, points: Tensor, most: int = MOST_NODES) -> SurfaceField:
+        """Create a field with at most `most` nodes spread over points [P, 3]."""
+        middle = points.median(0).values
+        nodes = _spread(points, middle, most)
+        return cls(nodes, middle, torch.linalg.inv(_settled(_covariance(nodes, nodes, middle))))
+
+    @one_thread()
+    def influence(self, points: Tensor) -> Tensor:
+        """Return interpolation weights [P, M] of the nodes' vectors at points [P, 3]."""
+        return _covariance(points, self.nodes, self.middle) @ self.stiffness
+
+
+def _covariance(first: Tensor, second: Tensor, middle: Tensor) -> Tensor:
+    first, second = first - middle, second - middle
+    linear = LINEAR**2 * (1 + first @ second.T)
+    return linear + LOCAL**2 * torch.exp(-0.5 * (torch.cdist(first, second) / LENGTH).square())
+
+
+def _settled(covariance: Tensor) -> Tensor:
+    return covariance + JITTER * covariance.diagonal().mean() * torch.eye(len(covariance), dtype=covariance.dtype)
+
+
+def _spread(points: Tensor, middle: Tensor, most: int) -> Tensor:
+    """Return points selected by farthest-point sampling, starting nearest to the middle."""
+    chosen = [int((points - middle).norm(dim=1).argmin())]
+    away = (points - points[chosen[0]]).norm(dim=1)
+    while len(chosen) < most and float(away.max()) > APART:
+        chosen.append(int(away.argmax()))
+        away = torch.minimum(away, (points - points[chosen[-1]]).norm(dim=1))
+    return points[chosen]
+
+
+SIGMA = 0.002
+"""Standard deviation of a ray (x / z). It corresponds to 0.6 pixels at a width of 320 and includes
+the correlation of errors over time.
+"""
+RELIEF = 0.3
+"""Prior standard deviation of the points' depth from their median, in units of the median depth."""
+NEAREST = 0.05
+"""Smallest depth used in projections, in units of the median depth."""
+HELD = 1e3
+"""Stiffness that holds the tissue's common rigid motion constant when there is no trajectory prior.
+"""
+
+
+@dataclass(frozen=True)
+class MovingBundle:
+    """Cameras, moving points and observations; all float64."""
+
+    poses: Tensor
+    """World-to-camera poses [C, 4, 4]; the first one is fixed."""
+    rest: Tensor
+    """Rest positions [P, 3] in the world."""
+    amplitudes: Tensor
+    """Motion vectors at the field's nodes, one for each wave, [M, 3, B]."""
+    camera: Tensor
+    """Camera index of each observation, int64 [K]."""
+    point: Tensor
+    """Point index of each observation, int64 [K]."""
+    rays: Tensor
+    """Observed rays as x / z and y / z, [K, 2]."""
+    waves: Tensor
+    """Value of each wave at each camera's time, [C, B]."""
+    influence: Tensor
+    """Weight of each node's vector at each point, [P, M]."""
+    field: SurfaceField
+    """Nodes and prior of the motion field."""
+
+    def places(self) -> Tensor:
+        """Return the world position of the point at each observation, [K, 3]."""
+        amplitudes_at = torch.einsum("pm,mjb->pjb", self.influence, self.amplitudes)
+        return self.rest[self.point] + torch.einsum("kjb,kb->kj", amplitudes_at[self.point], self.waves[self.camera])
+
+    def off(self) -> Tensor:
+        """Return the ray residuals predicted minus observed, [K, 2]."""
+        return _residuals(self)[0]
+
+
+def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
+    """Replace the waves [C, B]. Vectors of additional waves start at zero."""
+    amplitudes = torch.zeros(len(bundle.field.nodes), 3, waves.shape[1], dtype=torch.float64)
+    amplitudes[:, :, : bundle.amplitudes.shape[2]] = bundle.amplitudes
+    return replace(bundle, waves=waves, amplitudes=amplitudes)
+
+
+@one_thread()
+def adjust(
+    bundle: MovingBundle, spread: float, rounds: int, prior: TrajectoryPrior | None = None
+) -> tuple[MovingBundle, float]:
+    """Minimise the robust cost.
+
+    Args:
+        bundle: start values.
+        spread: Cauchy scale of ray errors; errors well above it have little influence.
+        rounds: maximum number of Levenberg-Marquardt steps.
+        prior: prior of the scope's trajectory, or None.
+
+    Returns:
+        The adjusted bundle and its cost, which is at most that of the start.
+    """
+    step = lambda bundle, damping: _in_unit(_step(bundle, spread, damping, prior))
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread, prior), rounds)
+
+
+def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) -> float:
+    residual, _, _ = _residuals(bundle)
+    seen = 0.5 * (spread / SIGMA) ** 2 * torch.log1p((residual / spread).square().sum(1)).sum()
+    depth = bundle.rest[:, 2]
+    relief = 0.5 * ((depth - depth.median()) / RELIEF).square().sum()
+    motion = 0.5 * torch.einsum("mjb,mn,njb->", bundle.amplitudes, bundle.field.stiffness, bundle.amplitudes)
+    return float(seen + relief + motion) + (prior.cost(bundle.poses) if prior is not None else 0.0)
+
+
+def _in_unit(bundle: MovingBundle) -> MovingBundle:
+    """Rescale to the median depth of the rest positions as the unit of length."""
+    unit = bundle.rest[:, 2].median().abs()
+    poses = bundle.poses.clone()
+    poses[:, :3, 3] /= unit
+    return replace(bundle, poses=poses, rest=bundle.rest / unit, amplitudes=bundle.amplitudes / unit)
+
+
+def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
+    """Return ray residuals [K, 2], points in camera coordinates [K, 3] and camera rotations [K, 3,
+    3].
+    """
+    pose = bundle.poses[bundle.camera]
+    rotation = pose[:, :3, :3]
+    local = (rotation @ bundle.places()[:, :, None])[:, :, 0] + pose[:, :3, 3]
+    local = torch.cat([local[:, :2], local[:, 2:].clamp(min=NEAREST)], 1)
+    return local[:, :2] / local[:, 2:] - bundle.rays, local, rotation
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Blocks of the normal equations needed to eliminate the rest positions."""
+
+    inverse: Tensor
+    """Inverse blocks of the rest positions, [P, 3, 3]."""
+    slope: Tensor
+    """Gradients of the rest positions, [P, 3]."""
+    by_camera: Tensor
+    """Coupling to cameras, [C, P, 6, 3]."""
+    by_amplitude: Tensor
+    """Coupling to motion vectors, [P, 3, 3 B]."""
+
+
+def _step(bundle: MovingBundle, spread: float, damping: float, prior: TrajectoryPrior | None) -> MovingBundle:
+    """Compute one damped step. Unknowns are the twists of all cameras but the first, then
+    amplitudes in the order (axis, wave, node).
+    """
+    residual, local, rotation = _residuals(bundle)
+    weight = 1 / (SIGMA**2 * (1 + (residual / spread).square().sum(1)))
+    by_local, by_rotation = ray_derivatives(local)
+    by_pose, by_place = torch.cat([by_local, by_local @ by_rotation], 2), by_local @ rotation
+    weighted = (by_pose * weight[:, None, None]).transpose(1, 2)
+    cameras, count = len(bundle.poses), len(bundle.rest)
+    H = summed(weighted @ by_pose, bundle.camera, cameras)
+    g = summed((weighted @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
+    H = H + damping * diagonal_of(H)
+    index = bundle.camera * count + bundle.point
+    by_camera = summed(weighted @ by_place, index, cameras * count).view(cameras, count, 6, 3)
+    weighted = (by_place * weight[:, None, None]).transpose(1, 2)
+    square, pull = weighted @ by_place, (weighted @ residual[:, :, None])[:, :, 0]
+    places = _eliminated(bundle, square, pull, by_camera, damping)
+    eliminated = torch.einsum("cpij,pjk->cpik", by_camera, places.inverse)
+    flat = lambda blocks: blocks.permute(0, 2, 1, 3).reshape(6 * cameras, 3 * count)
+    S = torch.block_diag(*H) - flat(eliminated) @ flat(by_camera).T
+    right = (g - torch.einsum("cpij,pj->ci", eliminated, places.slope)).reshape(-1)
+    if prior is not None:
+        more, slope = prior.terms(bundle.poses)
+        S, right = S + more, right + slope
+    cross_terms, own_terms, slopes = _amplitude_terms(bundle, square, pull, places, eliminated, held=prior is None)
+    whole = torch.cat([torch.cat([S, cross_terms], 1), torch.cat([cross_terms.T, own_terms], 1)])[6:, 6:]
+    found = -torch.linalg.solve(whole, torch.cat([right, slopes])[6:])
+    twist = torch.cat([torch.zeros(6, dtype=found.dtype), found[: 6 * cameras - 6]]).view(cameras, 6)
+    change = found[6 * cameras - 6 :].view(3, bundle.waves.shape[1], bundle.influence.shape[1]).permute(2, 0, 1)
+    at_points = torch.einsum("pm,mjb->pjb", bundle.influence, change).flatten(1)
+    moved = places.slope + torch.einsum("cpij,ci->pj", by_camera, twist)
+    moved = moved + torch.einsum("pia,pa->pi", places.by_amplitude, at_points)
+    rest = bundle.rest - (places.inverse @ moved[:, :, None])[:, :, 0]
+    return replace(bundle, poses=exp(twist) @ bundle.poses, rest=rest, amplitudes=bundle.amplitudes + change)
+
+
+def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: Tensor, damping: float) -> _Places:
+    count, waves = len(bundle.rest), bundle.waves[bundle.camera]
+    V, slope = summed(square, bundle.point, count), summed(pull, bundle.point, count)
+    depth = bundle.rest[:, 2]
+    V[:, 2, 2] += 1 / RELIEF**2
+    slope[:, 2] += (depth - depth.median()) / RELIEF**2
+    V = V + damping * diagonal_of(V)
+    by_amplitude = summed((square[:, :, :, None] * waves[:, None, None, :]).flatten(2), bundle.point, count)
+    return _Places(torch.linalg.inv(V), slope, by_camera, by_amplitude)
+
+
+def _amplitude_terms(
+    bundle: MovingBundle, square: Tensor, pull: Tensor, places: _Places, eliminated: Tensor, *, held: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return coupling of amplitudes to cameras [6 C, n], their own matrix [n, n] and gradient [n],
+    after eliminating the rest positions.
+    """
+    count, waves = len(bundle.rest), bundle.waves[bundle.camera]
+    cameras, wave_count, nodes = len(bundle.poses), waves.shape[1], bundle.influence.shape[1]
+    size = 3 * wave_count
+    pairs = square[:, :, None, :, None] * (waves[:, :, None] * waves[:, None, :])[:, None, :, None, :]
+    own = summed(pairs.reshape(len(pairs), size, size), bundle.point, count)
+    slope = summed((pull[:, :, None] * waves[:, None, :]).flatten(1), bundle.point, count)
+    back = places.by_amplitude.transpose(1, 2) @ places.inverse
+    own = own - back @ places.by_amplitude
+    slope = slope - (back @ places.slope[:, :, None])[:, :, 0]
+    influence = bundle.influence
+    by_camera = (places.by_camera.permute(0, 2, 3, 1) @ influence)[:, :, :, None, :] * bundle.waves[
+        :, None, None, :, None
+    ]
+    cross = by_camera.reshape(6 * cameras, size, nodes)
+    for term in range(size):
+        through = torch.einsum("cpij,pj->cip", eliminated, places.by_amplitude[:, :, term])
+        cross[:, term] -= through.reshape(6 * cameras, count) @ influence
+    whole = torch.zeros(size, nodes, size, nodes, dtype=own.dtype)
+    for row in range(size):
+        for column in range(row, size):
+            whole[row, :, column] = (influence * own[:, row, column, None]).T @ influence
+            whole[column, :, row] = whole[row, :, column].T
+        whole[row, :, row] += bundle.field.stiffness
+    slopes = torch.einsum("pa,pm->am", slope, influence)
+    slopes = slopes + torch.einsum("mn,njb->jbm", bundle.field.stiffness, bundle.amplitudes).reshape(size, nodes)
+    if held and wave_count:
+        whole = whole + _rigid(bundle, wave_count)
+    return cross.reshape(6 * cameras, size * nodes), whole.reshape(size * nodes, size * nodes), slopes.reshape(-1)
+
+
+def _rigid(bundle: MovingBundle, wave_count: int) -> Tensor:
+    """Return the penalty matrix [3 B, M, 3 B, M] that holds the rigid motion of the amplitudes."""
+    at = bundle.field.nodes - bundle.field.middle
+    x, y, z = at.unbind(1)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    rows = [one, zero, zero, zero, z, -y, zero, one, zero, -z, zero, x, zero, zero, one, y, -x, zero]
+    modes = torch.linalg.qr(torch.stack(rows, 1).reshape(-1, 6)).Q.view(-1, 3, 6)
+    block = HELD / SIGMA * torch.einsum("mik,njk->imjn", modes, modes)
+    each = torch.eye(wave_count, dtype=block.dtype)
+    return torch.einsum("imjn,ab->iamjbn", block, each).reshape(3 * wave_count, len(at), 3 * wave_count, len(at))
