@@ -44,7 +44,7 @@ from operators.frame_clock import FrameClock
 
 SCORED_EVERY = 10
 REHEARSED_AT_ONCE = {"cpu": 1, "cuda": 3}
-"""Rehearsal steps between two looks at the clock, as in `operators.live_reconstruct`."""
+"""Rehearsal steps between two looks at the clock, as in `operators.reconstruct`."""
 RETAINED_S = 5.0
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.frames import Frame
-from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES
+from operators.checks import PICTURE_STAGES, TISSUE_STAGES
 
 
 def main() -> int:

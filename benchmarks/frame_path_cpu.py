@@ -23,12 +23,12 @@ import numpy as np
 import torch
 
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.applications.live_analysis import analysis_operator
+from operators.applications.live import analysis_operator
 from operators.display import DisplayOp
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.graph import Application
 from operators.messages import PictureState, RenderedFrame, ShownPicture
-from operators.on_screen import OnScreenMetricsOp
+from operators.metrics import OnScreenMetricsOp
 from operators.side_by_side import SideBySideOp, through, with_findings
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState

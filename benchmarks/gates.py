@@ -42,7 +42,7 @@ from gsplat_core.endoscope.out_of_body import (
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.frames import Frame
-from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
+from operators.checks import PICTURE_STAGES, TISSUE_STAGES, new_stages
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.gsplat_core.endoscope.outside import OUTSIDE

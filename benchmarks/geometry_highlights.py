@@ -21,7 +21,7 @@ from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.rendering.elsewhere import SeenFromElsewhere
 from gsplat_core.scene.model import Model
-from operators.applications.geometry import SeenFromAnywhere, measure_geometry
+from operators.applications.evaluate import SeenFromAnywhere, measure_geometry
 
 
 def main() -> None:

@@ -41,7 +41,7 @@ from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.poses.odometry import trajectory_of
-from operators.applications.geometry import SeenFromAnywhere, measure_geometry
+from operators.applications.evaluate import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay
 

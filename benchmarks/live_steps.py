@@ -33,7 +33,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.applications.live_analysis import analysis_operator
+from operators.applications.live import analysis_operator
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
 from operators.graph import Application
@@ -44,7 +44,7 @@ from operators.sources.registry import SourceOptions, open_source
 FIRST_STEPS = {"cpu": 4, "cuda": 60}
 """Steps on the first frame: about what a live run has time for."""
 SETTLING_S = 1.0
-"""Seconds at the start that are not scored, as in `operators.on_screen`."""
+"""Seconds at the start that are not scored, as in `operators.metrics`."""
 
 
 class Shown:

@@ -1,11 +1,17 @@
-"""Depth maps of frames: recorded with the stream, estimated from the frames, or absent."""
+"""Depth maps of frames: recorded with the stream, estimated from the frames, or absent.
+
+During a live stream, `DepthBesideOp` estimates depth in a background thread, and the stream never waits for it. Late estimates are passed to the model after
+training on their frames.
+"""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 
@@ -13,9 +19,14 @@ from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.depth.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.threads import use_one_thread
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.placement import LateDepth
 from operators.graph import Operator, OperatorSpec
+from operators.graph.tracking import Histogram
 from operators.outcome import OutcomeBuilder
+from operators.side_thread import step_back, usable_cores
 
 
 @dataclass(frozen=True)
@@ -174,3 +185,259 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
         f"{lacking}: {found}the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
         " depth has no measured scale"
     )
+
+
+FEW_CORES = 4
+"""Largest number of cores at which depth estimation is throttled, because training uses them
+all.
+"""
+SHARE_OF_FEW = 0.25
+"""Share of one core's time for depth estimation on a throttled machine."""
+KEEPS = ("auto", "recorded")
+"""Values of the setting `depth` with which a frame keeps its recorded depth."""
+
+
+class DepthBeside:
+    """Estimates depth in a background thread of lower priority. `offer` and `take` never block.
+
+    The queue holds one pending frame. A newer frame replaces the pending one, which is counted in
+    `DepthCounts.passed_over`.
+    """
+
+    def __init__(self, choice: str, camera: Camera, *, share: float | None = None, device: str = "cpu") -> None:
+        """Check the settings. The thread begins with `start`.
+
+        Args:
+            choice: the setting `depth`.
+            camera: camera of the frames.
+            share: largest share of one core's time, in (0, 1]; None selects it by the number of
+                cores.
+            device: device of estimators that are not limited to the CPU.
+
+        Raises:
+            InvalidSetting: `choice` is rejected by `check_depth`.
+        """
+        check_depth(choice)
+        self.choice, self._camera, self._device = choice, camera, device
+        self._share = share if share is not None else share_of(usable_cores())
+        self.counts = DepthCounts()
+        self.finder: DepthFinder | None = None
+        self._changed = threading.Condition()
+        self._offered: Frame | None = None
+        self._found: tuple[Frame, LateDepth] | None = None
+        self._failure: BaseException | None = None
+        self._over = False
+        self._begun = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Reset the counts and start the thread for a new stream."""
+        self.counts = DepthCounts()
+        self.finder = DepthFinder(self.choice, self._camera, device=self._device)
+        self._offered = self._found = self._failure = None
+        self._over = False
+        self._begun.clear()
+        self._thread = threading.Thread(target=self._run, args=(self.finder,), name="depth", daemon=True)
+        self._thread.start()
+        self._begun.wait()  # `use_one_thread` must take effect before other threads compute
+
+    def stop(self) -> None:
+        """Stop the thread after its current frame. Raises the exception of the thread, if any."""
+        thread, self._thread = self._thread, None
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+        if thread is not None:
+            thread.join()
+        self.raise_failure()
+
+    def offer(self, frame: Frame) -> None:
+        """Queue a frame for depth estimation if it has no depth and the estimator accepts it."""
+        if frame.depth is not None or self.finder is None or not self.finder.seeks_in(frame):
+            return
+        with self._changed:
+            self.counts.passed_over += self._offered is not None
+            self._offered = frame
+            self._changed.notify_all()
+
+    def take(self) -> tuple[Frame, LateDepth] | None:
+        """Return and clear the newest result: the frame with its depth, and the training data made
+        from it.
+        """
+        with self._changed:
+            found, self._found = self._found, None
+        return found
+
+    def _run(self, finder: DepthFinder) -> None:
+        """Estimate depth of pending frames until `stop`, sleeping between frames to keep the time
+        share.
+        """
+        step_back()
+        if self._share < 1:
+            use_one_thread()
+        self._begun.set()
+        scene, placed = 0, -1
+        try:
+            while (frame := self._next()) is not None:
+                began_s = time.thread_time()
+                # The first frame of the scene may have been dropped.
+                is_new = frame.scene != scene and frame.new_scene is None
+                scene = frame.scene
+                found = finder.find(frame.with_fields(new_scene="passed over") if is_new else frame)
+                if found is not None:
+                    fields = {"depth": found.kept, "depth_confidence": found.confidence, "depth_origin": found.origin}
+                    self._put(frame.with_fields(**fields), places=scene != placed)
+                    placed = scene
+                self._rest((time.thread_time() - began_s) * (1 / self._share - 1))
+        except BaseException as error:  # noqa: BLE001 - carried to the operator of this thread
+            self._failure = error
+
+    def _next(self) -> Frame | None:
+        """Wait for the next pending frame. Return None once `stop` was called."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._over or self._offered is not None)
+            frame, self._offered = self._offered, None
+            return None if self._over else frame
+
+    def _put(self, found: Frame, places: bool) -> None:
+        self.counts.take(found, found)
+        # Prepared in this thread, because the training thread has no spare time between two frames.
+        late = LateDepth.of(found, self._device, places=places)
+        with self._changed:
+            self._found = found, late
+
+    def _rest(self, seconds: float) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._over, seconds)
+
+    def raise_failure(self) -> None:
+        """Raise the exception that ended the thread, once."""
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+
+def share_of(cores: int) -> float:
+    """Return the largest share of one core's time for depth estimation in a process with `cores`
+    cores.
+    """
+    return SHARE_OF_FEW if cores <= FEW_CORES else 1.0
+
+
+class DepthBesideOp(Operator):
+    """Passes frames on with or without their recorded depth, and owns the depth estimation thread.
+
+    Frames are passed on immediately. `LiveReconstructOp` offers the frames that it trains on to the
+    thread and takes the results.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame`; its depth is removed unless `beside.choice` is in `KEEPS`.
+
+    Params:
+        beside: the background depth estimator; started and stopped with this operator.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, beside: DepthBeside, **kwargs: Any) -> None:
+        self.beside = beside
+        self._given = DepthCounts()
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def start(self) -> None:
+        self._given = DepthCounts()
+        self.beside.start()
+
+    def stop(self) -> None:
+        self.beside.stop()
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = given = op_input.receive("frame")
+        if frame.depth is not None and self.beside.choice not in KEEPS:
+            given = frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
+        self._given.take(frame, given)
+        self.beside.raise_failure()
+        op_output.emit(given, "frame")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        (self._given + self.beside.counts).contribute(outcome, self.beside.choice, self.beside.finder)
+
+
+@dataclass(frozen=True)
+class TakenDepth:
+    """Statistics of depth that a live model received after the frames."""
+
+    frames: int
+    """Number of frames whose depth was used."""
+    age_p50_ms: float
+    """Median delay from the frame's arrival to the use of its depth, in milliseconds."""
+    dropped: int
+    """Rejected estimates, for example of an earlier scene or of a frame too old."""
+
+
+class DepthFound(Protocol):
+    """Asynchronous depth estimator for frames that are being trained on."""
+
+    def offer(self, frame: Frame) -> None:
+        """Submit a frame for estimation; the estimator may drop it."""
+
+    def take(self) -> tuple[Frame, LateDepth] | None:
+        """Return a finished frame with its depth and the training data made from it, once each.
+        None if there is no new result.
+        """
+
+
+class LateDepths:
+    """Passes late depth estimates to a model and records their delay."""
+
+    def __init__(self, found: DepthFound | None) -> None:
+        """found: the asynchronous estimator; None disables late depth."""
+        self._found = found
+        self.begin()
+
+    def begin(self) -> None:
+        """Reset the statistics for a new stream."""
+        self._ages = Histogram()
+        self._taken = self._dropped = 0
+
+    def offer(self, frame: Frame) -> None:
+        """Submit a frame that is being trained on to the estimator."""
+        if self._found is not None:
+            self._found.offer(frame)
+
+    def give(self, reconstructor: LiveReconstructor, now_ns: Callable[[], int]) -> Frame | None:
+        """Pass a new estimate, if any, to the model.
+
+        Args:
+            reconstructor: the live model.
+            now_ns: monotonic clock in nanoseconds, the clock of `Frame.arrived_ns`.
+
+        Returns:
+            The frame with the depth that the model accepted; None if there was none.
+        """
+        found = None if self._found is None else self._found.take()
+        if found is None:
+            return None
+        frame, late = found
+        if not reconstructor.take_depth(frame, late):
+            self._dropped += 1
+            return None
+        self._taken += 1
+        if frame.arrived_ns is not None:
+            self._ages.record(now_ns() - frame.arrived_ns)
+        return frame
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        age_ms = self._ages.summary().p50_ms
+        outcome.add(TakenDepth(self._taken, age_ms, self._dropped))
+        if self._taken:
+            outcome.note(
+                f"the depth of {self._taken} frames was learned after they were shown, {age_ms:.0f} ms after they had come (median)"
+            )

@@ -1,39 +1,387 @@
 """Output folder of a run: created, empty, or left by an earlier run of this program.
 
-A run collects its results in the staging folder `.run-…` inside the output folder. At the end the
-results replace the earlier ones in one transaction:
+Outputs never replace recordings, inputs, home or current folders, or files of other programs. `--overwrite` replaces only files that this program wrote,
+recognised by their content. A lock keeps two runs out of one folder.
+
+Recognition of this program's output files by content, so that `--overwrite` replaces only those.
+
+Each format carries a mark: a comment in `.ply` and `.mp4`, the generator of `.glb`, bytes after the array of `.npy`.
+A `.splat` has no space for a mark, so its rows are validated instead.
+
+A run collects its results in the staging folder `.run-…` inside the output folder. At the end the results replace the
+earlier ones in one transaction:
 
     .run-…  →  .complete-…   commit point: the new results are valid
     the earlier results      → .old-…
     the new results          → their names
     .old-… is removed
 
-An interruption never mixes two runs. Before the commit point the earlier results are untouched.
-After it, the next run in the folder completes the remaining steps.
+An interruption never mixes two runs. Before the commit point the earlier results are untouched. After it, the next
+run in the folder completes the remaining steps.
 
-The marker file lists every file of a run with a fingerprint. Only listed files are replaced or
-removed. A run refuses a folder with modified listed files or foreign files among the results. Files
-that appear during a run are moved to `kept-…`.
+The marker file lists every file of a run with a fingerprint. Only listed files are replaced or removed. A run refuses
+a folder with modified listed files or foreign files among the results. Files that appear during a run are moved to
+`kept-…`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import hashlib
 import json
 import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+import struct
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import BinaryIO
 
+import numpy as np
+
+from gsplat_core.io.exports.export import TIMES_FILE
+from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.files import open_regular, read_regular, replace_durably, sync_folder, unfinished
-from operators.errors import OutputFolderInUse
-from operators.folder_lock import LOCK, FolderLock
-from operators.output_paths import MARKER, check_folder_path
+from gsplat_core.io.ply import MARK_LINE
+from gsplat_core.io.recordings.calibration import TRAILER
+from operators.errors import OutputError, OutputFolderInUse
 from operators.storage import STAGING_PREFIX, storage_errors, write_whole
+
+_MOST_JSON_BYTES = 64 << 20
+
+
+def is_own_file(path: Path) -> bool:
+    """Return True if the file has the mark for its suffix. False for a missing or unreadable
+    file.
+    """
+    recognise = _KINDS.get(path.suffix.lower())
+    if recognise is None:
+        return False
+    try:
+        with open_regular(path) as file:
+            return recognise(file)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, struct.error, zipfile.BadZipFile):
+        return False
+
+
+def _ply(file: BinaryIO) -> bool:
+    return any(line.strip() == MARK_LINE.encode() for line in file.read(512).split(b"\n")[:4])
+
+
+def _glb(file: BinaryIO) -> bool:
+    magic, _, _, length, kind = struct.unpack("<4sIII4s", file.read(20))
+    if magic != b"glTF" or kind != b"JSON" or length > _MOST_JSON_BYTES:
+        return False
+    return json.loads(file.read(length))["asset"]["generator"] == "IntraSplat"
+
+
+def _npy(file: BinaryIO) -> bool:
+    if file.read(6) != b"\x93NUMPY":
+        return False
+    file.seek(-len(TRAILER), os.SEEK_END)
+    return file.read() == TRAILER
+
+
+def _mp4(file: BinaryIO) -> bool:
+    import av
+
+    from operators.sinks.video_file import MARK
+
+    try:
+        with av.open(file, format="mp4") as container:
+            return container.metadata.get("comment") == MARK
+    except av.FFmpegError:
+        return False
+
+
+def _splat(file: BinaryIO) -> bool:
+    data = file.read(1 << 24)
+    size = os.fstat(file.fileno()).st_size
+    if not data or size % ROW.itemsize:
+        return False
+    rows = np.frombuffer(data[: len(data) - len(data) % ROW.itemsize], ROW)
+    return bool(np.isfinite(rows["position"]).all() and np.isfinite(rows["scale"]).all() and (rows["scale"] >= 0).all())
+
+
+def _sequence(file: BinaryIO) -> bool:
+    with zipfile.ZipFile(file) as archive:
+        return archive.namelist()[:2] == [TIMES_FILE, "0000.ply"]
+
+
+def _packed(file: BinaryIO) -> bool:
+    """Return True for a tar archive whose first member is a manifest, as written by `pack`."""
+    block = file.read(512)
+    return block[:100].rstrip(b"\0") == b"manifest.json" and block[257:262] == b"ustar"
+
+
+def _page(file: BinaryIO) -> bool:
+    head = file.read(4096)
+    return head.startswith(b"<!doctype html>") and b"IntraSplat" in head
+
+
+def _report(file: BinaryIO) -> bool:
+    values = json.loads(file.read(_MOST_JSON_BYTES))
+    return isinstance(values, dict) and {"series", "outputs", "notes"} <= set(values)
+
+
+def _frames(file: BinaryIO) -> bool:
+    entry = json.loads(file.readline(1 << 16))
+    return isinstance(entry, dict) and {"seq", "psnr_tissue_db"} <= set(entry)
+
+
+_KINDS: dict[str, Callable[[BinaryIO], bool]] = {
+    ".ply": _ply,
+    ".glb": _glb,
+    ".npy": _npy,
+    ".mp4": _mp4,
+    ".splat": _splat,
+    ".zip": _sequence,
+    ".isplat": _packed,
+    ".html": _page,
+    ".json": _report,
+    ".jsonl": _frames,
+}
+LOCK = ".intrasplat.lock"
+_CANNOT_LOCK = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+
+
+class FolderLock:
+    """Context manager that holds an exclusive lock on a folder.
+
+    The lock is a `flock` on a file in the folder. The operating system releases the lock when the
+    process ends, even after a crash. On NFS, Linux forwards the lock to the server, so the lock
+    also excludes runs on other machines if the server supports locks.
+
+    Raises:
+        OutputFolderInUse: another run holds the lock; the message names its process.
+        OutputError: the file system does not support locks.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._path = folder / LOCK
+        self._descriptor = -1
+
+    def __enter__(self) -> FolderLock:
+        while not self._taken():
+            pass  # the previous run deleted its lock file between open and flock: retry with a new file
+        os.ftruncate(self._descriptor, 0)
+        os.write(self._descriptor, f"{os.getpid()}\n".encode())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(FileNotFoundError):  # the folder was deleted during the run
+            self._path.unlink()
+        os.close(self._descriptor)
+
+    def _taken(self) -> bool:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(descriptor), os.lstat(self._path)):
+                    self._descriptor, descriptor = descriptor, -1
+                    return True
+            return False
+        except BlockingIOError as error:
+            pid = os.read(descriptor, 32).decode("ascii", "replace").strip()
+            raise OutputFolderInUse(
+                f"another run writes into {self.folder} (process {pid or 'unknown'}); wait for its end or choose another --out"
+            ) from error
+        except OSError as error:
+            if error.errno not in _CANNOT_LOCK:
+                raise
+            self._path.unlink()
+            raise OutputError(
+                f"{self.folder} is on a file system that cannot lock files ({error.strerror}); choose another --out"
+            ) from error
+        finally:
+            if descriptor >= 0:
+                os.close(descriptor)
+
+
+_UNSPECIFIC = frozenset({"images", "flow", "views"})
+SIDECARS = _UNSPECIFIC | {"images_right", "masks", "depth", "true_depth", "scene_flow"}
+"""Names of sub-folders that belong to a recording."""
+DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json")
+"""Names of files that occur only in a recording's folder."""
+MAX_PATH_BYTES = 4096
+BATCH_DATABASE = "batch.sqlite"
+"""Database next to the results of a batch. Other runs must not replace these results."""
+MARKER = ".intrasplat.json"
+"""Marker file of folders that this program created."""
+_PICTURES = frozenset({".png", ".jpg", ".jpeg", ".npy", ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
+
+
+def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
+    """Check that a run may use `out` as its output folder.
+
+    Args:
+        out: the output folder.
+        inputs: files and folders that the run reads.
+
+    Raises:
+        OutputError: `out` is a protected folder, or contains or is part of an input or recording.
+    """
+    if len(os.fsencode(out)) >= MAX_PATH_BYTES:
+        raise OutputError(f"--out has {len(os.fsencode(out))} bytes; a path has at most {MAX_PATH_BYTES - 1}")
+    real = Path(os.path.realpath(out))
+    for place, what in ((Path("/"), "the root of the file system"), (_home(), "your home folder")):
+        if _same(real, place):
+            raise OutputError(f"--out is {what}; give a folder for the results alone")
+    if _same(real, Path.cwd()):
+        raise OutputError("--out is empty or the current folder; give the name of a folder for the results alone")
+    if (real.parent / BATCH_DATABASE).is_file():
+        raise OutputError(f"--out {out} is a result of the batch in {real.parent}; choose another --out")
+    for source in inputs:
+        if any(_same(parent, real) for parent in _with_parents(source)):
+            raise OutputError(f"{source} lies inside --out {out}, where the results are replaced; choose another --out")
+    check_beside_recordings(real, out, inputs)
+
+
+def check_file_path(
+    out: Path,
+    inputs: Sequence[Path] = (),
+    *,
+    overwrite: bool = False,
+    into_recording: bool = False,
+    option: str = "--out",
+) -> None:
+    """Raise OutputError if a command with these inputs must not write the file `out`.
+
+    With `overwrite`, an earlier output of this program is replaced, and no other file. An input, a
+    part of one or a hard link to one is never replaced, and no file is put among a recording's
+    pictures.
+
+    Args:
+        out: the output file.
+        inputs: files and folders that the command reads.
+        overwrite: replace an earlier output.
+        into_recording: `out` belongs into a recording's folder, next to its description.
+        option: command line option that set `out`, for the messages.
+    """
+    if "\0" in str(out) or len(os.fsencode(out)) >= MAX_PATH_BYTES:
+        raise OutputError(f"{option} {str(out)[:80]!r} is no name that a file can have; give another one")
+    try:
+        _check_file_path(out, inputs, overwrite, into_recording, option)
+    except OSError as error:
+        raise OutputError(f"{option} {out} cannot be used: {error.strerror or error}; choose another one") from error
+
+
+def _check_file_path(out: Path, inputs: Sequence[Path], overwrite: bool, into_recording: bool, option: str) -> None:
+    real = Path(os.path.realpath(out))
+    if out.is_dir():
+        raise OutputError(f"{out} is a folder; give the name of a file")
+    if any(_same(source, real) for source in inputs):
+        raise OutputError(f"{out} is what the command reads; choose another {option}")
+    if into_recording:
+        inputs = [source for source in inputs if not _same(source, real.parent)]
+    else:
+        _check_no_recording(real.parent, option)
+    check_beside_recordings(real, out, inputs, option)
+    if not out.parent.is_dir():
+        raise OutputError(f"there is no folder {out.parent} to write {out.name} into; make it first")
+    if not os.path.lexists(out):
+        return
+    if not overwrite:
+        raise OutputError(f"{out} is there already; give another {option}, or --overwrite to replace it")
+    if out.is_symlink() or not out.is_file():
+        raise OutputError(f"{out} is not a plain file, so that it is not replaced; give another {option}")
+    if (part := _part_of(inputs, out)) is not None:
+        raise OutputError(f"{out} is {part} by another name, which the command reads; choose another {option}")
+    if not is_own_file(out):
+        raise OutputError(f"{out} was not written by intrasplat, so that it is not replaced; give another {option}")
+
+
+def _check_no_recording(folder: Path, option: str) -> None:
+    found = [name for name in DESCRIPTIONS if os.path.lexists(folder / name)]
+    found += [name for name in sorted(SIDECARS) if _holds_pictures(folder / name)]
+    if found:
+        raise OutputError(f"{folder} is a recording's folder (it holds {', '.join(found)}); choose another {option}")
+
+
+def _part_of(inputs: Sequence[Path], out: Path) -> Path | None:
+    """Return the input file of which `out` is a hard link; None if there is none."""
+    status = out.stat()
+    if status.st_nlink < 2:
+        return None
+    for source in inputs:
+        for parent, _, names in os.walk(source):
+            for name in names:
+                found = Path(parent) / name
+                if found != out and _same(found, out):
+                    return found
+    return None
+
+
+def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path], option: str = "--out") -> None:
+    """Raise OutputError if an output path is inside an input or among a recording's images, masks
+    or depth.
+
+    Args:
+        real: the resolved output path.
+        out: the path as given by the user, for the messages.
+        inputs: paths that the command reads.
+        option: command line option that set the path, for the messages.
+    """
+    for source in inputs:
+        if any(_same(parent, source) for parent in _with_parents(real)):
+            raise OutputError(f"{option} {out} lies inside {source}, which the run reads; choose another {option}")
+    for part in _with_parents(real):
+        if part.name.lower() in SIDECARS and _has_sidecar(part.parent, part.name.lower()):
+            raise OutputError(
+                f"{option} {out} lies in {part}, which belongs to the recording {part.parent}; choose another {option}"
+            )
+
+
+def _has_sidecar(folder: Path, name: str) -> bool:
+    """Return True if the sub-folder `name` of `folder` is part of a recording there (see
+    `layouts`).
+    """
+    if (folder / MARKER).exists() or not folder.is_dir():
+        return False
+    if any((folder / description).exists() for description in DESCRIPTIONS):
+        return True
+    # Next to a video or pictures, sub-folders of unspecific names are not read by the recording's
+    # loader.
+    return name not in _UNSPECIFIC and (_holds_pictures(folder / "images") or _holds_pictures(folder))
+
+
+def _holds_pictures(folder: Path) -> bool:
+    """Return True if the folder contains pictures, videos or arrays that are not results of this
+    program.
+    """
+    if (folder / MARKER).exists() or not folder.is_dir():
+        return False
+    return any(entry.suffix.lower() in _PICTURES for entry in folder.iterdir())
+
+
+def _with_parents(path: Path) -> Iterator[Path]:
+    real = Path(os.path.realpath(path))
+    yield real
+    yield from real.parents
+
+
+def _same(first: Path, second: Path) -> bool:
+    """Return True if both paths name one file or folder, also through bind mounts or ignored
+    case.
+    """
+    if first == second:
+        return True
+    try:
+        return os.path.samefile(first, second)
+    except OSError:
+        return False
+
+
+def _home() -> Path:
+    return Path(os.path.realpath(os.path.expanduser("~")))
+
 
 _FORMAT = "intrasplat-output"
 MOST_MARKER_BYTES = 1 << 26

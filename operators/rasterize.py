@@ -1,6 +1,4 @@
-"""Rendering of the deformed model from the frame's camera, and prediction of frames before
-training.
-"""
+"""Deformation of the model to a frame's timestamp, rendering from the frame's camera, and prediction of frames before training on them."""
 
 from __future__ import annotations
 
@@ -21,7 +19,34 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
-from operators.messages import DeformedScene, Prediction, RenderedFrame
+from operators.messages import DeformedScene, Prediction, Reconstruction, RenderedFrame
+
+
+class DeformOp(Operator):
+    """Deforms the model to its frame's timestamp and sets the camera to the frame's pose.
+
+    On a GPU the renderer's captured graph performs the deformation, so this operator only selects
+    the camera.
+
+    Inputs:
+        reconstruction: `Reconstruction`.
+
+    Outputs:
+        scene: `DeformedScene`.
+    """
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("reconstruction", type=Reconstruction)
+        spec.output("scene", type=DeformedScene)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        message: Reconstruction = op_input.receive("reconstruction")
+        frame, model = message.frame, message.model
+        camera = model.camera if frame.pose is None else model.camera.with_pose(frame.pose)
+        if model.device.type == "cpu":
+            with torch.inference_mode():
+                model.at(frame.time_s)  # caches the state inside the model; the renderer reuses it
+        op_output.emit(DeformedScene(frame, model, camera, message.trained, message), "scene")
 
 
 def displayed(image: torch.Tensor) -> NDArray[np.uint8]:

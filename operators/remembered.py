@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.endoscope.stage import tissue_of
+from operators.checks import tissue_of
 from operators.messages import RenderedFrame
 
 COVERED = 0.1

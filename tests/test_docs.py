@@ -29,8 +29,7 @@ from gsplat_core.scene.model import Model
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
 from operators.sinks.callback import CallbackSinkOp
-from operators.sources.source import SourceDescription
-from operators.sources.threaded import ThreadedSource
+from operators.sources.source import SourceDescription, ThreadedSource
 from services.cli.app import app
 from services.control import routes as service_routes
 from services.settings import ServiceSettings

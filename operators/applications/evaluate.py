@@ -1,49 +1,182 @@
-"""Evaluation of a finished model, or of the run that made it, by several protocols with trivial
-baselines.
-"""
+"""Evaluation of a finished model, or of the run that made it, by several protocols with trivial baselines."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
+
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.evaluation.baselines import AGES, measure_baselines
-from gsplat_core.evaluation.geometry import Geometry
+from gsplat_core.evaluation.baselines import AGES, Baselines, measure_baselines
+from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
 from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.protocols import (
+    LAST_S,
     HeldOut,
+    Picture,
     PictureMaker,
     Retention,
     Return,
+    Visits,
     evaluate_causal,
     evaluate_heldout,
     evaluate_retention,
     find_places,
     returns,
 )
-from gsplat_core.evaluation.scores import Record
+from gsplat_core.evaluation.scores import Record, Score
 from gsplat_core.evaluation.views import SecondEye, evaluate_second_eye
-from gsplat_core.io.recordings.truth import open_truth
+from gsplat_core.io.recordings.calibration import read_poses
+from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.truth import GroundTruth, open_truth
 from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s
-from operators.applications.evaluation import PROTOCOLS, WITHOUT_LEARNING, CausalRun, Evaluation, EvaluationSettings
-from operators.applications.geometry import SeenFromAnywhere, measure_geometry
-from operators.applications.limits import check_picture
-from operators.applications.live_log import is_live_log, read_live_log
-from operators.applications.memory import render_bytes, replay_bytes, require_memory
+from operators.applications.limits import check_picture, render_bytes, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplaySettings
-from operators.frame_log import FRAMES_FILE, FrameLog, read_frames
-from operators.sources.source import FrameSource
+from operators.choices import Device
+from operators.frame_log import FRAMES_FILE, FrameLog, is_live_log, read_frames, read_live_log
+from operators.settings import check_option
+from operators.sources.source import FrameSource, SourceDescription
+
+PROTOCOLS = ("heldout", "live", "retention", "second_eye", "geometry", "causal")
+WITHOUT_LEARNING = ("heldout", "live", "retention", "second_eye", "geometry")
+"""Default protocols; `causal` is excluded because it trains on the whole recording again."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Selection of protocols and their parameters. Raises InvalidSetting for a value out of
+    range.
+    """
+
+    recording: Path | str
+    protocols: tuple[str, ...] = ()
+    """Names in `PROTOCOLS`; empty selects all measurable protocols of `WITHOUT_LEARNING`."""
+    device: Device = "cpu"
+    renderer: str = "alpha"
+    scale: float | None = None
+    """Scale of the frames; None for the scale at which the model was made."""
+    max_frames: int | None = None
+    steps_per_frame: int | None = None
+    """Optimiser steps per frame in the causal protocol; None for the run's."""
+    motion_prior: str | None = None
+    """Motion prior of the causal protocol, a name in `MOTION_PRIORS`; None for the default."""
+    last_s: float = LAST_S
+    """Duration at the end of the stream that the retention protocol renders, in seconds."""
+    places: tuple[Visits, ...] | None = None
+    """Visits to places for the retention protocol; None detects them from the poses."""
+    poses: Path | None = None
+    """File `poses.npy` with the poses that the model was made with, for the geometry protocol; None
+    for the recording's.
+    """
+
+    def __post_init__(self) -> None:
+        for name in self.protocols:
+            if name not in PROTOCOLS:
+                raise InvalidSetting(f"protocol is {name!r}; choose among {', '.join(PROTOCOLS)}")
+        if self.motion_prior is not None:
+            MOTION_PRIORS.check(self.motion_prior)
+        if self.scale is not None:
+            check_option("scale", self.scale)
+        if self.steps_per_frame is not None:
+            check_option("steps_per_frame", self.steps_per_frame)
+        check_option("max_frames", self.max_frames)
+        if not 0 < self.last_s < 1e6:
+            raise InvalidSetting(f"last_s is {self.last_s:g}; it must be positive")
+
+
+@dataclass(frozen=True)
+class CausalRun:
+    """Prediction score of the causal protocol, with its training settings."""
+
+    score: Score
+    field: str
+    steps_per_frame: int
+    seed: int
+    motion_prior: str
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Results of all protocols; None for a protocol that was not measured."""
+
+    description: SourceDescription
+    scale: float
+    started_at: datetime
+    wall_s: float
+    interrupted: bool
+    baselines: Baselines
+    notes: tuple[str, ...]
+    heldout: HeldOut | None = None
+    causal: CausalRun | None = None
+    live: Live | None = None
+    retention: Retention | None = None
+    geometry: Geometry | None = None
+    second_eye: SecondEye | None = None
+    returns: Mapping[str, tuple[Return, ...]] = field(default_factory=dict)
+    """Recovery of each place after a return to it, by protocol."""
+    logs: Mapping[str, Path] = field(default_factory=dict)
+    """Files with per-frame scores, by protocol."""
+
+
+class SeenFromAnywhere:
+    """Renders a model from arbitrary cameras, with one renderer per picture size and projection."""
+
+    def __init__(self, device: str = "cpu", renderer: str = "alpha") -> None:
+        self._device, self._renderer = device, renderer
+        self._makers: dict[Camera, PictureMaker] = {}
+
+    def __call__(self, model: Model, camera: Camera, frame: Frame) -> Picture:
+        """Render the model from `camera` at the frame's timestamp and exposure, in the colours
+        visible from there.
+        """
+        lens = camera.with_pose(np.eye(4))
+        maker = self._makers.get(lens)
+        if maker is None:
+            maker = self._makers[lens] = PictureMaker(lens, self._device, self._renderer)
+        return maker(model.seen_from(camera, frame.time_s), frame.with_fields(pose=camera.world_to_camera))
+
+
+def measure_geometry(
+    frames: Iterable[Frame],
+    frame_count: int,
+    camera: Camera,
+    model: Model,
+    pictures: SeenFromAnywhere,
+    truth: GroundTruth,
+    poses: Path | None = None,
+) -> Geometry:
+    """Run `evaluate_geometry` with the poses that the model was made with.
+
+    Args:
+        frames: frames of the recording.
+        frame_count: number of frames.
+        camera: camera of the frames.
+        model: the finished model.
+        pictures: renderer.
+        truth: ground truth of the recording.
+        poses: file with the poses; None for those of the frames.
+
+    Raises:
+        RecordingInvalid: the file does not contain `frame_count` poses.
+    """
+    read = None if poses is None else read_poses(poses, frame_count, Findings(strict=True))
+    own = lambda frame: frame.pose if read is None else read[frame.seq]
+    shown = lambda view, frame: pictures(model, view, frame)
+    return evaluate_geometry(frames, frame_count, camera, model, shown, truth, own)
 
 
 def evaluate(

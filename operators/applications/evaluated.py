@@ -16,7 +16,7 @@ from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
-from operators.applications.finishing import FirstFrames
+from operators.applications.session import FirstFrames
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 

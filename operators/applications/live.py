@@ -1,53 +1,72 @@
 """Live reconstruction and display of an endless stream.
 
+Analysis of a frame runs before training. Before the first frame, models and operators are warmed up and the interpreter is set for low latency.
+
                       depth (background thread)
                    ┌┈┈┈┈┈┘     └┈┈┈┐
 source → analysis ─┴┬─► reconstruct ◄┘ → deform → rasterize → display ─┬─► sinks
                     └──────────────────────────► on_screen ◄───────────┘
 
-Each operator has its own thread. Depth estimation runs in a background thread on the newest frame
-and reaches training late. The queues into `reconstruct`, `rasterize` and `display` drop the oldest
-frame and count dropped frames. Displayed pictures carry their age.
+Each operator has its own thread. Depth estimation runs in a background thread on the newest frame and reaches
+training late. The queues into `reconstruct`, `rasterize` and `display` drop the oldest frame and count dropped
+frames. Displayed pictures carry their age.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import gc
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
+
 from gsplat_core.rendering.registry import check_renderer
-from operators.applications.delivery import Report, delivered
-from operators.applications.device import check_device
-from operators.applications.finishing import saves_model
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.live import LiveReconstructor
+from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture
-from operators.applications.live_analysis import analysis_operator
 from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
-from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
 from operators.applications.recording import RunRecording
 from operators.applications.replay import REPORT_RESERVE_BYTES
-from operators.applications.result import RunOutcome
-from operators.applications.session import Session
-from operators.applications.trial_run import trial_run
+from operators.applications.session import Report, RunOutcome, Session, delivered, saves_model
+from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.applications.working_size import (
     SHARE_OF_INTERVAL,
     PacedTissue,
     WorkingSize,
     choose_working_size,
     measured_frame_s,
+    trial_run,
 )
-from operators.deform import DeformOp
-from operators.depth_beside import DepthBeside, DepthBesideOp
+from operators.checks import (
+    PICTURE_STAGES,
+    TISSUE_STAGES,
+    OrdinaryStream,
+    PictureStagesOp,
+    SceneNumberStage,
+    StageOp,
+    TissueStagesOp,
+    new_stages,
+)
+from operators.choices import Policy
+from operators.depth import DepthBeside, DepthBesideOp
 from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
-from operators.graph import Application, MultiThreadScheduler
+from operators.graph import Application, MultiThreadScheduler, Operator
 from operators.ingest import SourceOp
-from operators.live_reconstruct import LiveReconstructOp
-from operators.metrics import ScoredFrame
-from operators.on_screen import OnScreenMetricsOp
+from operators.messages import DeformedScene
+from operators.metrics import OnScreenMetricsOp, ScoredFrame
+from operators.out_of_body import OutOfBodyGateOp
 from operators.pose import check_poses, pose_operators
-from operators.rasterize import RasterizeOp
+from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
+from operators.reconstruct import LiveReconstructOp
+from operators.side_by_side import SideBySideOp
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.keyframes import KeyframesOp
 from operators.sources.options import SourceOptions
@@ -55,6 +74,137 @@ from operators.sources.registry import open_source
 from operators.sources.scaled import ScaledSource, scaled_description
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
+from operators.tool_mask import new_tool_mask
+
+BESIDE = "highlights"
+"""A stage with no dependencies; runs concurrently with the other picture stages."""
+
+
+def analysis_operator(
+    fragment: Any,
+    tool_mask: str,
+    out_of_body: Policy,
+    depth: Sequence[Operator],
+    behind_gate: Sequence[Operator] = (),
+    behind: Sequence[Operator] = (),
+) -> Operator:
+    """Return the operator between source and reconstruction, with the input and output `frame`.
+
+    Tools and highlights are detected in parallel to the other checks of the picture.
+
+    Args:
+        fragment: the graph.
+        tool_mask: tool detector, a name in `TOOL_MASKS`.
+        out_of_body: policy for pictures from outside of the body.
+        depth: operators that set the pose of a frame and select its recorded depth.
+        behind_gate: operators inserted directly after the out-of-body gate.
+        behind: operators appended at the end.
+    """
+    others = [name for name in PICTURE_STAGES if name != BESIDE]
+    stream = OrdinaryStream()
+    return SideBySideOp(
+        fragment,
+        name="analysis",
+        gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
+        first=[
+            PictureStagesOp(
+                fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]), stream=stream
+            )
+        ],
+        beside=[
+            [
+                new_tool_mask(fragment, tool_mask),
+                StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
+            ]
+        ],
+        then=[
+            *behind_gate,
+            *depth,
+            TissueStagesOp(
+                fragment,
+                name="tissue",
+                always=[*new_stages(TISSUE_STAGES, without=["exposure"]), SceneNumberStage()],
+                stages=new_stages(TISSUE_STAGES, without=[name for name in TISSUE_STAGES if name != "exposure"]),
+                stream=stream,
+            ),
+            *behind,
+        ],
+    )
+
+
+GARBAGE_THRESHOLDS = (20_000, 20, 1000)
+"""Thresholds of the garbage collector. Collections are rare and mostly of young objects: processing
+a frame creates no cycles, and a full collection takes tens of milliseconds.
+"""
+SWITCH_INTERVAL_S = 0.0002
+"""Interpreter switch interval in seconds. With the default of 5 ms, a thread could wait that long
+for the GIL.
+"""
+OPENCV_THREADS = 1
+"""Number of OpenCV threads. Starting more takes longer than processing a small picture."""
+
+
+def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
+    """Create a reconstructor for the frames of a source."""
+    camera = source.description.camera
+    return LiveReconstructor(
+        settings.reconstructor_config(camera.width_px * camera.height_px),
+        camera,
+        live=settings.chosen_training,
+        seed=settings.seed,
+        device=settings.device,
+    )
+
+
+@dataclass(frozen=True)
+class LiveParts:
+    """Components of a live session."""
+
+    reconstructor: LiveReconstructor
+    rasterizer: Rasterizer
+
+
+def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
+    """Create the components for a source. Their first use is slow (see `warm_up`)."""
+    return LiveParts(new_live_reconstructor(settings, source), Rasterizer(settings.renderer))
+
+
+def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
+    """Create the components and exercise them: capture graphs, allocate memory, measure the
+    duration of a step.
+    """
+    camera = source.description.camera
+    parts = new_parts(settings, source)
+
+    def draw(frame: Frame, model: Model | Snapshot) -> object:
+        scene = DeformedScene(frame, model, camera, trained=True)
+        return scene, parts.rasterizer.draw(scene)
+
+    with seeded(settings.seed, settings.device):
+        warm_reconstructor(parts.reconstructor, draw, stereo=source.description.is_stereo)
+    return parts
+
+
+@contextmanager
+def low_latency() -> Iterator[None]:
+    """Context manager with a short interpreter switch interval and existing objects exempt from
+    garbage collection.
+    """
+    interval_s = sys.getswitchinterval()
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(min(threads, OPENCV_THREADS))
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()
+        cv2.setNumThreads(threads)
+        sys.setswitchinterval(interval_s)
 
 
 class LiveApplication(Application):

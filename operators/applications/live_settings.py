@@ -12,7 +12,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.live import LiveTraining
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
-from operators.applications.result import RunSettings
+from operators.applications.session import RunSettings
 from operators.display import DisplaySettings
 from operators.frame_clock import ClockSettings
 from operators.settings import LiveOptions

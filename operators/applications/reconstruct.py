@@ -20,13 +20,19 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.training.budget import ObserveReport
 from gsplat_core.training.right_eye import BothEyes
-from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
-from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
-from operators.applications.result import RunOutcome
-from operators.applications.session import Session, Start
+from operators.applications.session import (
+    FirstFrames,
+    Report,
+    RunOutcome,
+    Session,
+    Start,
+    delivered,
+    measures_baselines,
+    saves_model,
+)
 from operators.errors import NothingShown
 from operators.settings import check_option
 from operators.sources.source import FrameSource

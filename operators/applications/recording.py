@@ -23,9 +23,8 @@ from gsplat_core.io.sessions.records import (
 from gsplat_core.training.live import LiveReconstructor
 from operators.graph import Application, Operator
 from operators.output_folder import RECORDINGS
-from operators.schedule import ScheduleEvent, ScheduleListener
-from operators.sinks.recorder import RecordFramesOp, RecordPicturesOp, RecordPreparationOp
-from operators.sinks.session_recorder import SessionRecorder
+from operators.reconstruct import ScheduleEvent, ScheduleListener
+from operators.sinks.session_recorder import RecordFramesOp, RecordPicturesOp, RecordPreparationOp, SessionRecorder
 from operators.sources.source import SourceDescription
 from operators.storage import StorageReserve
 

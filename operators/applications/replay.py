@@ -1,5 +1,8 @@
-"""Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finite
-source.
+"""Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finished model.
+
+A recorded session is replayed faithfully, with its prepared frames, calls and settings.
+
+Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finite source.
 
 source → tool_mask → (pose) → depth → reconstruct → deform → rasterize → video
                                                               → metrics → keyframes
@@ -7,54 +10,65 @@ source → tool_mask → (pose) → depth → reconstruct → deform → rasteri
 
 `ReplaySettings.sinks` selects the sinks, here `video` and `keyframes`.
 
-Each operator processes its frames in order and shares only messages. Timestamps come from the
-recording, the work per frame is a fixed number of steps, and every edge blocks. The same recording,
-settings and device therefore give the same `frames_sha256` on either engine and with any number of
-threads (`scheduler_for`).
+Each operator processes its frames in order and shares only messages. Timestamps come from the recording, the work per
+frame is a fixed number of steps, and every edge blocks. The same recording, settings and device therefore give the
+same `frames_sha256` on either engine and with any number of threads (`scheduler_for`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from gsplat_core.depth.registry import check_depth, depth_inputs
-from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings import is_heldout
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.io.recordings.truth import open_behind
+from gsplat_core.io.sessions import SessionReader, is_session
+from gsplat_core.io.sessions.records import ReconstructorMade, camera_of
 from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.applications.delivery import Report, delivered
-from operators.applications.device import check_device, scheduler_for
-from operators.applications.finishing import measures_baselines, saves_model
-from operators.applications.limits import check_picture
-from operators.applications.memory import replay_bytes, require_memory
+from operators.applications.device import check_device, scheduler_for, seeded
+from operators.applications.limits import check_picture, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.replay_analysis import lacking_depth, replay_analysis
-from operators.applications.result import RunOutcome, RunSettings
-from operators.applications.session import Session
-from operators.applications.session_replay import FollowedSession, followed_session
-from operators.deform import DeformOp
+from operators.applications.session import (
+    Report,
+    RunOutcome,
+    RunSettings,
+    Session,
+    delivered,
+    measures_baselines,
+    saves_model,
+)
+from operators.applications.warm_reconstructor import warm_reconstructor
+from operators.compare_shown import CompareShownOp
+from operators.depth import DepthOp, without_depth
 from operators.frame_log import FRAMES_FILE, FrameLog
-from operators.graph import Application
+from operators.graph import Application, Operator
 from operators.ingest import SourceOp
 from operators.messages import RenderedFrame
 from operators.metrics import MetricsOp, ScoredFrame
-from operators.pose import check_poses
-from operators.rasterize import RasterizeOp
-from operators.reconstruct import ReconstructOp
-from operators.settings import ReplayOptions
+from operators.pose import check_poses, pose_operators
+from operators.rasterize import DeformOp, RasterizeOp
+from operators.reconstruct import ReconstructOp, ScheduledReconstructOp
+from operators.settings import ReplayOptions, check_option
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.registry import SINKS, SinkOptions, input_of
+from operators.sources.recording import SessionSource
 from operators.sources.registry import SourceOptions, open_source
-from operators.sources.source import FrameSource
+from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
+from operators.tool_mask import RecordedToolMaskOp
 from operators.truth import TruthOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
@@ -338,3 +352,112 @@ def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline:
         recording_digest=description.digest,
         device=settings.device,
     )
+
+
+def replay_analysis(
+    graph: ReplayApplication, camera: Camera, held_out: Callable[[Frame], bool], *, follows: bool
+) -> Sequence[Operator]:
+    """Return the operators between source and reconstruction, in order.
+
+    Args:
+        graph: graph of the replay.
+        camera: camera of the frames.
+        held_out: returns True for frames excluded from training.
+        follows: a recorded session is replayed, whose frames already carry poses and depth.
+    """
+    settings = graph.settings
+    # A graph that only displays a finished model does not use depth.
+    learns = graph.stage == "replay"
+    depth = DepthOp(
+        graph, name="depth", choice="recorded" if follows else settings.depth, camera=camera, held_out=held_out,
+        has_time=learns, device=settings.device,
+    )  # fmt: skip
+    poses = "given" if follows else settings.poses
+    return RecordedToolMaskOp(graph, name="tool_mask"), *pose_operators(graph, poses, camera, settings.depth), depth
+
+
+def lacking_depth(settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig) -> str | None:
+    """Return a note if the source's frames have no usable recorded depth; None otherwise."""
+    poses = {"pose"} if settings.poses == "estimated" else set()
+    return without_depth(settings.depth, source.fields | poses, config)
+
+
+@dataclass(frozen=True)
+class FollowedSession:
+    """A recorded session whose schedule is replayed."""
+
+    reader: SessionReader
+    source: SessionSource
+    made: ReconstructorMade
+    config: ReconstructorConfig
+    training: LiveTraining
+    device: str
+
+    def new_reconstructor(self) -> LiveReconstructor:
+        """Create a reconstructor with the session's settings, warmed up identically."""
+        with seeded(self.made.seed, self.device):
+            reconstructor = LiveReconstructor(
+                self.config,
+                camera_of(self.made.camera),
+                live=self.training,
+                seed=self.made.seed,
+                recording_digest=self.source.description.digest,
+                device=self.device,
+            )
+            warm_reconstructor(reconstructor, stereo=self.made.stereo)
+        return reconstructor
+
+    def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:
+        """Create the training operator, which follows the schedule."""
+        return ScheduledReconstructOp(
+            graph,
+            name=name,
+            make_reconstructor=self.new_reconstructor,
+            schedule=self.reader.schedule,
+            late_depths=self.reader.late_depths,
+        )
+
+    def compare_op(self, graph: Application, name: str) -> CompareShownOp:
+        """Create the operator that compares the pictures with the recorded ones."""
+        return CompareShownOp(graph, name=name, shown=self.reader.digests)
+
+
+def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSession | None:
+    """Return the recorded session if its schedule can be replayed; None for a plain recording.
+
+    Args:
+        settings: settings of the replay.
+        notes: receives the reason if the schedule of a session is not followed.
+
+    Raises:
+        InvalidSetting: the schedule has settings that this version does not support.
+    """
+    path = Path(settings.recording)
+    if settings.ignore_schedule or not is_session(path):
+        return None
+    reader = SessionReader(path)
+    made = reader.made
+    why = None
+    if made is None:
+        why = "its beginning is not there any more, or it has no schedule"
+    elif settings.given_scale != 1 or settings.heldout or settings.steps_per_frame is not None:
+        why = "scale, held-out frames or steps per frame were given, which it does not have"
+    if made is None or why is not None:
+        notes.append(
+            f"the session's schedule is not followed, so that pictures differ from those that it showed: {why}"
+        )
+        return None
+    try:
+        config = TypeAdapter(ReconstructorConfig).validate_python(made.config)
+        training = TypeAdapter(LiveTraining).validate_python(made.training)
+        check_option("seed", made.seed)
+        camera_of(made.camera)
+    except (ValidationError, InvalidInput, InvalidSetting) as error:
+        first = " ".join(str(error).split())[:200]
+        raise InvalidSetting(
+            f"{path}: its schedule has settings that this version does not take ({first}); give --ignore-schedule"
+        ) from error
+    if made.device != settings.device:
+        notes.append(f"the session ran on {made.device}: on {settings.device} its pictures come out otherwise")
+    source = SessionSource(reader, open_recording(path), max_frames=settings.max_frames)
+    return FollowedSession(reader, source, made, config, training, settings.device)

@@ -1,20 +1,97 @@
-"""Execution of one run of a graph, from its start to its outcome."""
+"""Execution of one run of a graph, from its start to its outcome, and delivery of the results to the output folder."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import resource
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from time import perf_counter
+from typing import Protocol, TypeVar, cast
 
 from gsplat_core.errors import CoreError
+from gsplat_core.evaluation.baselines import measure_baselines
+from gsplat_core.io.bundle import save_bundle
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
 from operators.applications.device import seeded
-from operators.applications.result import RunOutcome, RunSettings, peak_memory_bytes
 from operators.errors import OperatorsError, RunFailed
-from operators.graph import Application, run
+from operators.graph import Application, DurationSummary, run
 from operators.graph.engines import Engine
-from operators.ingest import SourceResult
+from operators.ingest import LOOK_S, SourceResult
+from operators.metrics import QualityResult
 from operators.outcome import Contributor, OutcomeBuilder
+from operators.output_folder import OutputFolder
+from operators.reconstruct import ModelResult
+from operators.sources.source import FrameSource, SourceState
+from operators.storage import storage_errors
+
+Part = TypeVar("Part")
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings stated in the report. With the source they determine the result of a deterministic
+    run.
+    """
+
+    device: str
+    engine: str
+    field: str
+    """Deformation field in use, never `auto`."""
+    renderer: str
+    seed: int
+    scale: float
+    steps_per_frame: int | None
+    """Optimiser steps per frame; None if training is not done frame by frame."""
+    heldout: bool
+    """True if the protocol's held-out frames are excluded from training and scored separately."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """Ending and outputs of a run, and the parts contributed by its operators (see
+    `operators.outcome`).
+    """
+
+    command: str
+    settings: RunSettings
+    started_at: datetime
+    wall_s: float
+    """Duration from the start of the run to the end of its graph, in seconds, without saving and
+    baselines.
+    """
+    stop_reason: str
+    """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the error
+    message.
+    """
+    interrupted: bool
+    dropped: int
+    """Number of messages dropped by the edges of the graph."""
+    dropped_by_edge: dict[str, int]
+    """Dropped messages by edge, for edges that dropped any."""
+    latency: dict[str, DurationSummary]
+    """Latency by path through the graph."""
+    latency_quantiles_ms: dict[str, list[float]]
+    operators: dict[str, DurationSummary]
+    parts: Mapping[type, object]
+    notes: tuple[str, ...]
+    outputs: dict[str, Path]
+    """Paths of written files and folders, by name."""
+    peak_memory_bytes: int
+
+    def find(self, kind: type[Part]) -> Part | None:
+        """Return the part of this class; None if no operator contributed it."""
+        return cast("Part | None", self.parts.get(kind))
+
+
+def peak_memory_bytes() -> int:
+    """Return the peak resident memory of this process, in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
 
 PERCENTILES = tuple(k / 100 for k in range(101))
 
@@ -167,3 +244,129 @@ class Session:
         except (CoreError, OperatorsError, OSError) as error:
             self.failure = self.failure or error
             self.notes.append(str(error))
+
+
+def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], None]:
+    """Return a step that saves the run's model to `out/model`.
+
+    Args:
+        out: output folder of the run.
+        fitted: model trained before the graph ran, saved even if no frame was displayed.
+    """
+
+    def save(session: Session) -> None:
+        if fitted is not None and session.reached.find(ModelResult) is None:
+            session.reached.add(ModelResult(fitted))
+        result = session.reached.find(ModelResult)
+        if result is not None:
+            folder = out / "model"
+            with storage_errors(out):
+                save_bundle(result.model, folder)
+            session.reached.output("model", folder)
+
+    return save
+
+
+def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
+    """Return a step that measures trivial baselines on the displayed frames, by reading the source
+    twice more.
+    """
+
+    def measure(session: Session) -> None:
+        if session.stop_requested() or session.failure is not None:
+            session.notes.append(
+                "the run ended early: baselines that need a second reading of the recording were left out"
+            )
+        elif source.description.digest is None:
+            session.notes.append(
+                f"{source.description.name} can be read only once: baselines that need a second reading were left out"
+            )
+        else:
+            quality = session.reached.find(QualityResult)
+            session.reached.add(measure_baselines(FirstFrames(source, 0 if quality is None else quality.frames)))
+
+    return measure
+
+
+@dataclass(frozen=True)
+class FirstFrames:
+    """The first `count` frames of a closed source; each iteration reads from the beginning."""
+
+    source: FrameSource
+    count: int
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.source.open()
+        try:
+            given = 0
+            while given < self.count:
+                frame = self.source.read(LOOK_S)
+                if frame is not None:
+                    given += 1
+                    yield frame
+                elif self.source.state is SourceState.ENDED:
+                    return
+        finally:
+            self.source.close()
+
+
+Report = Callable[[RunOutcome, Path], None]
+"""Writes report files made from the outcome into a folder, next to the run's own files."""
+
+
+class HasFolders(Protocol):
+    """Settings of a run: a frozen dataclass with the output folder `out`."""
+
+    @property
+    def out(self) -> Path: ...
+
+    @property
+    def inputs(self) -> Sequence[Path]:
+        """Paths that the run reads."""
+
+
+Settings = TypeVar("Settings", bound=HasFolders)
+
+
+def delivered(
+    settings: Settings,
+    command: str,
+    run: Callable[[Settings, list[str]], RunOutcome],
+    report: Report | None = None,
+) -> RunOutcome:
+    """Run `run` in a staging folder, add the report, and replace an earlier run's results by the
+    new ones.
+
+    A run that ends with RunFailed delivers its partial results. After any other exception the
+    earlier results are unchanged.
+
+    Args:
+        settings: settings of the run.
+        command: name of the command, for the marker of the output folder.
+        run: called with the settings, whose `out` is the staging folder, and a list of notes for
+            the report.
+        report: writes the report files; None for no report.
+
+    Returns:
+        The outcome with the final paths of the outputs.
+
+    Raises:
+        OutputError: as `OutputFolder` raises it.
+        RunFailed: the run ended early; carries the outcome with the final paths.
+    """
+    with OutputFolder(settings.out, command, settings.inputs) as output:
+        notes = ["the output folder held an earlier run; this one replaces its files"] if output.earlier else []
+
+        def deliver(outcome: RunOutcome) -> RunOutcome:
+            if outcome.outputs:
+                if report is not None:
+                    report(outcome, output.path)
+                output.publish()
+            paths = {name: settings.out / path.relative_to(output.path) for name, path in outcome.outputs.items()}
+            return replace(outcome, outputs=paths)
+
+        try:
+            return deliver(run(replace(settings, out=output.path), notes))  # type: ignore[type-var]
+        except RunFailed as failed:
+            assert isinstance(failed.result, RunOutcome)
+            raise RunFailed(str(failed), deliver(failed.result)) from failed.__cause__

@@ -23,11 +23,10 @@ from operators.graph.contexts import ExecutionContext, InputContext, OutputConte
 from operators.graph.engines import Engine, run
 from operators.graph.faults import DISABLE_BRANCH, STOP_GRAPH, Fault, FaultAction, FaultPolicy
 from operators.graph.graph import RunResult, StopReason
-from operators.graph.greedy import GreedyScheduler
 from operators.graph.metadata import MetadataPolicy
-from operators.graph.multithread import MultiThreadScheduler
 from operators.graph.operator import Operator
 from operators.graph.queues import EdgeStats
+from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler
 from operators.graph.spec import REQUIRED, ConditionType, ConnectorType, IOSpec, OperatorSpec, QueuePolicy
 from operators.graph.tracking import DurationSummary, FlowTracker
 

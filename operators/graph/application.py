@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from operators.errors import GraphBusy, GraphInvalid
 from operators.graph.faults import Fault
 from operators.graph.graph import Flow, Graph, RunResult, Scheduler
-from operators.graph.greedy import GreedyScheduler
 from operators.graph.queues import EdgeStats
+from operators.graph.schedulers import GreedyScheduler
 from operators.graph.spec import QueuePolicy, queue_policy
 from operators.graph.tracking import FlowTracker
 

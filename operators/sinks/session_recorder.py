@@ -1,4 +1,15 @@
-"""Recorder of a session, which writes in a background thread so that producers never block."""
+"""Recording of a session: operators that pass frames, analysis results and displayed pictures to a recorder, which writes in a background thread.
+
+Producers never block.
+
+Operators that pass frames, analysis results and displayed pictures to a `SessionRecorder`.
+
+    source → out_of_body → recorded_frames → analysis … → recorded_preparation → reconstruct
+                                               … → display → recorded_pictures
+
+The recorder writes in its own thread. `recorded_frames` follows the out-of-body gate, so that withheld pictures are
+never written.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +18,10 @@ import shutil
 import threading
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import av
 from pydantic import ValidationError
@@ -21,9 +32,55 @@ from gsplat_core.io.sessions.records import MOST_NS, SESSION_FILE, LostLine, Sch
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.errors import OutputError
+from operators.graph import Operator, OperatorSpec
+from operators.messages import ShownPicture
+from operators.outcome import OutcomeBuilder
 from operators.side_thread import step_back
-from operators.sinks.recorded import Recorded
-from operators.storage import StorageReserve, storage_errors
+from operators.storage import StorageReserve, mebibytes, storage_errors
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """State of a session recording."""
+
+    folder: Path
+    frames: int = 0
+    """Number of written input frames."""
+    shown: int = 0
+    """Number of written displayed pictures."""
+    lost: Mapping[str, int] | None = None
+    """Items that were not written, by kind and reason, for example `frame: the disk is too
+    slow`.
+    """
+    bytes: int = 0
+    """Size on disk in bytes."""
+    deleted_segments: int = 0
+    """Number of older segments deleted to stay within the size and duration limits."""
+    deleted_sessions: int = 0
+    """Number of earlier sessions deleted for the same reason."""
+    ended: str | None = None
+    """Reason for an early end of the recording; None if there was none."""
+
+
+def stated(recorded: Recorded) -> list[str]:
+    """Return the notes on a recording for the report."""
+    said = [
+        f"{count} times the recording in {recorded.folder} lost something ({what})"
+        for what, count in sorted((recorded.lost or {}).items())
+        if not what.endswith("has ended")
+    ]
+    if recorded.ended is not None:
+        said.append(f"the recording ended before the session, with {mebibytes(recorded.bytes)}: {recorded.ended}")
+    if recorded.deleted_segments:
+        said.append(
+            f"{recorded.deleted_segments} older segments of the recording were removed to keep it within its bounds"
+        )
+    if recorded.deleted_sessions:
+        said.append(
+            f"earlier recordings beside {recorded.folder} were removed to keep within the bounds: {recorded.deleted_sessions}"
+        )
+    return said
+
 
 QUEUE_BYTES = 256 * 2**20
 """Capacity of the queue in bytes of pictures: about three seconds of 640x512 at 30 frames/s."""
@@ -309,3 +366,116 @@ def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
     for key in others:
         mine.pop(key, None)
     return sum(mine.values())
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """Recording of a run."""
+
+    recorded: Recorded
+
+
+class RecordFramesOp(Operator):
+    """Passes each frame unchanged and queues it for recording without blocking. Opens and closes
+    the recorder.
+
+    Inputs:
+        frame: `Frame`, after the out-of-body gate.
+
+    Outputs:
+        frame: the same `Frame`.
+
+    Params:
+        recorder: opened by `start()`, closed by `stop()`.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, recorder: SessionRecorder, **kwargs: Any) -> None:
+        self.recorder = recorder
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def start(self) -> None:
+        self.recorder.open()
+
+    def stop(self) -> None:
+        self.recorder.close()
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        self.recorder.frame(frame)
+        op_output.emit(frame, "frame")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        recorded = self.recorder.recorded
+        outcome.add(RecordingResult(recorded))
+        if recorded.frames:
+            # A note rather than an output, because the recording is outside of the published
+            # results and grows during the run.
+            outcome.note(f"{recorded.frames} frames were recorded in {recorded.folder} ({mebibytes(recorded.bytes)})")
+        for sentence in stated(recorded):
+            outcome.note(sentence)
+
+
+class RecordPreparationOp(Operator):
+    """Passes each prepared frame unchanged and queues it for recording without blocking.
+
+    Inputs:
+        frame: `Frame`, after the complete analysis.
+
+    Outputs:
+        frame: the same `Frame`.
+
+    Params:
+        recorder: opened by `RecordFramesOp`.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, recorder: SessionRecorder, **kwargs: Any) -> None:
+        self.recorder = recorder
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        self.recorder.prepared(frame)
+        op_output.emit(frame, "frame")
+
+
+class RecordPicturesOp(Operator):
+    """Queues each displayed picture for recording without blocking.
+
+    Inputs:
+        shown: `ShownPicture`.
+
+    Params:
+        recorder: opened by `RecordFramesOp`.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, recorder: SessionRecorder, **kwargs: Any) -> None:
+        self.recorder = recorder
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("shown", type=ShownPicture)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        shown: ShownPicture = op_input.receive("shown")
+        rendered = shown.rendered
+        self.recorder.shown(
+            Shown(
+                frame=rendered.frame,
+                rendered=rendered.image,
+                model_version=rendered.model_version,
+                on_screen=shown.image,
+                new=shown.new,
+                shown_ns=shown.shown_ns,
+                age_ns=shown.age_ns,
+                state=shown.state.value,
+            )
+        )

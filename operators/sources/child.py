@@ -17,9 +17,10 @@ from multiprocessing.connection import Connection
 
 from gsplat_core.errors import UserError
 from gsplat_core.scene.frames import Frame
-from operators.sources.shared_memory import SLOTS, FrameWriter
 from operators.sources.source import FrameSource
 from operators.sources.wire import (
+    SLOTS,
+    FrameWriter,
     as_contiguous,
     description_to,
     frame_header,

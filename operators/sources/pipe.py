@@ -1,5 +1,6 @@
-"""Source that reads raw frames from a pipe, such as those of `ffmpeg -f rawvideo`, `ffmpeg -f
-yuv4mpegpipe` or `gst-launch … ! fdsink`.
+"""Source that reads raw frames from a pipe, such as those of `ffmpeg -f rawvideo` or `ffmpeg -f yuv4mpegpipe`.
+
+Contains the raw pixel formats of capture programs and the headers of YUV4MPEG2.
 """
 
 from __future__ import annotations
@@ -7,20 +8,132 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
 import select
 import stat
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings.decoder import PictureConverter
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost, SourceUnavailable
 from operators.sources.address_options import PipeAddress
 from operators.sources.options import SourceOptions
-from operators.sources.raw_pictures import RawFormat
-from operators.sources.steady_clock import SteadyClock
-from operators.sources.stream import DEFAULT_FPS, StreamSource
-from operators.sources.y4m import FRAME, MOST_HEADER_BYTES, Y4mHeader
+from operators.sources.stream import DEFAULT_FPS, SteadyClock, StreamSource, check_size
+
+_CHROMA = (2, 2, 1)
+PLANES: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "rgb24": ((1, 1, 3),),
+    "bgr24": ((1, 1, 3),),
+    "rgba": ((1, 1, 4),),
+    "bgra": ((1, 1, 4),),
+    "gray": ((1, 1, 1),),
+    "yuv420p": ((1, 1, 1), _CHROMA, _CHROMA),
+    "yuvj420p": ((1, 1, 1), _CHROMA, _CHROMA),
+    "yuv422p": ((1, 1, 1), (2, 1, 1), (2, 1, 1)),
+    "yuv444p": ((1, 1, 1), (1, 1, 1), (1, 1, 1)),
+    "nv12": ((1, 1, 1), (2, 2, 2)),
+    "yuyv422": ((2, 1, 4),),
+    "uyvy422": ((2, 1, 4),),
+}
+"""Planes by FFmpeg's format name: horizontal and vertical subsampling, and bytes per element."""
+
+
+class RawFormat:
+    """Format of contiguous pictures of one size, as written by `ffmpeg -f rawvideo` and GStreamer's
+    `fdsink`.
+    """
+
+    def __init__(self, name: str, width_px: int, height_px: int) -> None:
+        """Raises InvalidSetting for an unknown format or an unusable size."""
+        if name not in PLANES:
+            raise InvalidSetting(f"format is {name!r:.60}; known are {', '.join(PLANES)}")
+        check_size("raw frames", width_px, height_px)
+        self.name, self.width_px, self.height_px = name, width_px, height_px
+        self._planes = [(-(-width_px // across) * size, -(-height_px // down)) for across, down, size in PLANES[name]]
+        self.frame_bytes = sum(row * rows for row, rows in self._planes)
+        """Size of one picture in bytes."""
+        self._converter = PictureConverter(0)
+
+    def picture(self, data: memoryview | bytes) -> NDArray[np.uint8]:
+        """Convert the bytes of one picture to a new uint8 RGB array [H, W, 3]."""
+        values = np.frombuffer(data, np.uint8, self.frame_bytes)
+        shape = self.height_px, self.width_px
+        if self.name == "rgb24":
+            return values.reshape(*shape, 3).copy()
+        if self.name == "bgr24":
+            return np.asarray(cv2.cvtColor(values.reshape(*shape, 3), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        if self.name == "gray":
+            return np.repeat(values.reshape(*shape, 1), 3, axis=2)
+        frame = av.VideoFrame(self.width_px, self.height_px, self.name)
+        begin = 0
+        for plane, (row, rows) in zip(frame.planes, self._planes, strict=True):
+            there = np.frombuffer(plane, np.uint8)  # type: ignore[call-overload]
+            lines = there[: plane.line_size * rows].reshape(rows, plane.line_size)
+            lines[:, :row] = values[begin : begin + row * rows].reshape(rows, row)
+            begin += row * rows
+        return self._converter.picture(frame)
+
+
+MAGIC = b"YUV4MPEG2"
+FRAME = b"FRAME"
+MOST_HEADER_BYTES = 1024
+_FORMATS = {
+    "420": "yuv420p",
+    "420jpeg": "yuv420p",
+    "420mpeg2": "yuv420p",
+    "420paldv": "yuv420p",
+    "422": "yuv422p",
+    "444": "yuv444p",
+    "mono": "gray",
+}
+_RATE = re.compile(r"(\d{1,9}):(\d{1,9})")
+
+
+@dataclass(frozen=True)
+class Y4mHeader:
+    """Contents of the header line."""
+
+    width_px: int
+    height_px: int
+    fps: float | None
+    format: str
+    """FFmpeg's name of the pixel format."""
+
+    @classmethod
+    def parse(cls, line: bytes) -> Y4mHeader:
+        """Parse the first line, without its line end. Raises InvalidSetting."""
+        words = line.decode("ascii", "replace").split(" ")
+        if words[0].encode() != MAGIC:
+            raise InvalidSetting(
+                f"this is no YUV4MPEG2 stream (it begins with {line[:16]!r}); for raw frames say ?size=640x512&format=rgb24"
+            )
+        said = {word[0]: word[1:] for word in reversed(words[1:]) if word and word[0] in "WHFCI"}
+        full = "XCOLORRANGE=FULL" in words
+        width, height = (said.get(side, "") for side in "WH")
+        if not (width.isdecimal() and height.isdecimal() and len(width) < 6 and len(height) < 6):
+            raise InvalidSetting(f"the header names no size: {line[:80]!r}")
+        name = _FORMATS.get(said.get("C", "420"))
+        if name is None:
+            raise InvalidSetting(
+                f"pictures of the kind C{said['C'][:20]} are not read; known are {', '.join(_FORMATS)}"
+            )
+        rate = _RATE.fullmatch(said.get("F", ""))
+        over, under = (int(part) for part in rate.groups()) if rate else (0, 0)
+        return cls(
+            int(width),
+            int(height),
+            over / under if over and under else None,
+            "yuvj420p" if full and name == "yuv420p" else name,
+        )
+
 
 LOOK_S = 0.05
 HEADER_TIMEOUT_S = 30.0

@@ -14,10 +14,10 @@ from typing import cast, get_args
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
+from operators.sources.address import UrlAddress
 from operators.sources.address_options import PARSERS
 from operators.sources.options import SourceOptions, StereoLayout
 from operators.sources.source import FrameSource
-from operators.sources.url_address import UrlAddress
 
 __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "check_address", "open_source", "split_address"]
 
@@ -32,7 +32,7 @@ SOURCES: Registry[SourceFactory] = Registry(
     "source",
     {
         "recording": "operators.sources.recording:recording_source",
-        "realtime": "operators.sources.realtime:realtime_source",
+        "realtime": "operators.sources.recording:realtime_source",
         "pipe": "operators.sources.pipe:pipe_source",
         "zmq+tcp": "operators.sources.zeromq:tcp_source",
         "zmq+ipc": "operators.sources.zeromq:ipc_source",

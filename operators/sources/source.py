@@ -1,12 +1,18 @@
-"""Protocol of frame sources, finite or endless."""
+"""Protocol of frame sources, finite or endless, with a base class of sources that read in a separate thread."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
 
+from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
@@ -107,3 +113,138 @@ class ReportingSource(Protocol):
     def state_sentence(self) -> str:
         """State of the source as a sentence without secrets."""
         ...
+
+
+log = logging.getLogger(__name__)
+
+
+class ThreadedSource:
+    """`FrameSource` made from an iterator. A subclass provides `description` and `frames()`.
+
+    The iterator runs in a daemon thread, at most `ahead` frames ahead of `read`, without dropping
+    frames. Its exception is raised by `read` after all earlier frames. It is closed in that thread.
+    """
+
+    description: SourceDescription
+    close_timeout_s = 10.0
+    """Maximum waiting time of `close` for a reader that blocks in a library, in seconds."""
+
+    def __init__(self, *, ahead: int = 2, stalled_after_s: float = math.inf) -> None:
+        """Set the queue's parameters.
+
+        Args:
+            ahead: capacity of the queue for `read`, in frames.
+            stalled_after_s: time without a frame until the state is `STALLED`, in seconds.
+
+        Raises:
+            InvalidInput: `ahead` is less than 1.
+        """
+        if ahead < 1:
+            raise InvalidInput(f"ahead is {ahead}; it must be at least 1")
+        self._ahead = ahead
+        self._stalled_after_s = stalled_after_s
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._ready: deque[Frame] = deque()
+        self._done = True
+        self._error: BaseException | None = None
+        self._last_s = 0.0
+
+    def frames(self) -> Iterator[Frame]:
+        """Return the frames from the beginning. Called in the reader's thread, once per `open`."""
+        raise NotImplementedError(f"{type(self).__name__} has no frames method")
+
+    @property
+    def state(self) -> SourceState:
+        """See `FrameSource`."""
+        with self._changed:
+            if self._ready:
+                return SourceState.LIVE
+            if self._done:
+                return SourceState.ENDED
+            late = time.monotonic() - self._last_s > self._stalled_after_s
+            return SourceState.STALLED if late else SourceState.LIVE
+
+    def open(self) -> None:
+        """Start reading. After `close` it restarts with the first frame."""
+        if self._thread is not None:
+            return
+        # A reader that outlived `close` keeps its own event, so it never writes into a later run's
+        # queue.
+        self._stop = threading.Event()
+        self._ready.clear()
+        self._done, self._error, self._last_s = False, None, time.monotonic()
+        name = f"read {self.description.name}"
+        self._thread = threading.Thread(target=self._run, args=(self._stop,), name=name, daemon=True)
+        self._thread.start()
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `FrameSource`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ready or self._done, timeout_s)
+            if self._ready:
+                frame = self._ready.popleft()
+                self._changed.notify_all()
+                return frame
+            error, self._error = self._error, None
+        if error is not None:
+            raise error
+        return None
+
+    def close(self) -> None:
+        """See `FrameSource`."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        with self._changed:
+            self._stop.set()
+            self._changed.notify_all()
+        self.interrupt()
+        thread.join(self.close_timeout_s)
+        if thread.is_alive():
+            log.warning("%s does not end; it is left behind", thread.name)
+        with self._changed:
+            self._ready.clear()
+            self._done, self._error = True, None
+
+    def interrupt(self) -> None:
+        """Make a blocked `frames()` return soon. Called by `close` from another thread."""
+
+    def _ended(self, error: BaseException | None) -> None:
+        """Handle the end of the iterator; `error` is its exception or None. Called once per
+        reading, with the lock.
+        """
+
+    def _run(self, stop: threading.Event) -> None:
+        """Main function of the reader's thread."""
+        error: BaseException | None = None
+        try:
+            frames = self.frames()
+            try:
+                for frame in frames:
+                    if not self._put(frame, stop):
+                        break
+            finally:
+                # Closing a generator also closes its files.
+                close = getattr(frames, "close", None)
+                if close is not None:
+                    close()
+        except BaseException as raised:  # noqa: BLE001 - carried to the thread that calls read
+            error = raised
+        with self._changed:
+            if not stop.is_set():
+                self._done, self._error = True, error
+                self._ended(error)
+                self._changed.notify_all()
+
+    def _put(self, frame: Frame, stop: threading.Event) -> bool:
+        """Wait for space and append the frame. Return False when the source is being closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: stop.is_set() or len(self._ready) < self._ahead)
+            if stop.is_set():
+                return False
+            self._ready.append(frame)
+            self._last_s = time.monotonic()
+            self._changed.notify_all()
+            return True

@@ -9,7 +9,7 @@ from gsplat_core.io.recordings.synthetic.kept import kept_recording
 from gsplat_core.io.recordings.synthetic.rendered import Asked
 from operators.sources.address_options import SyntheticAddress
 from operators.sources.options import SourceOptions
-from operators.sources.realtime import RealtimeSource
+from operators.sources.recording import RealtimeSource
 
 log = logging.getLogger(__name__)
 DEFAULT_FRAMES = 48

@@ -1,19 +1,197 @@
-"""Network streams: RTSP and other URLs that PyAV can open."""
+"""Network streams: RTSP and other URLs that PyAV can open. PyAV decodes packets, and damaged pictures are marked."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import partial
 
-from gsplat_core.scene.frames import Frame
+import av
+
+from gsplat_core.io.recordings.decoder import PictureConverter, PictureDecoder, captured_log, frame_rate
+from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
+from operators.sources.address import UrlAddress
 from operators.sources.backoff import Backoff
-from operators.sources.connection import Connection, ConnectionFailed, Place
 from operators.sources.options import SourceOptions
 from operators.sources.stream import StreamSource
-from operators.sources.url_address import UrlAddress
+
+KEPT_PACKETS = 256
+"""Maximum number of packets in flight in the decoder."""
+WHOLE_PICTURES = frozenset({"rawvideo", "wrapped_avframe", "mjpeg"})
+"""Codecs in which every packet is a complete picture, even if not marked as a key frame."""
+PACKETS_WITHOUT_KEY = 300
+"""Number of packets without a key frame after which decoding starts without one."""
+
+
+class ConnectionFailed(Exception):
+    """The connection failed. The message never contains the address, which may include a
+    password.
+    """
+
+
+@dataclass(frozen=True)
+class Place:
+    """Address and parameters of a stream."""
+
+    url: str
+    options: Mapping[str, str]
+    format: str | None = None
+    """FFmpeg's name of the demuxer or device; None to detect it from the data."""
+    open_s: float = 10.0
+    read_s: float = 5.0
+    """Timeouts in seconds for opening the stream and for the next packet."""
+
+
+class Connection:
+    """An open stream. Raises ConnectionFailed if it cannot be opened or has no picture of a usable
+    size.
+    """
+
+    def __init__(self, place: Place) -> None:
+        self._container: av.container.InputContainer | None = None
+        try:
+            with captured_log():
+                self._container = av.open(
+                    place.url,
+                    mode="r",
+                    format=place.format,
+                    options=dict(place.options),
+                    metadata_errors="replace",
+                    timeout=(place.open_s, place.read_s),
+                )
+        except (av.FFmpegError, OSError, ValueError) as error:
+            raise ConnectionFailed(_words(error)) from None  # the original error contains the address with its password
+        try:
+            self._look()
+        except ConnectionFailed:
+            self.close()
+            raise
+
+    def _look(self) -> None:
+        assert self._container is not None
+        if not self._container.streams.video:
+            raise ConnectionFailed("there is no video in it")
+        stream = self._container.streams.video[0]
+        width_px, height_px = stream.codec_context.width, stream.codec_context.height
+        if width_px < 1 or height_px < 1:
+            raise ConnectionFailed("no picture came while it was looked at")
+        if width_px * height_px > MAX_PIXELS:
+            raise ConnectionFailed(f"its pictures of {width_px}x{height_px} px are larger than {MAX_PIXELS} pixels")
+        self._stream = stream
+        self.size = width_px, height_px
+        self.fps = frame_rate(stream) or None
+        self.has_an_end = bool(self._container.duration and self._container.duration > 0)
+        """True if the stream states its duration. Its end is then regular, otherwise a lost
+        connection.
+        """
+        try:
+            self._decoder, self._converter = PictureDecoder(stream, probe=False), PictureConverter(0)
+        except (av.FFmpegError, ValueError) as error:
+            raise ConnectionFailed(f"its pictures cannot be decoded: {_words(error)}") from None
+        self.skipped = 0
+        """Number of packets before the first key frame, which cannot be decoded."""
+
+    def pictures(self) -> Iterator[Frame]:
+        """Yield the pictures with the arrival times of their packets. Raises ConnectionFailed."""
+        damage = StreamDamage()
+        came: dict[int, int] = {}
+        tick = self._stream.time_base or Fraction(1, 90_000)
+        number = seq = 0
+        began = alone = self._stream.codec_context.name in WHOLE_PICTURES
+        for packet in self._packets():
+            if packet is not None and not began:
+                began = packet.is_keyframe or self.skipped >= PACKETS_WITHOUT_KEY
+                if not began:
+                    self.skipped += 1
+                    continue
+            if packet is not None:
+                came[number] = time.monotonic_ns()
+                came.pop(number - KEPT_PACKETS, None)
+                damage.saw(number, alone or packet.is_keyframe)
+            for own, decoded in self._decoder.decode(packet, number, shown=True):
+                damage.doubt(self._decoder.doubts)
+                if decoded.width * decoded.height > MAX_PIXELS:
+                    raise ConnectionFailed(f"a picture of {decoded.width}x{decoded.height} px is too large")
+                arrived_ns = came.get(own, time.monotonic_ns())
+                pts_ns = None if decoded.pts is None else round(decoded.pts * tick * 1_000_000_000)
+                why, image = damage.of(own), self._converter.picture(decoded)
+                yield Frame(
+                    seq=seq,
+                    pts_ns=arrived_ns if pts_ns is None or abs(pts_ns) > 2**62 else pts_ns,
+                    image=image,
+                    arrived_ns=arrived_ns,
+                    status=FrameStatus.LIVE if why is None else FrameStatus.DAMAGED,
+                    damage=why,
+                )
+                seq += 1
+            damage.doubt(self._decoder.doubts)
+            number += packet is not None
+
+    def _packets(self) -> Iterator[av.Packet | None]:
+        """Yield the packets of the stream, then None at its end."""
+        assert self._container is not None
+        packets = self._container.demux(self._stream)
+        while True:
+            try:
+                with captured_log():
+                    packet = next(packets, None)
+            except (av.FFmpegError, OSError) as error:
+                raise ConnectionFailed(_words(error)) from None
+            if packet is None:
+                return
+            if packet.size:
+                yield packet
+            elif packet.dts is None:  # PyAV's end marker
+                yield None
+                return
+
+    def close(self) -> None:
+        """Close the connection. Idempotent."""
+        container, self._container = self._container, None
+        if container is not None:
+            container.close()
+
+
+class StreamDamage:
+    """Damage of pictures: suspicious ones, and those predicted from them up to the next key
+    frame.
+    """
+
+    def __init__(self) -> None:
+        self._keys: list[int] = []
+        self._own: dict[int, str] = {}
+
+    def saw(self, number: int, is_key: bool) -> None:
+        """Record a packet before it is decoded."""
+        if is_key:
+            self._keys = [*self._keys[-3:], number]
+        if len(self._own) > KEPT_PACKETS:
+            newest = max(self._own)
+            self._own = {newest: self._own[newest]}
+
+    def doubt(self, doubts: dict[int, str]) -> None:
+        """Take over the decoder's doubts, by packet number, and clear them."""
+        self._own.update(doubts)
+        doubts.clear()
+
+    def of(self, number: int) -> str | None:
+        """Return the damage of a packet's picture; None if it is intact."""
+        if number in self._own:
+            return self._own[number]
+        key = max((key for key in self._keys if key <= number), default=0)
+        return DEPENDS if any(key <= own < number for own in self._own) else None
+
+
+def _words(error: Exception) -> str:
+    """Return an error's text without the address that it contains."""
+    if isinstance(error, av.error.ExitError):
+        return "nothing came in time"
+    return str(getattr(error, "strerror", None) or type(error).__name__)
+
 
 FRESH_S = 1.0
 """Age in seconds at which an idle connection is replaced before reading, because its data are

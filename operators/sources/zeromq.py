@@ -18,8 +18,7 @@ from operators.errors import SourceUnavailable
 from operators.sources.address_options import OPEN_S, ZeroMqAddress
 from operators.sources.options import SourceOptions
 from operators.sources.stream import StreamSource
-from operators.sources.zeromq_address import connected, keys_from, require_encryption
-from operators.sources.zeromq_message import MOST_BYTES, BadMessage, unpacked
+from operators.sources.zeromq_message import MOST_BYTES, BadMessage, connected, keys_from, require_encryption, unpacked
 
 LOOK_MS = 50
 NEW_SOCKET_S = 2.0

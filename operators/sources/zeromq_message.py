@@ -1,27 +1,95 @@
-"""Binary format of one frame as one ZeroMQ message: a fixed header, then contiguous arrays.
+"""Frames as ZeroMQ messages, and a publisher of them for readers with `zmq+tcp://…` or `zmq+ipc://…`.
 
-| bytes | type | content |
-|---|---|---|
-| 0-3 | `ISPF` | |
-| 4-5 | uint16 | version, 1 |
-| 6-7 | uint16 | arrays after the image, as bits: 1 right image, 2 depth, 4 mask, 8 pose |
-| 8-11, 12-15 | uint32 | width and height in pixels |
-| 16-23 | uint64 | sequence number |
-| 24-31 | int64 | presentation timestamp in nanoseconds |
-| 32- | | arrays in the order below |
+One frame is one message: a fixed header, then contiguous arrays. Connections to other machines must be encrypted (CURVE).
 
-The arrays are image uint8 [H, W, 3] RGB, right image of the same form, depth float32 [H, W] in mm,
-mask uint8 [H, W], and pose float64 [4, 4] world to camera. All values are little-endian. Decoding
-never unpickles data.
+Binary format of one frame as one ZeroMQ message: a fixed header, then contiguous arrays.
+
+| bytes | type | content | |---|---|---| | 0-3 | `ISPF` | | | 4-5 | uint16 | version, 1 | | 6-7 | uint16 | arrays
+after the image, as bits: 1 right image, 2 depth, 4 mask, 8 pose | | 8-11, 12-15 | uint32 | width and height in pixels
+| | 16-23 | uint64 | sequence number | | 24-31 | int64 | presentation timestamp in nanoseconds | | 32- | | arrays in
+the order below |
+
+The arrays are image uint8 [H, W, 3] RGB, right image of the same form, depth float32 [H, W] in mm, mask uint8 [H, W],
+and pose float64 [4, 4] world to camera. All values are little-endian. Decoding never unpickles data.
 """
 
 from __future__ import annotations
 
+import ipaddress
+import os
 import struct
 from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any
 
 import numpy as np
+import zmq
+import zmq.auth
 from numpy.typing import NDArray
+from zmq.auth.thread import ThreadAuthenticator
+
+from gsplat_core.errors import InvalidSetting
+
+
+def is_of_this_machine(endpoint: str) -> bool:
+    """Return True if the endpoint is on this machine."""
+    scheme, _, place = endpoint.partition("://")
+    if scheme == "ipc":
+        return True
+    host = place.rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def require_encryption(endpoint: str, encrypted: bool) -> None:
+    """Raise InvalidSetting for an unencrypted endpoint on another machine."""
+    if not encrypted and not is_of_this_machine(endpoint):
+        raise InvalidSetting(
+            f"{endpoint} leads to another machine, and patients' pictures do not go over a network in the clear; give keys "
+            "(docs/sources.md, ZeroMQ), or stay on 127.0.0.1"
+        )
+
+
+def keys_from(path: str) -> tuple[bytes, bytes | None]:
+    """Return public and secret key of a certificate file of `zmq.auth.create_certificates`. Raises
+    InvalidSetting.
+    """
+    try:
+        return zmq.auth.load_certificate(os.fspath(path))
+    except (OSError, ValueError) as error:
+        raise InvalidSetting(f"{path} is no certificate of ZeroMQ: {error}") from None
+
+
+def connected(kind: int, endpoint: str, *, bind: bool, options: dict[int, Any]) -> tuple[zmq.Context, zmq.Socket]:
+    """Create a socket in a new context and bind or connect it.
+
+    Args:
+        kind: ZeroMQ's socket type.
+        endpoint: ZeroMQ endpoint.
+        bind: bind the socket; otherwise connect it.
+        options: socket options.
+
+    Raises:
+        InvalidSetting: the endpoint or an option is invalid.
+    """
+    context = zmq.Context()
+    socket = context.socket(kind)
+    try:
+        socket.setsockopt(zmq.LINGER, 0)
+        for option, value in options.items():
+            socket.setsockopt(option, value)
+        if bind:
+            socket.bind(endpoint)
+        else:
+            socket.connect(endpoint)
+    except (zmq.ZMQError, ValueError) as error:
+        socket.close()
+        context.term()
+        raise InvalidSetting(f"{endpoint} cannot be used: {error}") from None
+    return context, socket
+
 
 MAGIC, VERSION = b"ISPF", 1
 HEADER = struct.Struct("<4sHHIIQq")
@@ -156,3 +224,73 @@ def _shape(values: int, width_px: int, height_px: int) -> tuple[int, ...]:
     if values == 0:
         return 4, 4
     return (height_px, width_px) if values == 1 else (height_px, width_px, values)
+
+
+class FramePublisher:
+    """Publishes frames at an endpoint to any number of readers. A slow reader loses the oldest
+    frames.
+
+        with FramePublisher("tcp://127.0.0.1:5555") as publisher:
+            publisher.publish(image, pts_ns=time.time_ns())
+
+    A remote endpoint requires `certificate`, the secret key file of `zmq.auth.create_certificates`.
+    `clients` is a folder with the public keys of permitted readers. Without it any reader that has
+    the publisher's public key is permitted.
+    """
+
+    def __init__(self, endpoint: str, *, certificate: str | None = None, clients: str | None = None) -> None:
+        """Bind the endpoint. Raises InvalidSetting for an unusable endpoint or keys.
+
+        Args:
+            endpoint: ZeroMQ endpoint.
+            certificate: file with the secret key; None for no encryption.
+            clients: folder with public keys of permitted readers; None for any reader.
+        """
+        require_encryption(endpoint, certificate is not None)
+        options: dict[int, object] = {zmq.SNDHWM: 2}
+        self._authenticator: ThreadAuthenticator | None = None
+        if certificate is not None:
+            public, secret = keys_from(certificate)
+            if secret is None:
+                raise InvalidSetting(f"{certificate} has no secret key; give the file that ends in .key_secret")
+            options |= {zmq.CURVE_SERVER: 1, zmq.CURVE_PUBLICKEY: public, zmq.CURVE_SECRETKEY: secret}
+        self._context, self._socket = connected(zmq.PUB, endpoint, bind=True, options=options)
+        if certificate is not None:
+            self._authenticator = ThreadAuthenticator(self._context)
+            self._authenticator.start()
+            self._authenticator.configure_curve(domain="*", location=clients or zmq.auth.CURVE_ALLOW_ANY)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        """Bound endpoint, with the actual port for `tcp://…:*`."""
+        self._seq = 0
+
+    def publish(self, image: NDArray, *, pts_ns: int, seq: int | None = None, **arrays: NDArray | None) -> None:
+        """Send one frame.
+
+        Args:
+            image: uint8 RGB [H, W, 3].
+            pts_ns: timestamp in nanoseconds.
+            seq: sequence number; None for the next one.
+            arrays: any of `right_image`, `depth`, `mask` and `pose`, as in `Frame`.
+
+        Raises:
+            ValueError: shapes do not match, or the picture is too large.
+        """
+        seq = self._seq if seq is None else seq
+        self._seq = seq + 1
+        given = {name: array for name, array in arrays.items() if array is not None}
+        self._socket.send(packed(seq, pts_ns, {"image": image, **given}))
+
+    def close(self) -> None:
+        """Close the socket and stop the authenticator."""
+        if self._authenticator is not None:
+            self._authenticator.stop()
+        self._socket.close()
+        self._context.term()
+
+    def __enter__(self) -> FramePublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -75,11 +75,11 @@ def print_found(
 
 
 def check_download(file: Path, overwrite: bool) -> None:
-    """Check the target of a download; see `operators.output_paths.check_file_path`.
+    """Check the target of a download; see `operators.output_folder.check_file_path`.
 
     Raises:
         OutputError: if the file must not be written.
     """
-    from operators.output_paths import check_file_path
+    from operators.output_folder import check_file_path
 
     check_file_path(file, overwrite=overwrite)

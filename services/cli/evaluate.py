@@ -11,8 +11,7 @@ import typer
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.protocols import Visits
 from gsplat_core.plain_numbers import plain_float
-from operators.applications.evaluate import evaluate
-from operators.applications.evaluation import EvaluationSettings
+from operators.applications.evaluate import EvaluationSettings, evaluate
 from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest

@@ -11,7 +11,7 @@ from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
 from gsplat_core.io.model_sources import load_model
 from operators.errors import OutputError
-from operators.output_paths import check_file_path
+from operators.output_folder import check_file_path
 from services.cli.exit_codes import OK
 
 

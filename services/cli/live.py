@@ -20,7 +20,7 @@ from gsplat_core.io.sessions import WriterOptions
 from operators.applications.live import LiveApplication, live
 from operators.applications.live_settings import LiveSettings
 from operators.applications.recording import new_recording_folder
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
 from operators.metrics import ScoredFrame
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest

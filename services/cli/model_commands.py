@@ -45,7 +45,7 @@ def render(
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
-    from operators.applications.views import ViewWish
+    from operators.applications.render import ViewWish
     from services.cli.render import render_command
 
     chosen = {"scale": scale, "device": device, "renderer": renderer, "view": ViewWish(view, baseline)}

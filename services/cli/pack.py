@@ -12,7 +12,7 @@ from gsplat_core.errors import BundleError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.manifest import parse_manifest
 from operators.errors import OutputError
-from operators.output_paths import check_file_path
+from operators.output_folder import check_file_path
 from services.cli.exit_codes import OK
 from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack
 

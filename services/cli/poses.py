@@ -18,7 +18,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.progress import Progress
 from operators.errors import OutputError
-from operators.output_paths import check_file_path
+from operators.output_folder import check_file_path
 from operators.storage import storage_errors
 from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import typer
 
-from operators.applications.delivery import Report
 from operators.applications.progress import ProgressCallback
-from operators.applications.result import RunOutcome
+from operators.applications.session import Report, RunOutcome
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter

@@ -10,7 +10,7 @@ import typer
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from operators.applications.progress import Progress
-from operators.output_paths import check_folder_path
+from operators.output_folder import check_folder_path
 from operators.storage import storage_errors
 from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest

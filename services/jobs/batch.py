@@ -17,8 +17,7 @@ from gsplat_core.io.files import PartialFile, open_regular, read_regular
 from gsplat_core.io.recordings.calibration import POSES_FILE
 from gsplat_core.io.recordings.layouts import split_eyes
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES
-from operators.output_folder import is_whole_output
-from operators.output_paths import BATCH_DATABASE, DESCRIPTIONS
+from operators.output_folder import BATCH_DATABASE, DESCRIPTIONS, is_whole_output
 from operators.settings import JobOptions
 from operators.storage import storage_errors
 from services.jobs.pool import JobPool, PoolSettings

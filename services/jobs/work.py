@@ -13,7 +13,7 @@ import torch
 
 from operators.applications.progress import Progress
 from operators.applications.replay import ReplaySettings, replay
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
 from services.cli.exit_codes import user_sentence
 from services.jobs.records import JobProgress, JobState
 from services.jobs.task import Task

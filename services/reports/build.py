@@ -10,14 +10,12 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.evaluation.depth import DepthShare
 from gsplat_core.training.metrics import QualityTracker
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
 from operators.display import LiveDisplayResult
-from operators.frame_log import Entry
+from operators.frame_log import LogLine
 from operators.ingest import SourceResult
-from operators.live_reconstruct import TrainingCounts
-from operators.metrics import NextFrameResult, QualityResult
-from operators.on_screen import OnScreenResult
-from operators.reconstruct import ModelResult, TrainedEyes
+from operators.metrics import NextFrameResult, OnScreenResult, QualityResult
+from operators.reconstruct import ModelResult, TrainedEyes, TrainingCounts
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
@@ -102,7 +100,7 @@ def displayed(outcome: RunOutcome) -> int:
     return quality.frames if isinstance(quality, QualityResult) else 0
 
 
-def _entry(entry: Entry, kind: type[FrameEntry]) -> FrameEntry:
+def _entry(entry: LogLine, kind: type[FrameEntry]) -> FrameEntry:
     return kind.model_validate({name: value for name, value in entry.items() if name in kind.model_fields})
 
 

@@ -19,9 +19,9 @@ from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.protocols import PlaceScore
 from gsplat_core.evaluation.views import MATCHED, RIGHT_BEFORE, SHIFTED, SecondEye
 from gsplat_core.scene.model import Model
+from operators.applications.evaluate import Evaluation, EvaluationSettings
 from operators.applications.evaluated import EvaluatedRun
-from operators.applications.evaluation import Evaluation, EvaluationSettings
-from operators.frame_log import MAX_SERIES, Entry, frames_per_entry, read_frames, series
+from operators.frame_log import MAX_SERIES, LogLine, frames_per_entry, read_frames, series
 from services.reports.evaluation_html import write_evaluation_html
 from services.reports.evaluation_schema import (
     BaselineFacts,
@@ -195,5 +195,5 @@ def _lines(log: Path) -> int:
     return sum(1 for _ in read_frames(log))
 
 
-def _series(log: Path, per_entry: int) -> list[Entry]:
+def _series(log: Path, per_entry: int) -> list[LogLine]:
     return list(series(read_frames(log), per_entry))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
+from operators.checks import StageCounts
 from operators.display import LiveDisplayResult
-from operators.endoscope.stage import StageCounts
-from operators.live_reconstruct import TrainingCounts
-from operators.on_screen import OnScreenResult
+from operators.metrics import OnScreenResult
+from operators.reconstruct import TrainingCounts
 from services.reports.schema import LiveFacts
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
 from operators.errors import NothingShown
 from operators.ingest import SourceResult
-from operators.live_reconstruct import TrainingCounts
 from operators.out_of_body import WITHHELD as OUT_OF_BODY
 from operators.out_of_body import OutOfBodyFrames
+from operators.reconstruct import TrainingCounts
 from services.reports.build import displayed
 
 CHECK_PICTURE = "check what the source sends"

@@ -13,12 +13,10 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceUnavailable
-from operators.sources.live import LiveSource
-from operators.sources.order import FrameOrder
+from operators.sources.live import FrameOrder, LiveSource
 from operators.sources.scaled import scaled_description
-from operators.sources.shared_memory import BadHeader
 from operators.sources.source import SourceDescription, SourceState
-from operators.sources.wire import description_from, frame_from
+from operators.sources.wire import BadHeader, description_from, frame_from
 from operators.sources.zeromq_message import BadMessage as BadFrame
 from operators.sources.zeromq_message import unpacked_pieces
 from services.bus.commands import ask

@@ -16,12 +16,10 @@ from gsplat_core.errors import UserError
 from gsplat_core.rendering.registry import check_renderer
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture
-from operators.applications.live import LiveApplication, measured_size
+from operators.applications.live import LiveApplication, LiveParts, low_latency, measured_size, new_parts, warm_up
 from operators.applications.live_settings import LiveSettings
-from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
 from operators.applications.session import Session
-from operators.applications.trial_run import trial_run
-from operators.applications.working_size import WorkingSize
+from operators.applications.working_size import WorkingSize, trial_run
 from operators.errors import SourceUnavailable
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame

@@ -45,7 +45,7 @@ from services.supervisor.process_end import ended_how
 log = logging.getLogger(__name__)
 LOADED = (
     "operators.sources.process",
-    "operators.sources.realtime",
+    "operators.sources.recording",
     "operators.sources.synthetic",
     "operators.sources.zeromq",
 )

@@ -15,7 +15,7 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import StagedCopies
 from operators.applications.live import LiveApplication
-from operators.live_reconstruct import LiveReconstructOp
+from operators.reconstruct import LiveReconstructOp
 from services.bus.commands import text_of
 from services.bus.errors import CommandRefused
 

@@ -17,8 +17,7 @@ import zmq
 
 from operators.sources import zeromq_message
 from operators.sources.registry import SourceOptions, open_source
-from operators.sources.shared_memory import BadHeader, FrameReader, FrameWriter, new_memory
-from operators.sources.wire import description_from, frame_from, parsed
+from operators.sources.wire import BadHeader, FrameReader, FrameWriter, description_from, frame_from, new_memory, parsed
 from operators.sources.zeromq_message import HEADER, BadMessage, packed, unpacked
 
 GOOD = packed(1, 2, {"image": np.full((4, 6, 3), 5, np.uint8)})

@@ -18,8 +18,7 @@ from gsplat_core.io.recordings import open_recording, validate_recording
 from gsplat_core.io.recordings.packets import whole_clusters
 from gsplat_core.io.sessions import SessionReader, SessionWriter
 from gsplat_core.scene.frames import FrameStatus
-from operators.applications.replay import ReplaySettings
-from operators.applications.session_replay import followed_session
+from operators.applications.replay import ReplaySettings, followed_session
 from tests.gsplat_core.io.sessions.made import new_frame, same_frame, session_info, write_frames
 
 FRAMES = 5

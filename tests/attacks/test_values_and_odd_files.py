@@ -14,7 +14,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io import files
 from gsplat_core.io.files import open_regular, read_regular
 from operators.errors import OutputError
-from operators.output_paths import check_folder_path
+from operators.output_folder import check_folder_path
 from services.audit import AuditLog
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT

@@ -7,8 +7,8 @@ import torch
 
 from gsplat_core.deformation import BasisField
 from gsplat_core.scene.model import Model
-from operators.deform import DeformOp
 from operators.messages import Reconstruction
+from operators.rasterize import DeformOp
 
 
 def test_the_gaussians_are_those_of_the_frames_time(frame, model, camera, compute):

@@ -16,8 +16,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.placement import LateDepth
-from operators.depth import FoundDepth
-from operators.depth_beside import FEW_CORES, DepthBeside, DepthBesideOp, share_of
+from operators.depth import FEW_CORES, DepthBeside, DepthBesideOp, FoundDepth, share_of
 from operators.outcome import OutcomeBuilder
 
 CAMERA = Camera.from_focal(30.0, 24, 16)
@@ -182,11 +181,11 @@ def test_depth_rests_three_times_as_long_as_it_works_where_cores_are_few(
     estimator, frame, monkeypatch, cores, rest_s, binds
 ):
     bound, rested, clock = [], [], iter(range(1000))
-    monkeypatch.setattr("operators.depth_beside.usable_cores", lambda: cores)
-    monkeypatch.setattr("operators.depth_beside.use_one_thread", lambda: bound.append(True))
+    monkeypatch.setattr("operators.depth.usable_cores", lambda: cores)
+    monkeypatch.setattr("operators.depth.use_one_thread", lambda: bound.append(True))
     beside = DepthBeside("gated", CAMERA)
     monkeypatch.setattr(beside, "_rest", rested.append)
-    monkeypatch.setattr("operators.depth_beside.time", SimpleNamespace(thread_time=lambda: 0.2 * next(clock)))
+    monkeypatch.setattr("operators.depth.time", SimpleNamespace(thread_time=lambda: 0.2 * next(clock)))
     estimator.gate.release(10)
     beside.start()
     beside.offer(frame(0))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from operators.late_depth import LateDepths, TakenDepth
+from operators.depth import LateDepths, TakenDepth
 from operators.outcome import OutcomeBuilder
 
 

@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from gsplat_core.scene.frames import FrameStatus
+from operators.depth import TakenDepth
 from operators.frame_clock import ClockSettings, FrameClock
-from operators.late_depth import TakenDepth
-from operators.live_reconstruct import GROWN_AT_LATEST, LiveReconstructOp
 from operators.outcome import OutcomeBuilder
-from operators.reconstruct import ModelResult
+from operators.reconstruct import GROWN_AT_LATEST, LiveReconstructOp, ModelResult
 
 
 class FakeReconstructor:

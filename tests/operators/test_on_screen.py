@@ -11,8 +11,7 @@ from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.frame_log import FrameLog, read_frames
 from operators.messages import PictureState, Prediction, ShownPicture
-from operators.metrics import NextFrameResult, QualityResult
-from operators.on_screen import PREDICTIONS_KEPT, OnScreenMetricsOp, OnScreenResult
+from operators.metrics import PREDICTIONS_KEPT, NextFrameResult, OnScreenMetricsOp, OnScreenResult, QualityResult
 from operators.outcome import OutcomeBuilder
 
 MS = 1_000_000

@@ -14,9 +14,7 @@ import pytest
 
 from operators import output_folder
 from operators.errors import OutputError, OutputFolderInUse
-from operators.folder_lock import LOCK
-from operators.output_folder import OutputFolder, check_output_folder
-from operators.output_paths import MARKER
+from operators.output_folder import LOCK, MARKER, OutputFolder, check_output_folder
 
 
 def deliver(folder, made_by="replay", **files):

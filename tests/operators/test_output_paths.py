@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from operators.errors import OutputError
-from operators.output_folder import OutputFolder
-from operators.output_paths import check_file_path, check_folder_path
+from operators.output_folder import OutputFolder, check_file_path, check_folder_path
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from gsplat_core.io.exports.export import TIMES_FILE
 from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.ply import MARK_LINE
 from gsplat_core.io.recordings.calibration import TRAILER
-from operators.own_files import is_own_file
+from operators.output_folder import is_own_file
 from operators.sinks.video_file import VideoFile
 
 

@@ -15,8 +15,7 @@ from gsplat_core.io.recordings import synthesize
 from gsplat_core.scene.frames import Frame
 from operators.applications.device import scheduler_for
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.result import RunOutcome, RunSettings
-from operators.applications.session import Session
+from operators.applications.session import RunOutcome, RunSettings, Session
 from operators.errors import RunFailed, StorageFull
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp, SourceResult

@@ -17,8 +17,7 @@ from operators.applications.replay import ReplaySettings, replay
 from operators.ingest import SourceResult
 from operators.metrics import QualityResult
 from operators.sources.registry import SOURCES, SourceOptions
-from operators.sources.source import SourceDescription
-from operators.sources.threaded import ThreadedSource
+from operators.sources.source import SourceDescription, ThreadedSource
 
 
 class PatternSource(ThreadedSource):

@@ -21,7 +21,7 @@ from operators.applications import live as live_module
 from operators.applications.live_settings import LiveSettings
 from operators.errors import RunFailed, SourceLost
 from operators.frame_log import read_frames
-from operators.sources.realtime import RealtimeSource, play
+from operators.sources.recording import RealtimeSource, play
 from operators.storage import STAGING_PREFIX
 from services.cli.exit_codes import user_sentence
 from services.reports.schema import RunReport

@@ -204,7 +204,7 @@ class Shown:
 
 
 class SessionWriter:
-    """Synchronous writer of a session folder; `operators.sinks.recorder` runs it in a thread.
+    """Synchronous writer of a session folder; `operators.sinks.session_recorder` runs it in a thread.
 
     The files are readable at any moment, even after a crash, except for the last one or two
     pictures. If the disk rejects a write, methods raise OSError or av.FFmpegError; call `abandon`

@@ -12,11 +12,10 @@ import numpy as np
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.applications.result import RunOutcome
-from operators.applications.trial_run import made_up_tissue
-from operators.live_reconstruct import TrainingCounts
+from operators.applications.session import RunOutcome
+from operators.applications.working_size import made_up_tissue
 from operators.messages import PictureState, ShownPicture
-from operators.schedule import ScheduleEvent
+from operators.reconstruct import ScheduleEvent, TrainingCounts
 from operators.sources.live import LiveSource
 from operators.sources.source import SourceDescription
 

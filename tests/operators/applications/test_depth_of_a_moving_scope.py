@@ -15,7 +15,7 @@ from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import write_poses
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
 from operators.depth import FoundDepth
 from tests.gsplat_core.geometry.moving_scope import FOCAL, HEIGHT, SIDEWAYS, WIDTH, video
 

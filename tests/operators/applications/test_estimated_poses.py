@@ -11,17 +11,15 @@ import pytest
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
-from operators.applications.live import LiveApplication
+from operators.applications.live import LiveApplication, warm_up
 from operators.applications.live_settings import LiveSettings
-from operators.applications.live_start import warm_up
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Session
 from operators.compare_shown import ShownComparison
 from operators.metrics import QualityResult
 from operators.pose import EstimatedPoses
-from operators.sinks.recorder import RecordingResult
-from operators.sources.source import SourceDescription
-from operators.sources.threaded import ThreadedSource
+from operators.sinks.session_recorder import RecordingResult
+from operators.sources.source import SourceDescription, ThreadedSource
 from tests.operators.applications.test_depth_of_a_moving_scope import clip  # noqa: F401 - a fixture
 
 FRAMES = 10

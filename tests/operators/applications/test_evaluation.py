@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.applications.evaluation import EvaluationSettings
+from operators.applications.evaluate import EvaluationSettings
 
 
 @pytest.mark.parametrize(

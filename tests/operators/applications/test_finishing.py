@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from operators.applications import finishing
-from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
+from operators.applications import session as session_module
+from operators.applications.session import FirstFrames, measures_baselines, saves_model
 from operators.metrics import QualityResult
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult
@@ -63,7 +63,7 @@ def test_the_first_frames_are_read_each_time_from_the_beginning(given, count, fr
 @pytest.mark.parametrize("has_fitted", [True, False])
 def test_the_newest_model_is_saved(tmp_path, monkeypatch, reached_its_own, has_fitted):
     saved = []
-    monkeypatch.setattr(finishing, "save_bundle", lambda model, folder: saved.append((model, folder)))
+    monkeypatch.setattr(session_module, "save_bundle", lambda model, folder: saved.append((model, folder)))
     run = session()
     if reached_its_own:
         run.reached.add(ModelResult("trained"))
@@ -93,7 +93,7 @@ def test_baselines_are_left_out_with_a_note(fields, digest, said):
 
 @pytest.mark.parametrize("shown", [None, 2])
 def test_baselines_are_of_the_frames_that_were_shown(monkeypatch, shown):
-    monkeypatch.setattr(finishing, "measure_baselines", lambda frames: SimpleNamespace(frames=list(frames)))
+    monkeypatch.setattr(session_module, "measure_baselines", lambda frames: SimpleNamespace(frames=list(frames)))
     run = session()
     if shown is not None:
         run.reached.add(QualityResult(None, None, (), 1, "", shown))

@@ -13,16 +13,15 @@ from gsplat_core.scene.frames import FrameStatus
 from operators.applications import live as live_module
 from operators.applications.live import live
 from operators.applications.live_settings import LiveSettings
+from operators.checks import CutCounts, MaskAndDepthCounts, SequenceCounts
 from operators.display import COLOURS, DisplaySettings, LiveDisplayResult
-from operators.endoscope.cuts import CutCounts
-from operators.endoscope.sequence import MaskAndDepthCounts, SequenceCounts
 from operators.frame_clock import ClockSettings
 from operators.ingest import SourceResult
-from operators.live_reconstruct import TrainingCounts
 from operators.messages import PictureState
-from operators.on_screen import OnScreenResult
+from operators.metrics import OnScreenResult
 from operators.out_of_body import OutOfBodyFrames
-from operators.sources.order import FrameOrder
+from operators.reconstruct import TrainingCounts
+from operators.sources.live import FrameOrder
 from tests.operators.applications.scripted import (
     BLACK,
     HEIGHT,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from operators.applications import memory
+from operators.applications import limits
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay
 from operators.errors import MemoryTooSmall
@@ -12,12 +12,12 @@ from operators.errors import MemoryTooSmall
 
 @pytest.mark.parametrize("run", [replay, lambda settings: reconstruct(settings, 1)], ids=["replay", "reconstruct"])
 def test_a_run_that_cannot_fit_is_refused(tiny, tmp_path, monkeypatch, run):
-    monkeypatch.setattr(memory, "available_bytes", lambda: 10 * 2**20)
+    monkeypatch.setattr(limits, "available_bytes", lambda: 10 * 2**20)
     with pytest.raises(MemoryTooSmall, match=r"4 frames of tiny takes about .* MiB of memory, and 10\.0 MiB are free"):
         run(ReplaySettings(tiny, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
 def test_where_the_memory_is_not_known_nothing_is_refused(monkeypatch):
-    monkeypatch.setattr(memory, "available_bytes", lambda: None)
-    memory.require_memory(1 << 60, "it", "try")
+    monkeypatch.setattr(limits, "available_bytes", lambda: None)
+    limits.require_memory(1 << 60, "it", "try")

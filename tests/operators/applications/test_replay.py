@@ -13,7 +13,7 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.training.config import ReconstructorConfig
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
-from operators.applications.result import RunOutcome
+from operators.applications.session import RunOutcome
 from operators.errors import DeviceMissing, OutputError, RunFailed, StorageFull
 from operators.graph import MultiThreadScheduler
 from operators.ingest import SourceResult

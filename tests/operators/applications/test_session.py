@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from operators.applications.result import RunSettings
-from operators.applications.session import Session
+from operators.applications.session import RunSettings, Session
 from operators.errors import RunFailed, StorageFull
 from operators.graph import Application, Operator
 from operators.ingest import SourceOp

@@ -16,19 +16,15 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.sessions import SessionReader, WriterOptions
 from gsplat_core.io.sessions.records import DepthTaken, Observed, Rehearsed, SceneBegun
 from gsplat_core.scene.frames import Frame
-from operators.applications.live import LiveApplication
+from operators.applications.live import LiveApplication, warm_up
 from operators.applications.live_settings import LiveSettings
-from operators.applications.live_start import warm_up
 from operators.applications.replay import ReplaySettings, replay
-from operators.applications.result import RunOutcome
-from operators.applications.session import Session
+from operators.applications.session import RunOutcome, Session
 from operators.compare_shown import ShownComparison
-from operators.depth import FoundDepth
-from operators.late_depth import TakenDepth
+from operators.depth import FoundDepth, TakenDepth
 from operators.metrics import QualityResult
-from operators.sinks.recorder import RecordingResult
-from operators.sources.source import SourceDescription
-from operators.sources.threaded import ThreadedSource
+from operators.sinks.session_recorder import RecordingResult
+from operators.sources.source import SourceDescription, ThreadedSource
 
 FRAMES = 14
 

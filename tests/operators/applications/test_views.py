@@ -12,8 +12,7 @@ import torch
 from gsplat_core import Camera, Gaussians, Model
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
-from operators.applications.render import render_model
-from operators.applications.views import ROUND_S, ViewWish, typical_depth, view_of
+from operators.applications.render import ROUND_S, ViewWish, render_model, typical_depth, view_of
 from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE
 
 CAMERA = Camera.from_focal(60.0, 48, 40)

@@ -244,8 +244,7 @@ def test_the_live_graph_itself_is_measured(tmp_path):
 
     def new_graph(tissue, settings):
         assert settings.clock.at_most_steps == 1 and settings.record is None
-        from operators.applications.live import LiveApplication
-        from operators.applications.live_start import new_parts
+        from operators.applications.live import LiveApplication, new_parts
 
         graphs.append(LiveApplication(tissue, settings, new_parts(settings, tissue), on_shown=tissue.shown))
         return graphs[0]

@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 
 from gsplat_core.endoscope.ordinary import OrdinarySettings
-from operators.endoscope.ordinary import OrdinaryFrames, OrdinaryStream, PictureStagesOp, TissueStagesOp
-from operators.endoscope.stage import Stage, StageOp, left_out
-from operators.endoscope.stages import PICTURE_STAGES, new_stages
+from operators.checks import (
+    PICTURE_STAGES,
+    OrdinaryFrames,
+    OrdinaryStream,
+    PictureStagesOp,
+    Stage,
+    StageOp,
+    TissueStagesOp,
+    left_out,
+    new_stages,
+)
 from operators.outcome import OutcomeBuilder
 from operators.side_by_side import through
 from tests.gsplat_core.endoscope.clips import clip

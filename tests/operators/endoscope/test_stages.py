@@ -12,16 +12,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.endoscope.cuts import CutCounts, CutStage
-from operators.endoscope.exposure import ExposureCounts, ExposureStage
-from operators.endoscope.field_of_view import FieldOfViewStage
-from operators.endoscope.highlights import HighlightStage
-from operators.endoscope.interlacing import InterlacingStage
-from operators.endoscope.sequence import MaskAndDepthCounts, MaskAndDepthStage, SequenceCounts, SequenceStage
-from operators.endoscope.sharpness import SharpnessStage
-from operators.endoscope.stage import StageOp, left_out, tissue_of
-from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
-from operators.endoscope.strip import StripStage
+from operators.checks import (
+    PICTURE_STAGES,
+    TISSUE_STAGES,
+    CutCounts,
+    CutStage,
+    ExposureCounts,
+    ExposureStage,
+    FieldOfViewStage,
+    HighlightStage,
+    InterlacingStage,
+    MaskAndDepthCounts,
+    MaskAndDepthStage,
+    SequenceCounts,
+    SequenceStage,
+    SharpnessStage,
+    StageOp,
+    StripStage,
+    left_out,
+    new_stages,
+    tissue_of,
+)
 from operators.outcome import OutcomeBuilder
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from operators.sinks.recorded import Recorded, stated
+from operators.sinks.session_recorder import Recorded, stated
 
 
 @pytest.mark.parametrize(

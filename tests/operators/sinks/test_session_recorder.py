@@ -20,8 +20,7 @@ from gsplat_core.io.sessions.records import LostLine, Observed
 from gsplat_core.io.sessions.writer import Shown
 from operators.errors import OutputError, StorageFull
 from operators.sinks import session_recorder
-from operators.sinks.recorded import stated
-from operators.sinks.session_recorder import SessionRecorder
+from operators.sinks.session_recorder import SessionRecorder, stated
 from operators.storage import StorageReserve
 from tests.gsplat_core.io.sessions.made import new_frame, same_frame, session_info
 

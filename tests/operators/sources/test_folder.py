@@ -15,7 +15,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources import folder as folder_module
-from operators.sources.new_files import NewFiles, following_name
+from operators.sources.folder import NewFiles, following_name
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
 

@@ -9,8 +9,7 @@ import pytest
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import FrameStatus
-from operators.sources.live import LiveSource
-from operators.sources.order import FrameOrder
+from operators.sources.live import FrameOrder, LiveSource
 from operators.sources.source import FrameSource, SourceDescription, SourceState
 
 SOON_S = 300.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.scene.frames import Frame
-from operators.sources.order import FrameOrder
+from operators.sources.live import FrameOrder
 
 MS = 1_000_000
 

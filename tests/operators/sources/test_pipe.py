@@ -15,11 +15,10 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from operators.errors import SourceLost, SourceUnavailable
 from operators.sources import pipe
-from operators.sources.raw_pictures import PLANES, RawFormat
+from operators.sources.pipe import PLANES, RawFormat, Y4mHeader
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
-from operators.sources.steady_clock import SteadyClock
-from operators.sources.y4m import Y4mHeader
+from operators.sources.stream import SteadyClock
 
 ROOT = Path(__file__).resolve().parents[3]
 ALL = SourceOptions(waiting=64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.sources.raw_pictures import PLANES, RawFormat
+from operators.sources.pipe import PLANES, RawFormat
 
 WIDTH, HEIGHT = 33, 17
 BYTES = {

@@ -11,10 +11,9 @@ import pytest
 from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.frames import FrameStatus
-from operators.sources import realtime
+from operators.sources import recording as recording_module
 from operators.sources.options import SourceOptions
-from operators.sources.realtime import RealtimeSource
-from operators.sources.recording import RecordingSource
+from operators.sources.recording import RealtimeSource, RecordingSource
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceState
 
@@ -25,7 +24,7 @@ SOON_S = 300.0
 def clock(monkeypatch):
     """Time in ns; `wait` moves it."""
     now = SimpleNamespace(ns=5_000_000_000)
-    monkeypatch.setattr(realtime, "time", SimpleNamespace(monotonic_ns=lambda: now.ns))
+    monkeypatch.setattr(recording_module, "time", SimpleNamespace(monotonic_ns=lambda: now.ns))
 
     def wait(self, seconds):
         now.ns += round(seconds * 1e9)
@@ -61,7 +60,7 @@ def test_looped_it_goes_on_without_a_gap_or_a_repeated_number(recording, clock):
 
 
 def test_what_is_too_large_to_remember_is_decoded_again(recording, clock, monkeypatch):
-    monkeypatch.setattr(realtime, "REMEMBERED_BYTES", 2000)
+    monkeypatch.setattr(recording_module, "REMEMBERED_BYTES", 2000)
     assert len(released(RealtimeSource(recording, SourceOptions(loop=True)), clock, 12)) == 12
     assert recording.opened >= 3
 
@@ -107,7 +106,7 @@ def test_a_frame_that_is_decoded_late_is_counted_and_the_others_keep_their_times
             yield frame
 
     monkeypatch.setattr(source, "_numbered", slow)
-    monkeypatch.setattr(realtime, "read_ahead", lambda items, *_: items)
+    monkeypatch.setattr(recording_module, "read_ahead", lambda items, *_: items)
     assert [at for _, _, at in released(source, clock)] == [0, 40, 130, 130, 160]
     assert source.counts() == {"decoded_late": 1}
 
@@ -134,7 +133,7 @@ def test_after_a_long_pause_of_the_machine_the_clock_starts_again(recording, clo
             yield frame
 
     monkeypatch.setattr(source, "_numbered", suspended)
-    monkeypatch.setattr(realtime, "read_ahead", lambda items, *_: items)
+    monkeypatch.setattr(recording_module, "read_ahead", lambda items, *_: items)
     assert [at for _, _, at in released(source, clock)] == [0, 40, 60_040, 60_080, 60_120]
     assert source.counts() == {"decoded_late": 1, "clock_restarts": 1}
 

@@ -9,7 +9,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.recordings import open_recording, synthesize
-from operators.applications.finishing import FirstFrames
+from operators.applications.session import FirstFrames
 from operators.sources.recording import RecordingSource
 from operators.sources.registry import SOURCES, SourceOptions, open_source
 

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from operators.sources.shared_memory import BadHeader, FrameReader
+from operators.sources.wire import BadHeader, FrameReader
 
 
 @pytest.fixture

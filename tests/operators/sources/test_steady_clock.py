@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from operators.sources.steady_clock import SteadyClock
+from operators.sources.stream import SteadyClock
 
 S = 1_000_000_000
 

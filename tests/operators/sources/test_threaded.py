@@ -7,8 +7,7 @@ import threading
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from operators.sources.source import FrameSource, SourceDescription, SourceState
-from operators.sources.threaded import ThreadedSource
+from operators.sources.source import FrameSource, SourceDescription, SourceState, ThreadedSource
 
 SOON_S = 300.0
 """Longer than anything here takes."""

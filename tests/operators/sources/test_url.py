@@ -17,11 +17,11 @@ import pytest
 from gsplat_core.errors import InvalidSetting, UserError
 from gsplat_core.scene.frames import FrameStatus
 from operators.errors import SourceUnavailable
-from operators.sources.connection import StreamDamage
+from operators.sources.address import UrlAddress, without_secrets
 from operators.sources.process import ProcessSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
-from operators.sources.url_address import UrlAddress, without_secrets
+from operators.sources.url import StreamDamage
 
 SOON_S = 300.0
 HERE = SourceOptions(process=False)

@@ -9,8 +9,8 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 from operators.sources import wire
 from operators.sources.options import SourceOptions
-from operators.sources.shared_memory import BadHeader
 from operators.sources.source import SourceDescription
+from operators.sources.wire import BadHeader
 
 IMAGE = np.zeros((2, 3, 3), np.uint8)
 CAMERA = Camera.from_focal(30.0, 3, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.sources.y4m import Y4mHeader
+from operators.sources.pipe import Y4mHeader
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,7 @@ from gsplat_core.scene.frames import FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
-from operators.sources.zeromq_address import is_of_this_machine
-from operators.sources.zeromq_message import HEADER, BadMessage, packed, unpacked
-from operators.sources.zeromq_publisher import FramePublisher
+from operators.sources.zeromq_message import HEADER, BadMessage, FramePublisher, is_of_this_machine, packed, unpacked
 
 ALL = SourceOptions(waiting=64)
 

@@ -7,14 +7,14 @@ from datetime import UTC, datetime
 import pytest
 
 from gsplat_core.scene.cameras import Camera
-from operators.applications.result import RunOutcome, RunSettings
+from operators.applications.session import RunOutcome, RunSettings
+from operators.checks import PICTURE_STAGES, TISSUE_STAGES
 from operators.display import LiveDisplayResult
-from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES
 from operators.errors import NothingShown
 from operators.ingest import SourceResult
-from operators.live_reconstruct import TrainingCounts
 from operators.metrics import QualityResult
 from operators.out_of_body import OutOfBodyFrames
+from operators.reconstruct import TrainingCounts
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
 from services.cli.exit_codes import BAD_INPUT, NOTHING_SHOWN, exit_code_of

@@ -7,9 +7,9 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED as SYNTHESIZED
 from operators.settings import MAX_SEED
+from operators.sources.address import PROTOCOLS
 from operators.sources.address_options import PARSERS
 from operators.sources.registry import SOURCES, check_address
-from operators.sources.url_address import PROTOCOLS
 from services.control.parts import NewStream
 from services.server.stream_specs import spec_of
 

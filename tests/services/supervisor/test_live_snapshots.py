@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.scene.snapshots import SnapshotSlots
-from operators.model_request import ModelRequest
+from operators.reconstruct import ModelRequest
 from services.bus.errors import BadMessage, CommandRefused
 from services.supervisor import live_snapshots
 from services.supervisor.live_snapshots import LiveSnapshots

@@ -1,0 +1,642 @@
+"""Checks of endoscopic video: stages that annotate each frame, one per fault, and the operator that runs them in sequence.
+
+`STAGES` lists them in the order in which a stream runs them. On ordinary frames some stages only take turns, to save time; every unusual frame is examined
+by all of them. The analysis of pictures is in `gsplat_core.endoscope`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.cuts import CutDetector, CutSettings
+from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator, ExposureSettings
+from gsplat_core.endoscope.field_of_view import FieldOfView, FieldOfViewSettings
+from gsplat_core.endoscope.highlights import HighlightFinder, HighlightSettings
+from gsplat_core.endoscope.interlacing import Deinterlacer, InterlacingSettings, without_combs
+from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskAndDepthSettings, MaskCheck
+from gsplat_core.endoscope.ordinary import OrdinaryPictures, Turns
+from gsplat_core.endoscope.sequence import SequenceCheck, SequenceSettings
+from gsplat_core.endoscope.sharpness import SharpnessGate, SharpnessSettings
+from gsplat_core.endoscope.stream_clock import OUT_OF_ORDER, ClockSettings, StreamClock
+from gsplat_core.endoscope.strip import StripDetector, StripSettings
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.graph import Operator, OperatorSpec
+from operators.outcome import OutcomeBuilder
+
+
+@dataclass(frozen=True)
+class StageCounts:
+    """Statistics of a stage in one run. Each stage has its own class, so that an outcome holds all
+    of them.
+    """
+
+    frames: int
+    """Number of frames the stage ran on."""
+    found: Mapping[str, int] = field(default_factory=dict)
+    """Number of frames with a finding, by reason."""
+
+    @property
+    def name(self) -> str:
+        """Name of the stage in reports: the class name without `Counts`, in lower case."""
+        return type(self).__name__.removesuffix("Counts").lower()
+
+
+class Stage(ABC):
+    """Annotates the frames of one stream in order.
+
+    A subclass sets `counts_type`, creates its state in `reset` and implements `annotate`, which
+    must not raise for any picture content. A stage that does not run on every frame must add its
+    lasting results to the skipped frames in `carried`.
+    """
+
+    counts_type: ClassVar[type[StageCounts]] = StageCounts
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.found: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:  # noqa: B027 - not every stage keeps something
+        """Clear the state, at the start of a stream."""
+
+    @abstractmethod
+    def annotate(self, frame: Frame) -> Frame:
+        """Return the frame with the findings added."""
+
+    def carried(self, frame: Frame) -> Frame:
+        """Return a skipped frame with the lasting results of the last annotated frame."""
+        return frame
+
+    def apply(self, frame: Frame) -> Frame:
+        """Annotate and count the frame."""
+        self.frames += 1
+        return self.annotate(frame)
+
+    def withhold(self, frame: Frame, reason: str) -> Frame:
+        """Return the frame marked as excluded from training, and count the reason. An earlier
+        reason is kept.
+        """
+        self.found[reason] += 1
+        return frame if frame.withheld is not None else frame.with_fields(withheld=reason)
+
+    def counts(self) -> StageCounts:
+        """Return the statistics since the start of the run."""
+        return self.counts_type(self.frames, {what: count for what, count in sorted(self.found.items()) if count})
+
+    def start(self) -> None:
+        """Reset the statistics and the state, at the start of a run."""
+        self.frames = 0
+        self.found.clear()
+        self.reset()
+
+
+class StageOp(Operator):
+    """Runs stages in sequence on each frame, including withheld ones.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame` with more fields.
+
+    Params:
+        stages: stages in order of execution. They have state and must not be shared between
+            operators.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, stages: Sequence[Stage], **kwargs: Any) -> None:
+        self.stages = tuple(stages)
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def start(self) -> None:
+        for stage in self.stages:
+            stage.start()
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        for stage in self.stages:
+            frame = stage.apply(frame)
+        op_output.emit(frame, "frame")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        for stage in self.stages:
+            outcome.add(stage.counts())
+
+
+def tissue_of(frame: Frame) -> NDArray[np.uint8] | None:
+    """Return the mask of tissue whose pixels count, uint8 [H, W], 0 = excluded; None if all pixels
+    do.
+    """
+    if frame.mask is None or frame.loss_mask is None:
+        return frame.mask if frame.loss_mask is None else frame.loss_mask
+    return np.minimum(frame.mask, frame.loss_mask)
+
+
+def left_out(frame: Frame, kept: NDArray[np.uint8]) -> Frame:
+    """Return the frame with further pixels excluded from the loss.
+
+    Args:
+        frame: the frame; its own `loss_mask` stays in effect.
+        kept: uint8 [H, W], 0 = excluded.
+    """
+    together = kept if frame.loss_mask is None else np.minimum(frame.loss_mask, kept)
+    return frame.with_fields(loss_mask=together)
+
+
+@dataclass(frozen=True)
+class OrdinaryFrames:
+    """Numbers of frames examined by all stages, and of ordinary frames."""
+
+    looked: int
+    ordinary: int
+
+
+class OrdinaryStream:
+    """State shared by two operators in sequence: the current frame's class and the stages due on
+    it.
+    """
+
+    def __init__(self) -> None:
+        self.pictures = OrdinaryPictures()
+        self.frame_is_ordinary = False
+        self._members = 0
+        self.reset()
+
+    def join(self, stages: int) -> range:
+        """Register `stages` further stages. Return their member numbers for `looks`."""
+        first, self._members = self._members, self._members + stages
+        return range(first, self._members)
+
+    def reset(self) -> None:
+        """Clear the state, at the start of a stream."""
+        self.pictures.reset()
+        self.frame_is_ordinary = False
+        self._turns = Turns(self._members, self.pictures.settings.look_every_s)
+        self._due: frozenset[int] = frozenset()
+
+    def begin(self, ordinary: bool, pts_ns: int) -> None:
+        """Start the next frame. On an ordinary frame only the due stages run, otherwise all."""
+        self.frame_is_ordinary = ordinary
+        if ordinary:
+            self._due = self._turns.due(pts_ns)
+        else:
+            self._turns.all_looked(pts_ns)
+
+    def looks(self, member: int) -> bool:
+        """Return True if the stage with this member number runs on the current frame."""
+        return not self.frame_is_ordinary or member in self._due
+
+
+class PictureStagesOp(StageOp):
+    """Runs its first stage on each frame, and the other stages on unusual frames or in turn.
+
+    On an ordinary frame a skipped stage carries its previous result over. When a stage finds
+    something unusual, all later stages run on the frame, and all stages run on the next one.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame` with more fields.
+
+    Params:
+        stages: stages that need the picture alone; the first compares each picture with the
+            previous one.
+        stream: state shared with the following `TissueStagesOp`.
+    """
+
+    def __init__(
+        self, fragment: Any, *args: Any, stages: Sequence[Stage], stream: OrdinaryStream, **kwargs: Any
+    ) -> None:
+        self.stream = stream
+        self._members = stream.join(len(stages) - 1)
+        self._settled = False
+        """True if the previous frame allows the next to be ordinary: it was unchanged and did not
+        begin a scene.
+        """
+        self._counts = [0, 0]
+        super().__init__(fragment, *args, stages=stages, **kwargs)
+
+    def start(self) -> None:
+        super().start()
+        self.stream.reset()
+        self._settled, self._counts = False, [0, 0]
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        came: Frame = op_input.receive("frame")
+        ordinary = self.stream.pictures.is_ordinary(came.image, came.pts_ns) and self._settled
+        frame = self.stages[0].apply(came)
+        ordinary = ordinary and _settled(frame, came)
+        self.stream.begin(ordinary, frame.pts_ns)
+        self._counts[ordinary] += 1
+        for member, stage in zip(self._members, self.stages[1:], strict=True):
+            frame = stage.apply(frame) if self.stream.looks(member) else stage.carried(frame)
+            self.stream.frame_is_ordinary &= _settled(frame, came)
+        self._settled = _settled(frame, came)
+        op_output.emit(frame, "frame")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        super().contribute(outcome)
+        outcome.add(OrdinaryFrames(*self._counts))
+
+
+def _settled(frame: Frame, came: Frame) -> bool:
+    """Return True if the stages changed only the masks, and did not withhold the frame or begin a
+    scene.
+    """
+    unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
+    return unchanged and frame.withheld is None and frame.new_scene is None and frame.status is not FrameStatus.DAMAGED
+
+
+class TissueStagesOp(StageOp):
+    """Runs some stages on each frame, and others on unusual frames or in turn.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame` with more fields.
+
+    Params:
+        always: stages that run on every frame.
+        stages: stages that run on unusual or withheld frames, and in turn on ordinary ones.
+        stream: state shared with the preceding `PictureStagesOp`.
+    """
+
+    def __init__(
+        self,
+        fragment: Any,
+        *args: Any,
+        always: Sequence[Stage],
+        stages: Sequence[Stage],
+        stream: OrdinaryStream,
+        **kwargs: Any,
+    ) -> None:
+        self.stream, self._always, self._seldom = stream, tuple(always), tuple(stages)
+        self._members = stream.join(len(self._seldom))
+        super().__init__(fragment, *args, stages=(*always, *stages), **kwargs)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame: Frame = op_input.receive("frame")
+        for stage in self._always:
+            frame = stage.apply(frame)
+        for member, stage in zip(self._members, self._seldom, strict=True):
+            looks = self.stream.looks(member) or frame.withheld is not None
+            frame = stage.apply(frame) if looks else stage.carried(frame)
+        op_output.emit(frame, "frame")
+
+
+@dataclass(frozen=True)
+class SequenceCounts(StageCounts):
+    """Withheld frames by reason (black, one colour, noise, duplicate, frozen, torn, out of order),
+    and clock jumps and gaps.
+    """
+
+
+class SequenceStage(Stage):
+    """Withholds pictures that are black, uniform, noise, repeated, torn or late, and removes clock
+    jumps.
+
+    It must run first. After a clock jump `Frame.pts_ns` is shifted. A late frame gets the newest
+    timestamp.
+    """
+
+    counts_type = SequenceCounts
+
+    def __init__(self, settings: SequenceSettings | None = None, clock: ClockSettings | None = None) -> None:
+        self.settings, self.clock_settings = settings or SequenceSettings(), clock or ClockSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._check = SequenceCheck(self.settings)
+        self._clock = StreamClock(self.clock_settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        timing = self._clock.observe(frame.pts_ns, frame.arrived_ns)
+        if timing.pts_ns != frame.pts_ns:
+            frame = frame.with_fields(pts_ns=timing.pts_ns)
+        if timing.finding == OUT_OF_ORDER:
+            # A late picture is not compared with its neighbours, which are consecutive.
+            return self.withhold(frame, OUT_OF_ORDER)
+        if timing.finding is not None:
+            self.found[timing.finding] += 1
+        if frame.status is FrameStatus.DAMAGED:
+            return frame
+        fault = self._check.fault(frame.image, frame.pts_ns)
+        return frame if fault is None else self.withhold(frame, fault)
+
+
+@dataclass(frozen=True)
+class MaskAndDepthCounts(StageCounts):
+    """Frames withheld for their mask, and frames whose depth was repaired or removed."""
+
+
+class MaskAndDepthStage(Stage):
+    """Withholds frames whose tool mask shows no tissue or was lost, and removes invalid depth.
+
+    It must run after the stage that sets `Frame.mask`. A frame without valid depth is trained on
+    without it.
+    """
+
+    counts_type = MaskAndDepthCounts
+
+    def __init__(self, settings: MaskAndDepthSettings | None = None) -> None:
+        self.settings = settings or MaskAndDepthSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._mask, self._depth = MaskCheck(self.settings), DepthCheck(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.depth is not None:
+            checked = self._depth.checked(frame.depth)
+            if checked.finding is not None:
+                self.found[checked.finding] += 1
+                frame = frame.with_fields(depth=checked.depth)
+        fault = None if frame.mask is None else self._mask.fault(frame.mask)
+        return frame if fault is None else self.withhold(frame, fault)
+
+
+@dataclass(frozen=True)
+class InterlacingCounts(StageCounts):
+    """Frames that were de-interlaced."""
+
+
+class InterlacingStage(Stage):
+    """Removes combing artefacts from interlaced video of both eyes, which changes `Frame.image`.
+
+    Progressive video is passed unchanged. The stage must run before stages that measure sharpness
+    and before training.
+    """
+
+    counts_type = InterlacingCounts
+
+    def __init__(self, settings: InterlacingSettings | None = None) -> None:
+        self.settings = settings or InterlacingSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._deinterlacer = Deinterlacer(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        image = self._deinterlacer.process(frame.image)
+        if image is frame.image:
+            return frame
+        self.found["de-interlaced"] += 1
+        right = frame.right_image
+        if right is not None:
+            right = without_combs(right, self.settings.stand_out_levels)
+        return frame.with_fields(image=image, right_image=right)
+
+
+@dataclass(frozen=True)
+class FieldOfViewCounts(StageCounts):
+    """Frames with a limited field of view."""
+
+
+class FieldOfViewStage(Stage):
+    """Excludes pixels outside of the field of view from the loss. Withheld and damaged frames keep
+    the previous field.
+    """
+
+    counts_type = FieldOfViewCounts
+
+    def __init__(self, settings: FieldOfViewSettings | None = None) -> None:
+        self.settings = settings or FieldOfViewSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._view = FieldOfView(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+            self._view.observe(frame.image)
+        masked = self.carried(frame)
+        self.found["limited"] += masked is not frame
+        return masked
+
+    def carried(self, frame: Frame) -> Frame:
+        mask = self._view.mask
+        return frame if mask is None or mask.shape != frame.image.shape[:2] else left_out(frame, mask)
+
+
+@dataclass(frozen=True)
+class StripCounts(StageCounts):
+    """Frames with a status bar or text."""
+
+
+class StripStage(Stage):
+    """Excludes status bars and text at the borders from the loss. Withheld and damaged frames keep
+    the previous mask.
+    """
+
+    counts_type = StripCounts
+
+    def __init__(self, settings: StripSettings | None = None) -> None:
+        self.settings = settings or StripSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._detector = StripDetector(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+            self._detector.observe(frame.image)
+        masked = self.carried(frame)
+        self.found["strip or text"] += masked is not frame
+        return masked
+
+    def carried(self, frame: Frame) -> Frame:
+        mask = self._detector.mask
+        return frame if mask is None or mask.shape != frame.image.shape[:2] else left_out(frame, mask)
+
+
+@dataclass(frozen=True)
+class HighlightCounts(StageCounts):
+    """Frames with highlights."""
+
+
+class HighlightStage(Stage):
+    """Excludes specular highlights from rehearsal: a frame's own training fits them, later
+    rehearsal does not.
+    """
+
+    counts_type = HighlightCounts
+
+    def __init__(self, settings: HighlightSettings | None = None) -> None:
+        self.settings = settings or HighlightSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._finder = HighlightFinder(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        kept = None if frame.withheld is not None else self._finder.without(frame.image)
+        if kept is None:
+            return frame
+        self.found["frames with highlights"] += 1
+        return frame.with_fields(rehearsal_mask=kept)
+
+
+@dataclass(frozen=True)
+class ExposureCounts(StageCounts):
+    """Frames whose exposure differs from that of their scene, and frames in which it was
+    changing.
+    """
+
+
+class ExposureStage(Stage):
+    """Sets `Frame.exposure` relative to the start of the scene.
+
+    Withheld and damaged frames keep the previous exposure. The stage must run after the tool mask,
+    the loss masks and the cuts.
+    """
+
+    counts_type = ExposureCounts
+
+    def __init__(self, settings: ExposureSettings | None = None) -> None:
+        self.settings = settings or ExposureSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._estimator = ExposureEstimator(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.new_scene is not None:
+            self._estimator.start_scene()
+        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+            self._estimator.observe(frame.image, tissue_of(frame), frame.pts_ns)
+            self.found["changing"] += self._estimator.following
+        self.found["other than the scene's"] += self._estimator.gains != UNCHANGED
+        return self.carried(frame)
+
+    def carried(self, frame: Frame) -> Frame:
+        gains = self._estimator.gains
+        return frame if gains == UNCHANGED else frame.with_fields(exposure=gains)
+
+
+@dataclass(frozen=True)
+class SharpnessCounts(StageCounts):
+    """Frames withheld for blur and for smoke."""
+
+
+class SharpnessStage(Stage):
+    """Withholds frames with blur or smoke, relative to the usual sharpness of the scene.
+
+    Withheld and damaged frames are skipped. The stage must run after `CutStage`.
+    """
+
+    counts_type = SharpnessCounts
+
+    def __init__(self, settings: SharpnessSettings | None = None) -> None:
+        self.settings = settings or SharpnessSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._gate = SharpnessGate(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
+            return frame
+        if frame.new_scene is not None:
+            self._gate.start_scene()
+        fault = self._gate.fault(frame.image, frame.pts_ns, tissue_of(frame))
+        return frame if fault is None else self.withhold(frame, fault)
+
+
+IN_DOUBT = "cut in doubt"
+
+
+@dataclass(frozen=True)
+class CutCounts(StageCounts):
+    """New scenes by reason (cut, returned, resized, frame rate), and frames withheld as possible
+    cuts.
+    """
+
+
+@dataclass(frozen=True)
+class SceneCounts(StageCounts):
+    """Number of frames that were given a scene number; `CutCounts` has the reasons for new
+    scenes.
+    """
+
+
+class SceneNumberStage(Stage):
+    """Sets `Frame.scene`, the number of scenes before the current one.
+
+    It must run on every frame, after all stages that set `Frame.new_scene`.
+    """
+
+    counts_type = SceneCounts
+
+    def reset(self) -> None:
+        self._scene = 0
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.new_scene is not None:
+            self._scene += 1
+        return frame if self._scene == 0 else frame.with_fields(scene=self._scene)
+
+
+class CutStage(Stage):
+    """Sets `Frame.new_scene` at cuts, never on a withheld or damaged frame.
+
+    It must run after all stages that withhold pictures. A frame that may be a cut is withheld, and
+    the next frame decides.
+    """
+
+    counts_type = CutCounts
+
+    def __init__(self, settings: CutSettings | None = None) -> None:
+        self.settings = settings or CutSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._detector = CutDetector(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
+            self._detector.skip()
+            return frame
+        verdict = self._detector.observe(frame.image, frame.seq, frame.pts_ns)
+        if verdict.in_doubt:
+            return self.withhold(frame, IN_DOUBT)
+        if verdict.new_scene is None:
+            return frame
+        self.found[verdict.new_scene] += 1
+        return frame if frame.new_scene is not None else frame.with_fields(new_scene=verdict.new_scene)
+
+
+PICTURE_STAGES: dict[str, Callable[[], Stage]] = {
+    "sequence": SequenceStage,
+    "interlacing": InterlacingStage,
+    "cuts": CutStage,
+    "strip": StripStage,
+    "field of view": FieldOfViewStage,
+    "highlights": HighlightStage,
+    "sharpness": SharpnessStage,
+}
+"""Stages that need only the picture and run before the tool mask."""
+TISSUE_STAGES: dict[str, Callable[[], Stage]] = {
+    "mask and depth": MaskAndDepthStage,
+    "exposure": ExposureStage,
+}
+"""Stages that need the tool mask."""
+
+
+def new_stages(stages: dict[str, Callable[[], Stage]], without: Sequence[str] = ()) -> list[Stage]:
+    """Create the stages in order, except those named in `without`."""
+    return [make() for name, make in stages.items() if name not in without]
