@@ -27,8 +27,7 @@ from operators.sources.live import LiveSource
 from operators.sources.source import SourceDescription
 from operators.sources.wire import description_to, frame_header, planes_of
 from operators.sources.zeromq_message import pieces
-from services.bus.commands import CommandServer
-from services.bus.heartbeats import Heartbeats
+from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher, picture_from, subscribe
 from services.bus.runtime import RuntimeFolder
 from services.display.encoder import encoded

@@ -5,12 +5,11 @@ AuditError
 └── AuditUnwritable (UserError)   an entry could not be written to the disk
 """
 
-from services.audit.entries import Entry
-from services.audit.errors import AuditError, AuditInUse, AuditUnwritable
+from services.audit.files import Entry, Keeping
 from services.audit.log import AuditLog
 from services.audit.pages import ExportFormat, Wanted
-from services.audit.segments import Keeping
 from services.audit.verify import Finding, Verdict, verify
+from services.errors import AuditError, AuditInUse, AuditUnwritable
 
 __all__ = [
     "AuditError",

@@ -19,12 +19,31 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from services.audit.entries import MOST_LINE_BYTES, Detail, Entry, Outcome, digest_of_entry, parse_line
-from services.audit.errors import AuditInUse, AuditUnwritable
-from services.audit.head import Head, anchor_path, head_path, read_anchor, read_head, write_anchor, write_head
-from services.audit.lines import lines_backwards, whole_lines_bytes
+from services.audit.files import (
+    MOST_LINE_BYTES,
+    Detail,
+    Entry,
+    Head,
+    Keeping,
+    Outcome,
+    all_segments,
+    anchor_path,
+    closed_segments,
+    digest_of_entry,
+    head_path,
+    lines_backwards,
+    parse_line,
+    read_anchor,
+    read_head,
+    segment_path,
+    sync_folder,
+    too_old,
+    whole_lines_bytes,
+    write_anchor,
+    write_head,
+)
 from services.audit.pages import ExportFormat, Page, Wanted, exported, newest, search
-from services.audit.segments import Keeping, all_segments, closed_segments, segment_path, sync_folder, too_old
+from services.errors import AuditInUse, AuditUnwritable
 
 log = logging.getLogger(__name__)
 

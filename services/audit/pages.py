@@ -12,9 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from services.audit.entries import Entry, Outcome, parse_line
-from services.audit.lines import lines_backwards
-from services.audit.segments import closed_segments
+from services.audit.files import Entry, Outcome, closed_segments, lines_backwards, parse_line
 
 MOST_LOOKED_AT = 50_000
 """Entries read per search, which bounds its time to about a second. The next page continues at that

@@ -7,9 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsplat_core.io.files import open_regular
-from services.audit.entries import MOST_LINE_BYTES, Entry, digest_of_entry, parse_line
-from services.audit.head import Head, read_anchor, read_head
-from services.audit.segments import closed_segments
+from services.audit.files import (
+    MOST_LINE_BYTES,
+    Entry,
+    Head,
+    closed_segments,
+    digest_of_entry,
+    parse_line,
+    read_anchor,
+    read_head,
+)
 
 MOST_FINDINGS = 100
 MOST_READINGS = 5

@@ -1,12 +1,24 @@
-"""JSON messages of the bus: one object of limited size. Nothing is ever unpickled."""
+"""JSON messages between the processes of the service: commands with their answers, and heartbeats.
+
+A message is one JSON object of limited size. Nothing is ever unpickled. Durations travel in heartbeats as histograms.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import logging
+import os
+import threading
+import time
+from bisect import bisect_left
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from services.bus.errors import BadMessage
+import zmq
+import zmq.asyncio
+
+from gsplat_core.errors import UserError
+from services.errors import BadMessage, BusError, CommandRefused, NoAnswer
 
 MOST_BYTES = 1 << 16
 """Largest message in bytes."""
@@ -47,3 +59,207 @@ def parsed_json(data: bytes | memoryview) -> dict[str, Any]:
 
 def _refuse(name: str) -> Any:
     raise ValueError(f"{name} is no number of JSON")
+
+
+log = logging.getLogger(__name__)
+LOOK_MS = 100
+ANSWER_S = 2.0
+Handler = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
+"""Command handler: takes the arguments, returns the answer."""
+
+
+def ask(endpoint: str, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any) -> dict[str, Any]:
+    """Send a command and wait for the answer.
+
+    Args:
+        endpoint: ZeroMQ address of the process.
+        command: name of the command.
+        timeout_s: seconds to wait.
+        arguments: arguments of the command.
+
+    Raises:
+        NoAnswer: if the process does not answer in time.
+        CommandRefused: with the reason, if the process refuses.
+    """
+    socket = _to(endpoint, zmq.Context.instance())
+    try:
+        socket.send(packed_json({"command": command, **arguments}))
+        if not socket.poll(round(timeout_s * 1000)):
+            raise _silence(endpoint, command, timeout_s)
+        return _accepted(socket.recv())
+    finally:
+        socket.close()
+
+
+async def ask_async(endpoint: str, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any) -> dict[str, Any]:
+    """Send a command like `ask`, in an event loop."""
+    socket = _to(endpoint, zmq.asyncio.Context.instance())
+    try:
+        await socket.send(packed_json({"command": command, **arguments}))
+        if not await socket.poll(round(timeout_s * 1000)):
+            raise _silence(endpoint, command, timeout_s)
+        return _accepted(await socket.recv())
+    finally:
+        socket.close()
+
+
+def _to(endpoint: str, context: Any) -> Any:
+    """Create a socket for one command."""
+    socket = context.socket(zmq.REQ)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
+    socket.setsockopt(zmq.RECONNECT_IVL, 20)
+    socket.connect(endpoint)
+    return socket
+
+
+def _silence(endpoint: str, command: str, timeout_s: float) -> NoAnswer:
+    return NoAnswer(f"{endpoint} has not answered {command!r} within {timeout_s:g} s")
+
+
+def _accepted(data: bytes) -> dict[str, Any]:
+    answer = parsed_json(data)
+    if answer.pop("ok", False) is not True:
+        raise CommandRefused(str(answer.get("error", "it gave no reason")))
+    return answer
+
+
+class CommandServer:
+    """Answers commands one at a time in its own thread."""
+
+    def __init__(self, endpoint: str, handlers: Mapping[str, Handler]) -> None:
+        self._handlers = handlers
+        self.heard_s = time.monotonic()
+        """Time of the last command."""
+        self._stop = threading.Event()
+        self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
+        self._socket.setsockopt(zmq.LINGER, 200)  # lets the answer to the stop command leave before the process ends
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
+        self._socket.bind(endpoint)
+        self._thread = threading.Thread(target=self._serve, name="commands", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop answering and remove the socket."""
+        self._stop.set()
+        self._thread.join()
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            if not self._socket.poll(LOOK_MS):
+                continue
+            parts = self._socket.recv_multipart()
+            self.heard_s = time.monotonic()
+            answer = self._answer(b"".join(parts))
+            self.heard_s = time.monotonic()
+            self._socket.send(answer)
+        self._socket.close()
+
+    def _answer(self, data: bytes) -> bytes:
+        try:
+            request = parsed_json(data)
+            name = request.pop("command", None)
+            if name not in self._handlers:
+                raise CommandRefused(f"there is no command {str(name)[:60]!r}; there are {', '.join(self._handlers)}")
+            return packed_json({"ok": True, **(self._handlers[name](request) or {})})
+        except (UserError, BusError) as error:
+            return _refusal(str(error))
+        except Exception as error:  # the client gets the error, and the process continues
+            log.exception("command failed")
+            return _refusal(f"{type(error).__name__}: {error}")
+
+
+def _refusal(why: str) -> bytes:
+    return packed_json({"ok": False, "error": why[:4000]})
+
+
+def text_of(arguments: Mapping[str, Any], name: str) -> str:
+    """Return a text argument.
+
+    Raises:
+        BadMessage: if the argument is missing, empty or no text.
+    """
+    value = arguments.get(name)
+    if not isinstance(value, str) or not value:
+        raise BadMessage(f"{name} is {value!r:.60}; it must be a text")
+    return value
+
+
+BOUNDS_S = (0.001, 0.0025, 0.005, 0.0083, 0.0167, 0.025, 0.0333, 0.05, 0.0667, 0.1, 0.15, 0.25, 0.5, 1.0, 5.0)
+"""Upper bounds in seconds: 8.3, 16.7, 33.3, 50 and 66.7 ms are one and two frames at 120, 60 and 30
+frames/s. Longer durations have their own bucket."""
+
+
+class Durations:
+    """Histogram of one kind of duration. One thread adds; another thread may read counts that lag
+    by at most one."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(BOUNDS_S) + 1)
+        self._sum_s = 0.0
+
+    def add(self, duration_s: float) -> None:
+        """Count one duration."""
+        self._counts[bisect_left(BOUNDS_S, duration_s)] += 1
+        self._sum_s += duration_s
+
+    def told(self) -> dict[str, Any]:
+        """Return the JSON form: the count of each bucket, the last without an upper bound, and the
+        sum."""
+        return {"counts": list(self._counts), "sum_s": round(self._sum_s, 6)}
+
+
+def cumulative(told: Any) -> tuple[list[tuple[str, float]], float] | None:
+    """Convert the durations of a heartbeat to Prometheus buckets and their sum; None for malformed
+    values."""
+    counts = told.get("counts") if isinstance(told, Mapping) else None
+    sum_s = told.get("sum_s") if isinstance(told, Mapping) else None
+    whole = (
+        isinstance(counts, list) and len(counts) == len(BOUNDS_S) + 1 and all(type(count) is int for count in counts)
+    )
+    if not whole or not isinstance(sum_s, int | float) or counts is None:
+        return None
+    found, total = [], 0
+    for bound, count in zip((*map(str, BOUNDS_S), "+Inf"), counts, strict=True):
+        total += count
+        found.append((bound, float(total)))
+    return found, float(sum_s)
+
+
+PERIOD_S = 0.25
+
+
+class Heartbeats:
+    """Publishes the result of `report` from its own thread until closed."""
+
+    def __init__(self, endpoint: str, report: Callable[[], Mapping[str, Any]]) -> None:
+        self._report = report
+        self._stop = threading.Event()
+        self._now = threading.Event()
+        self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.PUB)
+        self._socket.setsockopt(zmq.LINGER, 200)  # lets the last heartbeat leave, which states why the process ends
+        self._socket.setsockopt(zmq.SNDHWM, 8)
+        self._socket.bind(endpoint)
+        self._thread = threading.Thread(target=self._beat, name="heartbeats", daemon=True)
+        self._thread.start()
+
+    def say_now(self) -> None:
+        """Publish at once, because the state has changed."""
+        self._now.set()
+
+    def close(self) -> None:
+        """Publish the last state and remove the socket."""
+        self._stop.set()
+        self._now.set()
+        self._thread.join()
+
+    def _beat(self) -> None:
+        while True:
+            last = self._stop.is_set()
+            said = {"pid": os.getpid(), "sent_ns": time.monotonic_ns(), **self._report()}
+            self._socket.send(packed_json(said))
+            if last:
+                break
+            self._now.wait(PERIOD_S)
+            self._now.clear()
+        self._socket.close()

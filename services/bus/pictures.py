@@ -1,15 +1,11 @@
-"""Pictures over ZeroMQ, published to any number of readers. Slow readers never delay the sender;
-they lose old pictures.
+"""Pictures over ZeroMQ, published to any number of readers. A slow reader misses pictures and never delays the sender.
 
-A message is a JSON header and the pixels. With `"pixels": "frame"` in the header a complete frame
-follows, in the pieces of `operators/sources/zeromq_message.py` (capture process). With `"rgb"` one
-part follows, uint8 [H, W, 3] of `width_px` and `height_px` (engine process). Pixels are sent
-without a copy, because copying a 1920x1080 picture costs more than the socket (ADR 14).
+`WatchedPublisher` detects its first and its last reader, so that pictures without readers are not produced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +14,13 @@ import zmq
 from numpy.typing import NDArray
 
 from operators.sources import zeromq_message
-from services.bus.errors import BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
+from services.errors import BadMessage
 
 HIGH_WATER = 4
 """Pictures queued per reader on either side; further ones are dropped for that reader. Readers
 drain the queue and use the newest picture. A smaller value would lose pictures of fast readers,
 because ZeroMQ updates the queue length only now and then."""
-
 MOST_PARTS = 2 + len(zeromq_message.ARRAYS)
 """Largest number of parts of a message."""
 
@@ -137,3 +132,30 @@ def picture_from(parts: Sequence[zmq.Frame]) -> Picture:
 def _side(value: Any) -> int:
     """Return a side length in pixels, or 0 if the value is not valid."""
     return value if type(value) is int and value > 0 else 0
+
+
+class WatchedPublisher(PicturePublisher):
+    """Publisher that knows whether readers are connected. For use by one thread."""
+
+    kind = zmq.XPUB
+
+    def __init__(self, endpoint: str, context: zmq.Context | None = None) -> None:
+        super().__init__(endpoint, context)
+        self._watched = False
+
+    @property
+    def watched(self) -> bool:
+        """Return True if a reader is connected; a dead reader does not count."""
+        while self._socket.poll(0):
+            # Each message is one byte and the topic: 1 for the first reader, 0 after the last one
+            # left.
+            self._watched = self._socket.recv()[:1] == b"\x01"
+        return self._watched
+
+
+def wait_for_readers(publishers: Iterable[WatchedPublisher], timeout_s: float) -> None:
+    """Wait until a reader connects to or leaves one of the publishers."""
+    poller = zmq.Poller()
+    for publisher in publishers:
+        poller.register(publisher._socket, zmq.POLLIN)
+    poller.poll(round(timeout_s * 1000))

@@ -190,7 +190,7 @@ def assigned(texts: Iterable[str]) -> dict[str, Any]:
 
 def _assigned(text: str) -> tuple[str, Any]:
     """Parse `name=value`, with the value as YAML: a number, a boolean or a word."""
-    from services.settings.yaml_file import yaml_value
+    from services.settings.load import yaml_value
 
     name, equals, value = text.partition("=")
     if not equals or not name:

@@ -10,7 +10,6 @@ from typing import Any
 import httpx2
 from pydantic import TypeAdapter, ValidationError
 
-from services.client.errors import ClientError
 from services.client.pictures import Picture, pictures
 from services.client.replays import ReplayMethods
 from services.client.requests import refused_by, waited_for
@@ -20,6 +19,7 @@ from services.control.routes.audit import AuditPage
 from services.control.routes.keys import KeyView, MadeKey, Myself
 from services.control.routes.models import ModelView, VersionView
 from services.control.routes.streams import StreamView
+from services.errors import ClientError
 
 TIMEOUT_S = 30.0
 WAITING = ("uploaded", "validated")

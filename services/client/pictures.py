@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
 from gsplat_core.io.files import read_regular
-from services.client.errors import ClientError, Unreachable
+from services.errors import ClientError, Unreachable
 
 MOST_CERTIFICATE_BYTES = 1 << 20
 MOST_BYTES = 64 << 20

@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 import httpx2
 
 from gsplat_core.io.files import PartialFile, open_regular
-from services.client.errors import ClientError, Refused, Unreachable
 from services.client.pictures import tls_context
+from services.errors import ClientError, Refused, Unreachable
 
 CHUNK_BYTES = 1 << 20
 MOST_ANSWER_BYTES = 64 << 20

@@ -11,8 +11,7 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from types import TracebackType
 
-from services.settings.addresses import masked_address
-from services.settings.sections import LogSettings
+from services.settings.sections import LogSettings, masked_address
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
 _FACTS = "facts"

@@ -11,10 +11,10 @@ from typing import Any, Literal, Protocol
 from fastapi import APIRouter
 from prometheus_client.registry import Collector
 
+from services.audit.system_events import SystemEvents
 from services.control.problems import Problem
 from services.control.replay_parts import Jobs, Recordings
 from services.control.snapshot_parts import Exports, Snapshots
-from services.control.system_events import SystemEvents
 
 PictureKind = Literal["raw", "shown", "depth", "confidence", "orbit"]
 BOUNDARY = "picture"

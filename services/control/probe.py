@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
-from services.control.errors import CannotServe
 from services.control.health import readiness
 from services.control.state import ControlState
+from services.errors import CannotServe
 from services.settings import ServiceSettings
 
 SOCKET = "probe.sock"

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 from starlette.requests import ClientDisconnect, Request
 
-from services.audit.entries import Detail, Outcome
+from services.audit.files import Detail, Outcome
 from services.control.auth.roles import Caller
 from services.control.problems import Problem
 from services.control.state import control_of

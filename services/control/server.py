@@ -16,15 +16,15 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from services.audit.system_events import SystemEvents
 from services.control.certificate import ServerCertificate
 from services.control.connections import AddressBound, BoundedListener
-from services.control.errors import CannotServe
 from services.control.handshakes import AnsweredHandshakes
 from services.control.heads import MOST_HEAD_BYTES
 from services.control.probe import ProbeListener
 from services.control.state import ControlState
-from services.control.system_events import SystemEvents
 from services.control.systemd import ServiceManager
+from services.errors import CannotServe
 from services.settings import ServiceSettings
 
 MOST_UNSENT_BYTES = 64 * 1024

@@ -14,12 +14,12 @@ from typing import Any, Literal
 import zmq
 import zmq.asyncio
 
-from services.bus.durations import Durations
-from services.bus.errors import BadMessage
+from services.bus.messages import Durations
 from services.bus.pictures import Picture, picture_from, subscribe
 from services.bus.runtime import LAYERS, Layer, StreamFolder
 from services.display.encoder import EncodedPicture, check_quality, dimmed, encoded
 from services.display.viewer import Viewer
+from services.errors import BadMessage
 
 log = logging.getLogger(__name__)
 Pictures = Literal["raw", "shown", Layer]

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.io.exports.formats import ExportWish
-from services.exports.errors import ExportBusy, ExportFailed
+from services.errors import ExportBusy, ExportFailed
 from services.exports.programs import ExportPrograms
 
 REVISION = 1

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsplat_core.io.exports.formats import ExportWish
-from services.exports.errors import ExportFailed, ExportRefused
+from services.errors import ExportFailed, ExportRefused
 from services.exports.formats import arguments_of
 
 PROGRAM = (sys.executable, "-P", "-m", "services.exports.make")

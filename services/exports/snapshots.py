@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_core.io.files import sync_folder
-from services.exports.errors import ExportFailed, NoSnapshot
+from services.errors import ExportFailed, NoSnapshot
 
 NUMBER = re.compile(r"[0-9a-f]{16}")
 ABOUT = "snapshot.json"

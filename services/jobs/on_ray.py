@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
+from services.errors import StoreUnavailable
 from services.jobs.task import Task
 from services.private_files import keep_files_private
-from services.registry.errors import StoreUnavailable
 
 ATTEMPTS_OF_A_PROCESS = 20
 """Attempts after which Ray starts a new worker process, which bounds memory leaks."""

@@ -13,13 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from services.errors import StoreUnavailable
 from services.jobs.claims import Claims
 from services.jobs.records import Claimed, JobState
 from services.jobs.results import Results, Workspace
 from services.jobs.runner import Runner
 from services.jobs.task import Task
 from services.registry.database import Database
-from services.registry.errors import StoreUnavailable
 
 log = logging.getLogger(__name__)
 STEP_S = 0.02

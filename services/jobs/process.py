@@ -17,13 +17,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from services.errors import StoreUnavailable
 from services.jobs.pool import JobPool, PoolSettings
 from services.jobs.results import Results
 from services.jobs.runner import Runner
 from services.jobs.tables import SCHEMA
 from services.private_files import keep_files_private
 from services.registry.database import Database
-from services.registry.errors import StoreUnavailable
 
 MOST_LINE = 1 << 16
 

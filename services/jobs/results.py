@@ -14,7 +14,7 @@ import shutil
 from pathlib import Path
 
 from gsplat_core.io.files import sync_folder
-from services.registry.errors import StoreUnavailable
+from services.errors import StoreUnavailable
 
 RUNNING, LOCK = ".running", "lock"
 OUT, REPORT = "out", "report.json"

@@ -12,10 +12,10 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from services.errors import Conflict, NotFound, Rejected
 from services.jobs.records import OPEN, JobRecord, JobState, NewJob, Submission, job_record
 from services.jobs.tables import JOBS, SCHEMA, SUBMISSIONS
 from services.registry.database import Database
-from services.registry.errors import Conflict, NotFound, Rejected
 from services.registry.rows import now
 
 MOST_AT_ONCE = 2000

@@ -10,9 +10,9 @@ from pathlib import Path
 import zmq
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.errors import BadMessage
 from services.bus.pictures import Picture, picture_from, subscribe
 from services.bus.runtime import StreamFolder
+from services.errors import BadMessage
 from services.openigtlink.messages import StreamMessages
 from services.openigtlink.server import MessageServer
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.registry.errors import Rejected
+from services.errors import Rejected
 
 ARCHIVE = "archive"
 

@@ -18,13 +18,13 @@ from typing import Any
 import sqlalchemy as sa
 
 from gsplat_core.io.files import sync_folder
+from services.errors import CheckFailed, Conflict, NotFound, StoreUnavailable
 from services.recordings.kinds import ARCHIVE, kind_of
 from services.recordings.limits import RecordingLimits
 from services.recordings.records import Expired, RecordingRecord, State, recording_record
 from services.recordings.tables import RECORDINGS, SCHEMA
 from services.registry.checking import BroughtDown, RunningChecks, run_program
 from services.registry.database import Database
-from services.registry.errors import CheckFailed, Conflict, NotFound, StoreUnavailable
 from services.registry.rows import now
 
 PROGRAM = (sys.executable, "-P", "-m", "services.recordings.check")

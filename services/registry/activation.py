@@ -7,7 +7,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from services.registry.errors import Conflict, StillActive
+from services.errors import Conflict, StillActive
 from services.registry.records import ACTIVATABLE, Change, State, VersionRecord
 from services.registry.rows import (
     activation_steps,

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import fsspec
 
 from gsplat_core.io.files import beside, sync_folder
-from services.registry.errors import StoreUnavailable
+from services.errors import StoreUnavailable
 
 PART_SUFFIX = ".part"
 """Suffix of incomplete files and folders."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.io.files import PartialFile, write_durably
-from services.registry.errors import Rejected
+from services.errors import Rejected
 
 SUFFIX = ".isplat"
 MANIFEST, TENSORS = "manifest.json", "model.safetensors"

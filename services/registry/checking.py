@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-from services.registry.errors import CheckFailed
+from services.errors import CheckFailed
 from services.registry.limits import RegistryLimits
 
 PROGRAM = (sys.executable, "-P", "-m", "services.registry.check")

@@ -21,7 +21,7 @@ from alembic.util import CommandError
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from services.registry.errors import SchemaTooNew, StoreUnavailable
+from services.errors import SchemaTooNew, StoreUnavailable
 
 BUSY_TIMEOUT_S = 10.0
 """Seconds that a writer waits for another one."""

@@ -10,12 +10,12 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from services.errors import Conflict, NotFound, StoreUnavailable
 from services.registry import activation
 from services.registry.blobs import open_blobs
 from services.registry.bundle_file import SUFFIX
 from services.registry.checking import PROGRAM, RunningChecks, Verdict, run_check
 from services.registry.database import Database
-from services.registry.errors import Conflict, NotFound, StoreUnavailable
 from services.registry.folder_lock import FolderLock
 from services.registry.limits import RegistryLimits
 from services.registry.publishing import add_version, check_by, check_name

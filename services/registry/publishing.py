@@ -6,7 +6,7 @@ import re
 
 import sqlalchemy as sa
 
-from services.registry.errors import Conflict, NotFound, Rejected
+from services.errors import Conflict, NotFound, Rejected
 from services.registry.records import State, VersionRecord
 from services.registry.rows import model_row, now, version_record, version_row
 from services.registry.staging import StagedUpload

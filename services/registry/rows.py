@@ -7,7 +7,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from services.registry.errors import NotFound
+from services.errors import NotFound
 from services.registry.records import ModelRecord, State, VersionRecord
 from services.registry.tables import ACTIVATIONS, MODELS, VERSIONS
 

@@ -13,9 +13,9 @@ from typing import BinaryIO
 from gsplat_core.errors import BundleError
 from gsplat_core.io.files import beside, write_durably
 from gsplat_core.io.model_files import open_model_file
+from services.errors import Rejected, StoreUnavailable
 from services.registry.blobs import PART_SUFFIX
 from services.registry.bundle_file import PIECE_BYTES, digest_of, members_of
-from services.registry.errors import Rejected, StoreUnavailable
 from services.registry.limits import RegistryLimits
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_core.io.files import PartialFolder
+from services.errors import BlobDamaged, Rejected, StoreUnavailable
 from services.registry.blobs import BlobStore
 from services.registry.bundle_file import MANIFEST, PIECE_BYTES, TENSORS, unpack
-from services.registry.errors import BlobDamaged, Rejected, StoreUnavailable
 
 _log = logging.getLogger(__name__)
 

@@ -12,7 +12,8 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from services.control.system_events import SystemEvents
+from services.audit.system_events import SystemEvents
+from services.errors import StoreUnavailable
 from services.jobs.pool import PoolSettings
 from services.jobs.process import PoolProcess
 from services.jobs.results import Results
@@ -22,7 +23,6 @@ from services.recordings.limits import RecordingLimits
 from services.recordings.records import State
 from services.recordings.store import RecordingStore
 from services.registry.check_limits import NICENESS
-from services.registry.errors import StoreUnavailable
 from services.registry.models import DATABASE_FILE
 from services.server.pool_keeper import PoolKeeper
 from services.server.replays import Replays

@@ -8,7 +8,7 @@ from typing import Any
 from prometheus_client import Metric
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
-from services.bus.durations import cumulative
+from services.bus.messages import cumulative
 
 SOURCE_STATES = ("starting", "opening", "live", "stalled", "reconnecting", "lost", "ended", "failed", "down", "stopped")
 LOST_BY_SOURCES = ("too_late", "bad_messages")

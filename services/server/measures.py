@@ -11,7 +11,7 @@ from prometheus_client import Metric
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.registry import Collector
 
-from services.bus.durations import cumulative
+from services.bus.messages import cumulative
 from services.bus.runtime import ROLES
 from services.display.hub import KINDS
 from services.server.graph_measures import GraphFamilies

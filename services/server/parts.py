@@ -8,17 +8,25 @@ import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from services.audit.entries import Outcome
-from services.bus.errors import BusError
+from services.audit.files import Outcome
+from services.audit.system_events import SystemEvents
 from services.bus.runtime import RuntimeFolder
 from services.clock_guard import ClockGuard
 from services.control.parts import CheckResult, NewStream, Parts
 from services.control.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable
-from services.control.system_events import SystemEvents
+from services.errors import (
+    BusError,
+    Conflict,
+    ExportBusy,
+    ExportFailed,
+    ExportRefused,
+    NoSnapshot,
+    NotFound,
+    Rejected,
+    StoreUnavailable,
+)
 from services.exports.cache import ExportCache
-from services.exports.errors import ExportBusy, ExportFailed, ExportRefused, NoSnapshot
 from services.exports.snapshots import SnapshotStore
-from services.registry.errors import Conflict, NotFound, Rejected, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from services.server import page

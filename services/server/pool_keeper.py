@@ -9,8 +9,8 @@ import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
+from services.errors import StoreUnavailable
 from services.jobs.process import PoolProcess
-from services.registry.errors import StoreUnavailable
 from services.supervisor.restarts import Restarts
 
 log = logging.getLogger(__name__)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from services.control import replay_parts
+from services.errors import NotFound, StoreUnavailable
 from services.jobs.records import JobRecord, JobState, NewJob, Submission
 from services.jobs.results import FILES, Results
 from services.jobs.store import JobStore
 from services.recordings.records import Expired
-from services.registry.errors import NotFound, StoreUnavailable
 
 
 class Replays:

@@ -8,9 +8,9 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
-from services.control.system_events import SystemEvents
+from services.audit.system_events import SystemEvents
+from services.errors import CheckFailed, NotFound, StoreUnavailable
 from services.recordings.store import RecordingStore
-from services.registry.errors import CheckFailed, NotFound, StoreUnavailable
 from services.server.replays import Replays
 
 log = logging.getLogger(__name__)

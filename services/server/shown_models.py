@@ -10,9 +10,8 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from services.bus.errors import BusError
-from services.control.system_events import SystemEvents
-from services.registry.errors import RegistryError
+from services.audit.system_events import SystemEvents
+from services.errors import BusError, RegistryError
 from services.registry.models import ModelRegistry
 from services.server.streams import Stream, SupervisedStreams
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
-from services.bus.errors import CommandRefused
 from services.control.problems import Conflicting, Unprocessable
+from services.errors import CommandRefused
 from services.exports.cache import ExportCache, Exported
 from services.exports.snapshots import Snapshot, SnapshotStore, described
 from services.registry.bundle_file import SUFFIX, pack

@@ -14,11 +14,11 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from services.audit.system_events import SystemEvents
 from services.control.parts import CheckResult
-from services.control.system_events import SystemEvents
+from services.errors import StoreUnavailable
 from services.missing_files import MissingFile, StoredFiles, count_by_kind, missing_files
 from services.registry.database import Database
-from services.registry.errors import StoreUnavailable
 
 log = logging.getLogger(__name__)
 FRESH_S = 60.0

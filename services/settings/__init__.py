@@ -1,9 +1,8 @@
 """Settings of the service, read from a file, the environment and the command line."""
 
-from services.settings.errors import SettingsInvalid
+from services.errors import SettingsInvalid
 from services.settings.load import ENVIRONMENT_PREFIX, load_settings
-from services.settings.sections import ResourceName, SourceRules, StreamSettings
-from services.settings.service import ServiceSettings
+from services.settings.sections import ResourceName, ServiceSettings, SourceRules, StreamSettings
 
 __all__ = [
     "ENVIRONMENT_PREFIX",

@@ -1,17 +1,123 @@
-"""Settings sections, one class each. Times are in seconds, sizes in bytes."""
+"""Settings of the service: their sections, and `ServiceSettings` with all of them. Times are in seconds, sizes in bytes."""
 
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
+import tempfile
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
+from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field, SecretStr, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SecretStr,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from operators.settings import check_stream_options
-from services.settings.oidc import OidcSettings
-from services.settings.section import Section
+
+_CREDENTIALS = re.compile(r"(?<=://)[^/?#|]*@")
+_SECRET_OPTION = re.compile(r"(?i)(?<=[?&#])([^=&#|]*(?:pass|secret|token|ticket|key|auth|sig)[^=&#|]*)=[^&#|]*")
+MASK = "**********"
+
+
+def masked_address(address: str) -> str:
+    """Return the address with user, password and tokens masked."""
+    return _SECRET_OPTION.sub(rf"\1={MASK}", _CREDENTIALS.sub(f"{MASK}@", address))
+
+
+MOST = 1e15
+MOST_SECONDS = 366 * 86400.0
+MOST_DAYS = 36_600.0
+
+
+class Section(BaseModel):
+    """Immutable settings section without unknown keys. Errors do not repeat secrets. Numbers are
+    finite, and booleans are not accepted as numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _of_its_kind(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse implicit conversions of pydantic: true as 1, 1 as true, 8000.0 as 8000."""
+        kinds = _kinds(cls.model_fields[str(info.field_name)].annotation)
+        if isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
+            raise ValueError(f"it must be a number, not {str(value).lower()}")
+        if isinstance(value, int | float) and not isinstance(value, bool) and bool in kinds:
+            raise ValueError(f"it must be true or false, not {value:g}")
+        if isinstance(value, float) and int in kinds and float not in kinds:
+            raise ValueError(f"it must be a whole number, not {value}")
+        return value
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _in_bounds(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            name = str(info.field_name)
+            most = MOST_SECONDS if name.endswith("_s") and "_per_" not in name else MOST
+            most = MOST_DAYS if name.endswith("_days") else most
+            if abs(value) > most:
+                raise ValueError(f"it must be at most {most:g}")
+        return value
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """Return the classes that an annotation names, those of its unions included."""
+    return {annotation, *(kind for each in get_args(annotation) for kind in _kinds(each))}
+
+
+def _url(text: str) -> str:
+    parts = urlsplit(text)
+    if parts.scheme == "https" and parts.hostname:
+        return text
+    if parts.scheme == "http" and parts.hostname and _is_loopback(parts.hostname):
+        return text
+    raise ValueError(f"{text!r:.100} is no https:// address; http:// is for this machine alone")
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+Url = Annotated[str, AfterValidator(_url), Field(examples=["https://login.example/realms/hospital"])]
+
+
+class OidcSettings(Section):
+    """OpenID Connect issuer whose users are admitted in addition to API keys; needs the extra oidc."""
+
+    issuer: Url = Field(description="As the issuer calls itself, to the letter.")
+    audience: str = Field(
+        min_length=1, description="What tokens for this service have as `aud`.", examples=["intrasplat"]
+    )
+    roles: dict[str, Literal["viewer", "operator", "admin"]] = Field(
+        min_length=1,
+        description="Role of each value of the claim; the highest counts, without one a token is refused.",
+        examples=[{"theatre-staff": "viewer", "research": "operator"}],
+    )
+    role_claim: str = Field(
+        default="roles", min_length=1, description="Claim with a text or a list, such as groups or realm_access.roles."
+    )
+    name_claim: str = Field(default="sub", min_length=1, description="Claim by which the audit log names a person.")
+    keys_url: Url | None = Field(default=None, description="JWK set. Default: what the issuer's discovery names.")
+    algorithms: tuple[
+        Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA"], ...
+    ] = Field(default=("RS256", "ES256"), min_length=1, description="Algorithms that may have signed a token.")
+    ca_file: Path | None = Field(default=None, description="Certificate of the issuer's authority (PEM).")
+    leeway_s: float = Field(default=30.0, ge=0, le=300, description="By how much clocks may differ.")
+
 
 NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
 ResourceName = Annotated[str, Field(pattern=NAME_PATTERN, examples=["theatre-1"])]
@@ -241,3 +347,65 @@ class StreamSettings(Section):
     def _known_options(cls, options: dict[str, Any]) -> dict[str, Any]:
         check_stream_options(options)
         return options
+
+
+class ServiceSettings(BaseSettings):
+    """Settings of `intrasplat serve`. Later sources win: defaults, file, environment, flags."""
+
+    model_config = SettingsConfigDict(
+        env_prefix="INTRASPLAT_", env_nested_delimiter="__", extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    version: Literal[1] = Field(default=1, description="Version of this format.")
+    server: ServerSettings = ServerSettings()
+    paths: PathSettings = PathSettings()
+    auth: AuthSettings = AuthSettings()
+    audit: AuditSettings = AuditSettings()
+    limits: LimitSettings = LimitSettings()
+    sources: SourceRules = SourceRules()
+    registry: RegistrySettings = RegistrySettings()
+    uploaded_recordings: RecordingSettings = RecordingSettings()
+    jobs: JobSettings = JobSettings()
+    log: LogSettings = LogSettings()
+    streams: dict[ResourceName, StreamSettings] = Field(
+        default={"endoscope": StreamSettings(source="synthetic:?width=320&height=256&frames=24&moving=1")},
+        description="Streams that are there from the start.",
+    )
+
+    @model_validator(mode="after")
+    def _no_more_streams_than_may_be(self) -> ServiceSettings:
+        if len(self.streams) > self.limits.streams:
+            raise ValueError(
+                f"{len(self.streams)} streams are listed and limits.streams is {self.limits.streams}; raise it"
+            )
+        return self
+
+    @cached_property
+    def data_dir(self) -> Path:
+        """Return the folder of all persistent data."""
+        return self.paths.data or _base("XDG_DATA_HOME", Path.home() / ".local" / "share") / "intrasplat"
+
+    @cached_property
+    def runtime_dir(self) -> Path:
+        """Return the folder of the sockets; a short path, because socket paths are limited."""
+        if self.paths.runtime is not None:
+            return self.paths.runtime
+        if os.environ.get("XDG_RUNTIME_DIR"):
+            return Path(os.environ["XDG_RUNTIME_DIR"]) / "intrasplat"
+        return Path(tempfile.gettempdir()) / f"intrasplat-{os.getuid()}"
+
+    @property
+    def admin_key_file(self) -> Path:
+        """Return the file of the first administrator's key."""
+        return self.auth.admin_key_file or self.data_dir / "admin.key"
+
+    def shown(self) -> dict[str, Any]:
+        """Return the settings as JSON, with secrets and passwords in source addresses masked."""
+        values = self.model_dump(mode="json")
+        for stream in values["streams"].values():
+            stream["source"] = masked_address(stream["source"])
+        return values
+
+
+def _base(variable: str, default: Path) -> Path:
+    return Path(os.environ[variable]) if os.environ.get(variable) else default

@@ -25,8 +25,8 @@ from operators.sources.registry import STUCK_AFTER_S, open_source, split_address
 from operators.sources.source import FrameSource, ReportingSource, SourceState
 from operators.sources.wire import description_to, frame_header, planes_of
 from operators.sources.zeromq_message import pieces
-from services.bus.errors import CommandRefused
 from services.bus.pictures import PicturePublisher
+from services.errors import CommandRefused
 from services.private_files import keep_files_private
 from services.supervisor.exit_codes import FAILED, NO_USE
 from services.supervisor.specs import SourceSpec

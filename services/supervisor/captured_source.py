@@ -19,11 +19,10 @@ from operators.sources.source import SourceDescription, SourceState
 from operators.sources.wire import BadHeader, description_from, frame_from
 from operators.sources.zeromq_message import BadMessage as BadFrame
 from operators.sources.zeromq_message import unpacked_pieces
-from services.bus.commands import ask
-from services.bus.errors import BadMessage, BusError
-from services.bus.messages import parsed_json
+from services.bus.messages import ask, parsed_json
 from services.bus.pictures import split, subscribe
 from services.bus.runtime import StreamFolder
+from services.errors import BadMessage, BusError
 
 LOOK_MS = 50
 ASK_AGAIN_S = 0.1

@@ -9,8 +9,8 @@ from gsplat_core.errors import UserError
 from operators.applications.working_size import WorkingSize
 from operators.settings import check_option
 from operators.sources.source import SourceDescription
-from services.bus.errors import BadMessage
 from services.bus.runtime import read_json, write_json
+from services.errors import BadMessage
 from services.supervisor.specs import EngineSpec
 
 SHARE_OF_INTERVAL = 0.5

@@ -16,7 +16,7 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.rendering.registry import new_renderer
 from operators.applications.limits import check_picture
 from operators.rasterize import displayed
-from services.bus.errors import CommandRefused
+from services.errors import CommandRefused
 from services.supervisor.layer_drawing import LayerScene
 
 

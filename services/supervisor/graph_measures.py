@@ -6,7 +6,7 @@ from typing import Any
 
 from operators.graph.application import Application
 from operators.graph.tracking import Histogram
-from services.bus.durations import BOUNDS_S
+from services.bus.messages import BOUNDS_S
 
 BOUNDS_NS = tuple(round(bound_s * 1e9) for bound_s in BOUNDS_S)
 
@@ -22,5 +22,5 @@ def graph_measures(graph: Application) -> dict[str, Any]:
 
 
 def _serialised(histogram: Histogram) -> dict[str, Any]:
-    """Return a histogram in the format of `services.bus.durations.Durations`."""
+    """Return a histogram in the format of `services.bus.messages.Durations`."""
     return {"counts": histogram.between(BOUNDS_NS), "sum_s": round(histogram.sum_ns * 1e-9, 6)}

@@ -34,10 +34,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gsplat_core.errors import UserError
-from services.bus.errors import AlreadyRunning, BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
-from services.bus.process_identity import ProcessIdentity
-from services.bus.runtime import RuntimeFolder, check_path, write_json
+from services.bus.runtime import ProcessIdentity, RuntimeFolder, check_path, write_json
+from services.errors import AlreadyRunning, BadMessage
 from services.private_files import keep_files_private
 from services.supervisor.launching import FORKED, RECORD, SOCKET, recorded_launcher
 from services.supervisor.process_end import ended_how

@@ -12,10 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from services.bus.errors import BadMessage, NoAnswer
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
-from services.bus.process_identity import ProcessIdentity
-from services.bus.runtime import RuntimeFolder, read_json
+from services.bus.runtime import ProcessIdentity, RuntimeFolder, read_json
+from services.errors import BadMessage, NoAnswer
 from services.supervisor.process_end import status_of_child
 
 log = logging.getLogger(__name__)

@@ -15,9 +15,9 @@ from operators.display import DisplaySettings
 from operators.messages import PictureState
 from operators.side_thread import step_back
 from operators.sources.source import SourceState
-from services.bus.errors import BadMessage
+from services.bus.pictures import WatchedPublisher, wait_for_readers
 from services.bus.runtime import LAYERS, Layer, StreamFolder
-from services.bus.watched_pictures import WatchedPublisher, wait_for_readers
+from services.errors import BadMessage
 from services.supervisor.layer_drawing import LayerDrawing, LayerScene, label
 
 log = logging.getLogger(__name__)

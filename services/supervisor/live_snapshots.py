@@ -16,8 +16,8 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import StagedCopies
 from operators.applications.live import LiveApplication
 from operators.reconstruct import LiveReconstructOp
-from services.bus.commands import text_of
-from services.bus.errors import CommandRefused
+from services.bus.messages import text_of
+from services.errors import CommandRefused
 
 WAIT_S = 5.0
 """Seconds to wait for the end of a frame."""

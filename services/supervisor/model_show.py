@@ -15,9 +15,9 @@ from gsplat_core.errors import UserError
 from gsplat_core.scene.frames import Frame
 from operators.messages import PictureState
 from operators.sources.source import SourceState
-from services.bus.commands import text_of
-from services.bus.errors import BadMessage, BusError, CommandRefused
+from services.bus.messages import text_of
 from services.bus.runtime import read_json, write_json
+from services.errors import BadMessage, BusError, CommandRefused
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.finished_model import FinishedModel, NotFinite
 from services.supervisor.layers import Layers

@@ -15,12 +15,10 @@ from typing import Any, Literal
 import zmq
 import zmq.asyncio
 
-from services.bus.commands import ask_async
-from services.bus.errors import BadMessage, BusError, NoAnswer
-from services.bus.messages import parsed_json
+from services.bus.messages import ask_async, parsed_json
 from services.bus.pictures import subscribe
-from services.bus.process_identity import ProcessIdentity
-from services.bus.runtime import Role, StreamFolder
+from services.bus.runtime import ProcessIdentity, Role, StreamFolder
+from services.errors import BadMessage, BusError, NoAnswer
 from services.supervisor.launching import Start
 from services.supervisor.process_end import cause_of, is_of_no_use, last_words
 from services.supervisor.restarts import MOST_S, Restarts

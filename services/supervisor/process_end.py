@@ -7,7 +7,7 @@ import re
 import signal
 from pathlib import Path
 
-from services.settings.addresses import masked_address
+from services.settings.sections import masked_address
 from services.supervisor.exit_codes import NO_USE
 
 _TAIL_BYTES = 4096

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
-from services.bus.durations import Durations
+from services.bus.messages import Durations
 from services.bus.pictures import PicturePublisher
 
 Shows = Literal["live", "model"]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from services.bus.commands import ANSWER_S
+from services.bus.messages import ANSWER_S
 from services.bus.runtime import Role, RuntimeFolder, StreamFolder
 from services.supervisor.launching import Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent

@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping
 from types import FrameType, TracebackType
 from typing import Any
 
-from services.bus.commands import CommandServer, Handler
-from services.bus.heartbeats import Heartbeats
+from services.bus.messages import CommandServer, Handler, Heartbeats
 from services.bus.runtime import Role, StreamFolder
 from services.supervisor.specs import ProcessSpec
 

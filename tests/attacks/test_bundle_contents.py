@@ -9,8 +9,8 @@ import torch
 from safetensors.torch import save
 
 from gsplat_core.io.bundle import load_bundle
+from services.errors import Conflict
 from services.registry.bundle_file import pack
-from services.registry.errors import Conflict
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 

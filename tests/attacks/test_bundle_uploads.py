@@ -10,8 +10,8 @@ import zlib
 import pytest
 import torch
 
+from services.errors import Rejected, StoreUnavailable
 from services.registry.bundle_file import MANIFEST, TENSORS, pack
-from services.registry.errors import Rejected, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 

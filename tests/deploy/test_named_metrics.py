@@ -13,10 +13,10 @@ import pytest
 import yaml
 
 from services.audit import AuditLog
+from services.audit.system_events import SystemEvents
 from services.control.certificate import ServerCertificate
 from services.control.measures import Measures
 from services.control.storage import Storage
-from services.control.system_events import SystemEvents
 from services.missing_files import StoredFiles
 from services.registry.database import Database
 from services.server.measures import STATES, StreamMeasures

@@ -16,16 +16,16 @@ import sqlalchemy as sa
 
 from services import backup as backups
 from services.audit import AuditLog, verify
+from services.audit.system_events import SystemEvents
 from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, restore_backup
 from services.cli.backup import backup_command, restore_command
 from services.control.app import AUDIT_FILE, KEYS_FILE
 from services.control.auth.keys import KeyStore
 from services.control.auth.roles import Role
-from services.control.system_events import SystemEvents
+from services.errors import StoreUnavailable
 from services.jobs.tables import JOBS
 from services.recordings.records import State
 from services.recordings.tables import RECORDINGS
-from services.registry.errors import StoreUnavailable
 from services.registry.tables import MODELS, VERSIONS
 from services.server.archive import Archive, new_archive
 from services.server.parts import registry_of

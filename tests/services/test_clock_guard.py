@@ -9,9 +9,9 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from services.audit import AuditLog, Keeping
-from services.audit.segments import closed_segments
+from services.audit.files import closed_segments
+from services.audit.system_events import SystemEvents
 from services.clock_guard import CONFIRM_S, FILE, ClockGuard
-from services.control.system_events import SystemEvents
 from services.server.retention import RecordingRetention, ReplayRetention
 
 DAY_S = 86_400.0
@@ -130,7 +130,7 @@ def test_the_audit_log_stays_while_the_clock_is_not_believed(tmp_path, monkeypat
         def now(cls, tz=None):
             return datetime.now(UTC) + timedelta(days=400)
 
-    monkeypatch.setattr("services.audit.segments.datetime", Later)
+    monkeypatch.setattr("services.audit.files.datetime", Later)
     AuditLog(path, keeping).close()
     assert len(closed_segments(path)) == many > 3
     trusted[0] = True

@@ -16,7 +16,7 @@ import httpx2
 import jwt
 
 from services.control.problems import Unauthenticated, Unavailable
-from services.settings.oidc import OidcSettings
+from services.settings.sections import OidcSettings
 
 log = logging.getLogger(__name__)
 FRESH_S = 600.0

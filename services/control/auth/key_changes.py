@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from services.audit import AuditLog, AuditUnwritable
-from services.audit.entries import Detail
+from services.audit.files import Detail
 from services.control.auth.keys import ApiKey, KeyStore
 
 log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ import jwt
 from services.control.auth.issuer_keys import IssuerKeys
 from services.control.auth.roles import Caller, Role
 from services.control.problems import Forbidden, Unauthenticated
-from services.settings.oidc import OidcSettings
+from services.settings.sections import OidcSettings
 
 MOST_TOKEN_LENGTH = 8192
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9._@+-]{1,80}")

@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from services.audit import ExportFormat, Wanted
-from services.audit.entries import Outcome
+from services.audit.files import Outcome
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.moments import Moment
 from services.control.recorded import recorded

@@ -16,7 +16,7 @@ from services.control.recorded import recorded
 from services.control.sources import check_source
 from services.control.state import control_of, part
 from services.settings import ResourceName, StreamSettings
-from services.settings.addresses import masked_address
+from services.settings.sections import masked_address
 
 router = new_router("streams")
 MOST_OPTIONS = 50

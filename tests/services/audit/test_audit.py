@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from services.audit import AuditError, AuditLog, AuditUnwritable, verify
-from services.audit.entries import Entry, digest_of_entry, parse_line
-from services.audit.head import head_path
+from services.audit.files import Entry, digest_of_entry, head_path, parse_line
 
 ENTRIES = 12
 

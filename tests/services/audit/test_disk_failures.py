@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from services.audit import AuditLog, AuditUnwritable, Keeping, verify
-from services.audit.entries import digest_of_entry, parse_line
-from services.audit.head import Head, head_path, read_head, write_head
+from services.audit.files import Head, digest_of_entry, head_path, parse_line, read_head, write_head
 
 CALLS = ("open", "write", "fsync", "fdatasync", "ftruncate", "rename", "replace")
 ONE_FILE = Keeping()

@@ -15,9 +15,7 @@ from pathlib import Path
 import pytest
 
 from services.audit import AuditLog, Keeping, verify
-from services.audit.entries import parse_line
-from services.audit.head import anchor_path, read_anchor, write_anchor
-from services.audit.segments import closed_segments, segment_path
+from services.audit.files import anchor_path, closed_segments, parse_line, read_anchor, segment_path, write_anchor
 
 SMALL = Keeping(segment_bytes=1000)
 ENTRIES = 20
@@ -96,7 +94,7 @@ def test_segments_go_by_their_age(tmp_path, monkeypatch):
         def now(cls, tz=None):
             return datetime.now(UTC) + timedelta(days=1.5)
 
-    monkeypatch.setattr("services.audit.segments.datetime", Tomorrow)
+    monkeypatch.setattr("services.audit.files.datetime", Tomorrow)
     AuditLog(log.path, keeping).close()
     assert closed_segments(log.path) == [] and verify(log.path).intact
 

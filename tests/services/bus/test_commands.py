@@ -7,9 +7,8 @@ import pytest
 import zmq
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.commands import CommandServer, ask, ask_async, text_of
-from services.bus.errors import BadMessage, CommandRefused, NoAnswer
-from services.bus.messages import MOST_BYTES
+from services.bus.messages import MOST_BYTES, CommandServer, ask, ask_async, text_of
+from services.errors import BadMessage, CommandRefused, NoAnswer
 
 
 def refuse(arguments):

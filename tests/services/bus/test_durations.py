@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.bus.durations import BOUNDS_S, Durations, cumulative
+from services.bus.messages import BOUNDS_S, Durations, cumulative
 
 
 def test_durations_are_counted_by_bucket():

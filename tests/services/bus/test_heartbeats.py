@@ -4,7 +4,7 @@ import json
 
 import zmq
 
-from services.bus.heartbeats import Heartbeats
+from services.bus.messages import Heartbeats
 from services.bus.pictures import subscribe
 
 

@@ -5,8 +5,8 @@ import pickle
 
 import pytest
 
-from services.bus.errors import BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
+from services.errors import BadMessage
 
 
 def test_round_trip():

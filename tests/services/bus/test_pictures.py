@@ -11,8 +11,8 @@ import pytest
 import zmq
 
 from operators.sources.zeromq_message import pieces
-from services.bus.errors import BadMessage
 from services.bus.pictures import HIGH_WATER, PicturePublisher, picture_from, subscribe
+from services.errors import BadMessage
 
 
 @pytest.fixture

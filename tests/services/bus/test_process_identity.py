@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 
-from services.bus.process_identity import ProcessIdentity
+from services.bus.runtime import ProcessIdentity
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(60)"]
 

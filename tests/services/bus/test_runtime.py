@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from services.bus.errors import AlreadyRunning, RuntimeFolderUnusable
-from services.bus.process_identity import ProcessIdentity
-from services.bus.runtime import RuntimeFolder, default_runtime_folder, write_json
+from services.bus.runtime import ProcessIdentity, RuntimeFolder, default_runtime_folder, write_json
+from services.errors import AlreadyRunning, RuntimeFolderUnusable
 
 
 def mode(path: Path) -> int:

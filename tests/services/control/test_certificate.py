@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from services.audit.system_events import SystemEvents
 from services.control.certificate import ServerCertificate, expiry_of
-from services.control.system_events import SystemEvents
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography comes with the extra oidc")
 from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402

@@ -17,10 +17,10 @@ import pytest
 
 from services.control import Parts, new_app
 from services.control.connections import AddressBound, BoundedListener
-from services.control.errors import CannotServe
 from services.control.limits import network_of_address
 from services.control.probe import MOST_CONNECTIONS, MOST_HEAD_BYTES, ProbeListener, bind_probe
 from services.control.server import DrainingServer, bind, config_of
+from services.errors import CannotServe
 from services.settings import ServiceSettings
 from tests.services.control.conftest import fakes
 

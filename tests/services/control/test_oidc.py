@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from services.control.problems import PROBLEM_JSON
 from services.settings import SettingsInvalid
-from services.settings.oidc import OidcSettings
+from services.settings.sections import OidcSettings
 
 jwt = pytest.importorskip("jwt", reason="PyJWT is in the extra oidc")
 from cryptography.hazmat.primitives import serialization  # noqa: E402

@@ -11,11 +11,11 @@ from starlette.websockets import WebSocketDisconnect
 
 from services.control.problems import Conflicting, Missing
 from services.control.routes.results import REPORT_POLICY
+from services.errors import NotFound
 from services.jobs.claims import Claims
 from services.jobs.records import JobProgress, JobState
 from services.jobs.results import Results
 from services.jobs.store import JobStore
-from services.registry.errors import NotFound
 from services.server.parts import ERRORS
 from services.server.replays import Replays
 

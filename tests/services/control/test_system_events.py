@@ -7,9 +7,8 @@ import time
 
 import pytest
 
-from services.audit import AuditLog, AuditUnwritable
-from services.control import system_events
-from services.control.system_events import SystemEvents
+from services.audit import AuditLog, AuditUnwritable, system_events
+from services.audit.system_events import SystemEvents
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ import pytest
 
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
+from services.errors import ExportBusy, ExportFailed, ExportRefused
 from services.exports.cache import ExportCache
-from services.exports.errors import ExportBusy, ExportFailed, ExportRefused
 from services.exports.formats import ALL
 from services.exports.programs import ExportPrograms
 from services.registry.bundle_file import members_of

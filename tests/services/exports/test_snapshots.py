@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.exports.errors import NoSnapshot
+from services.errors import NoSnapshot
 from services.exports.snapshots import Snapshot, SnapshotStore, described
 
 SAID = {"seq": 7, "model_version": 3, "gaussians": 12, "time_window_s": [1.0, 2.0], "pause_ms": 0.4, "more": 1}

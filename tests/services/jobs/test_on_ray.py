@@ -7,10 +7,10 @@ import time
 
 import pytest
 
+from services.errors import StoreUnavailable
 from services.jobs.pool import JobPool, PoolSettings
 from services.jobs.records import JobState, NewJob
 from services.jobs.results import RUNNING, Results
-from services.registry.errors import StoreUnavailable
 
 pytestmark = pytest.mark.slow
 

@@ -6,10 +6,10 @@ import json
 
 import pytest
 
+from services.errors import StoreUnavailable
 from services.jobs.pool import JobPool
 from services.jobs.records import JobState, NewJob
 from services.jobs.results import RUNNING
-from services.registry.errors import StoreUnavailable
 
 
 def submitted(store, count=1):

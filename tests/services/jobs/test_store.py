@@ -10,12 +10,12 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
 from operators.settings import JobOptions
+from services.errors import Conflict, NotFound, Rejected
 from services.jobs.claims import Claims
 from services.jobs.records import JobState, NewJob
 from services.jobs.store import DAY_S, MOST_AT_ONCE, uses_recording
 from services.jobs.tables import METADATA, SCHEMA
 from services.registry import rows
-from services.registry.errors import Conflict, NotFound, Rejected
 
 
 def test_the_migrations_make_the_tables_that_the_program_uses(new_store):

@@ -12,10 +12,10 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
 from gsplat_core.io.recordings import open_recording
+from services.errors import CheckFailed, Conflict, NotFound, Rejected
 from services.recordings.limits import RecordingLimits
 from services.recordings.records import State
 from services.recordings.tables import METADATA, RECORDINGS
-from services.registry.errors import CheckFailed, Conflict, NotFound, Rejected
 from services.registry.rows import now
 
 VERDICT = """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.registry.errors import Conflict
+from services.errors import Conflict
 from services.registry.models import ModelRegistry
 from tests.services.registry.stub_check import ALWAYS_READY
 

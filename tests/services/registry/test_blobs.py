@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from services.errors import StoreUnavailable
 from services.registry import blobs
 from services.registry.blobs import FolderBlobs, RemoteBlobs, open_blobs
-from services.registry.errors import StoreUnavailable
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import tarfile
 import pytest
 
 from gsplat_core.io import bundle, manifest
+from services.errors import Rejected
 from services.registry import bundle_file
 from services.registry.bundle_file import MANIFEST, TENSORS, members_of, pack, unpack
-from services.registry.errors import Rejected
 from tests.services.registry.made import save_model
 
 

@@ -16,9 +16,9 @@ import torch
 from gsplat_core.io import model_files
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.rendering.alpha import AlphaRenderer
+from services.errors import CheckFailed
 from services.registry import check
 from services.registry.checking import PROGRAM, run_check
-from services.registry.errors import CheckFailed
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import packed_model, save_model

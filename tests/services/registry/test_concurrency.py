@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from services.registry.errors import NotFound
+from services.errors import NotFound
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.activating import ROUNDS, activate_together

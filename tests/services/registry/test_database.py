@@ -7,8 +7,8 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
+from services.errors import SchemaTooNew, StoreUnavailable
 from services.registry.database import Database
-from services.registry.errors import SchemaTooNew, StoreUnavailable
 from services.registry.models import ModelRegistry
 from services.registry.tables import METADATA, MODELS
 from tests.services.registry.servers import new_database

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from gsplat_core.io.bundle import load_bundle
-from services.registry.errors import BlobDamaged, Conflict, NotFound, Rejected, StillActive, StoreUnavailable
+from services.errors import BlobDamaged, Conflict, NotFound, Rejected, StillActive, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import add_ready, assert_whole, packed_model, sha256

@@ -6,7 +6,7 @@ import numpy as np
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
-from services.bus.durations import BOUNDS_S, Durations
+from services.bus.messages import BOUNDS_S, Durations
 from services.server.graph_measures import GraphFamilies
 from services.server.measures import StreamMeasures
 from services.supervisor.process_end import cause_of

@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-from services.control.system_events import SystemEvents
+from services.audit.system_events import SystemEvents
 from services.server.measures import StreamMeasures
 from services.server.parts import assembled, told
 from services.server.streams import StreamFacts, SupervisedStreams

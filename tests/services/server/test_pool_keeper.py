@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.registry.errors import StoreUnavailable
+from services.errors import StoreUnavailable
 from services.server import pool_keeper as keepers
 from services.server.pool_keeper import PoolKeeper, relayed
 

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.bus.errors import CommandRefused
-from services.registry.errors import Conflict
+from services.errors import CommandRefused, Conflict
 from services.server.shown_models import ShownModels
 
 

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.errors import CommandRefused
 from services.control.problems import Conflicting, Unprocessable
+from services.errors import CommandRefused
 from services.exports.formats import ALL, ExportWish
 from services.registry.records import State
 from services.server import snapshots as parts

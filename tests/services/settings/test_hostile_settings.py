@@ -7,7 +7,7 @@ import os
 import pytest
 
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
-from services.settings.yaml_file import yaml_value
+from services.settings.load import yaml_value
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import os
 import pytest
 
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
-from services.settings.addresses import masked_address
+from services.settings.sections import masked_address
 
 
 @pytest.fixture(autouse=True)

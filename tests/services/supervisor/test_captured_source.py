@@ -12,8 +12,7 @@ from operators.errors import SourceUnavailable
 from operators.sources.source import SourceDescription, SourceState
 from operators.sources.wire import description_to, frame_header, planes_of
 from operators.sources.zeromq_message import pieces
-from services.bus.commands import CommandServer
-from services.bus.heartbeats import Heartbeats
+from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher
 from services.supervisor.captured_source import CapturedSource
 

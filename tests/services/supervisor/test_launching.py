@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from services.bus.process_identity import ProcessIdentity
+from services.bus.runtime import ProcessIdentity
 from services.supervisor.launcher import Launcher
 from services.supervisor.launching import SOCKET, ByLauncher, Direct, recorded_launcher
 from services.supervisor.process_end import is_of_no_use, last_words

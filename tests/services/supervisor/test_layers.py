@@ -10,8 +10,8 @@ import pytest
 import zmq
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.errors import BadMessage
 from services.bus.pictures import picture_from, subscribe
+from services.errors import BadMessage
 from services.supervisor import layers as layers_module
 from services.supervisor.layers import Layers
 

@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.scene.snapshots import SnapshotSlots
 from operators.reconstruct import ModelRequest
-from services.bus.errors import BadMessage, CommandRefused
+from services.errors import BadMessage, CommandRefused
 from services.supervisor import live_snapshots
 from services.supervisor.live_snapshots import LiveSnapshots
 from tests.services.supervisor.test_model_show import uniform

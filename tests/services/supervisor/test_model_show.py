@@ -16,7 +16,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from operators.sources.source import SourceState
-from services.bus.errors import BadMessage, CommandRefused
+from services.errors import BadMessage, CommandRefused
 from services.supervisor import model_show
 from services.supervisor.finished_model import FinishedModel, NotFinite
 from services.supervisor.model_show import LATE_IN_A_ROW, ModelShow

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from services.bus.errors import NoAnswer
+from services.errors import NoAnswer
 from services.supervisor import process as processes
 from services.supervisor.launching import Direct
 from services.supervisor.process import ManagedProcess, Rate

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from services.control.system_events import SystemEvents
+from services.audit.system_events import SystemEvents
 from services.server.measures import StreamMeasures
 from services.server.parts import told
 from services.supervisor import process as processes

@@ -20,8 +20,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from services.bus.pictures import split, subscribe
-from services.bus.process_identity import ProcessIdentity
-from services.bus.runtime import RuntimeFolder
+from services.bus.runtime import ProcessIdentity, RuntimeFolder
 from services.supervisor.launching import ByLauncher, Direct
 from services.supervisor.process import ManagedProcess, StreamEvent
 from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec

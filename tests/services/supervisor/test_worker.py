@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.commands import ask
-from services.bus.errors import AlreadyRunning
+from services.bus.messages import ask
+from services.errors import AlreadyRunning
 from services.supervisor import worker as workers
 from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
 from services.supervisor.worker import MEASURED_EVERY_S, SIGNALS, Worker, stream_folder_of

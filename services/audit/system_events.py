@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from services.audit import AuditLog, AuditUnwritable
-from services.audit.entries import Detail, Outcome
+from services.audit.files import Detail, Outcome
 
 log = logging.getLogger(__name__)
 MOST_WAITING = 1000

@@ -1,0 +1,126 @@
+"""Errors of the services, one tree per part. Each message states what happened, the value and the remedy.
+
+Errors of HTTP requests, with their status, are in `services.api.problems`.
+"""
+
+from __future__ import annotations
+
+from gsplat_core.errors import UserError
+
+
+class SettingsInvalid(UserError, ValueError):
+    """A settings file, environment variable or flag is invalid. The message names it and the
+    remedy."""
+
+
+class BusError(Exception):
+    """Base class of the bus errors."""
+
+
+class RuntimeFolderUnusable(BusError, UserError):
+    """The runtime folder has another owner, is accessible to other users, or its path is too long."""
+
+
+class AlreadyRunning(BusError, UserError):
+    """Another process serves this role of the stream."""
+
+
+class BadMessage(BusError):
+    """A message on a socket is malformed."""
+
+
+class NoAnswer(BusError):
+    """A process did not answer a command in time."""
+
+
+class CommandRefused(BusError):
+    """A process refused a command. The message is its reason."""
+
+
+class RegistryError(UserError):
+    """Base class of the registry's errors."""
+
+
+class NotFound(RegistryError):
+    """The model or version does not exist."""
+
+
+class Conflict(RegistryError):
+    """A concurrent change was first, or the version's state does not permit the operation."""
+
+
+class StillActive(Conflict):
+    """The active version cannot be deleted."""
+
+
+class Rejected(RegistryError):
+    """The upload is invalid; nothing was stored."""
+
+
+class StoreUnavailable(RegistryError):
+    """Database or file storage is unavailable; nothing was changed."""
+
+
+class SchemaTooNew(StoreUnavailable):
+    """A later version of this program wrote the database."""
+
+
+class BlobDamaged(StoreUnavailable):
+    """The stored file of a version is missing or altered."""
+
+
+class CheckFailed(StoreUnavailable):
+    """The check of a version could not run. The version itself may be valid."""
+
+
+class ExportsError(UserError):
+    """Base class of the export errors."""
+
+
+class ExportRefused(ExportsError):
+    """The model cannot be exported to the format. The message is one sentence."""
+
+
+class ExportBusy(ExportsError):
+    """Too many exports are waiting."""
+
+
+class ExportFailed(ExportsError):
+    """The export program or the disk failed."""
+
+
+class NoSnapshot(ExportsError):
+    """The snapshot does not exist."""
+
+
+class AuditError(Exception):
+    """Base class of the audit log's errors."""
+
+
+class AuditUnwritable(AuditError, UserError):
+    """An entry or the log itself could not be written. The message names the file and the cause."""
+
+
+class AuditInUse(AuditError, UserError):
+    """Another process writes this log. Each folder belongs to one service."""
+
+
+class CannotServe(UserError):
+    """The server cannot listen as the settings demand."""
+
+
+class ClientError(UserError):
+    """Base class of the client's errors."""
+
+
+class Unreachable(ClientError):
+    """No server answers at the address, or the connection broke."""
+
+
+class Refused(ClientError):
+    """The server refused the request. The message is the server's."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(f"the server refuses ({status}): {sentence}")
+        self.status = status
+        self.sentence = sentence
