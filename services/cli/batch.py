@@ -20,8 +20,7 @@ from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.cli.interrupt import ASKING
 from services.cli.streams import printable
 from services.jobs.batch import Batch, Counts, Summary
-from services.jobs.pool import PoolSettings
-from services.jobs.process import new_runner
+from services.jobs.pool import PoolSettings, new_runner
 
 SAY_S = 5.0
 

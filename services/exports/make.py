@@ -15,7 +15,7 @@ from pathlib import Path
 
 from gsplat_core.errors import UserError
 from gsplat_core.io.exports.formats import ExportWish
-from services.exports.formats import ALL, ISPLAT
+from services.exports.cache import ALL, ISPLAT
 from services.private_files import keep_files_private
 from services.registry.bundle_file import pack
 

@@ -23,7 +23,7 @@ from operators.storage import storage_errors
 from services.jobs.pool import JobPool, PoolSettings
 from services.jobs.records import JobRecord, JobState, NewJob
 from services.jobs.results import RUNNING, Results
-from services.jobs.runner import Runner
+from services.jobs.runners import Runner
 from services.jobs.store import MOST_AT_ONCE, JobStore
 
 DATABASE = BATCH_DATABASE

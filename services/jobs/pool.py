@@ -1,24 +1,25 @@
-"""Job pool: claims jobs, runs attempts and publishes their results.
-
-Only the pool publishes, and only while it holds the claim. One rename moves a result into place and
-fails if a result exists. An attempt whose pool died or lost its claim thus leaves no result.
-"""
+"""Job pool: claims jobs, runs attempts and publishes their results. As a process: `python -m services.jobs.pool`."""
 
 from __future__ import annotations
 
+import json
 import logging
 import secrets
+import select
+import signal
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from services.errors import StoreUnavailable
-from services.jobs.claims import Claims
-from services.jobs.records import Claimed, JobState
-from services.jobs.results import Results, Workspace
-from services.jobs.runner import Runner
-from services.jobs.task import Task
+from services.jobs.records import SCHEMA, Claimed, JobState
+from services.jobs.results import Results, Task, Workspace
+from services.jobs.runners import Runner
+from services.jobs.store import Claims
+from services.private_files import keep_files_private
 from services.registry.database import Database
 
 log = logging.getLogger(__name__)
@@ -169,3 +170,75 @@ class JobPool:
         self._running.clear()
         self._workspace.close()
         self._database.close()
+
+
+MOST_LINE = 1 << 16
+
+
+@dataclass(frozen=True)
+class PoolProcess:
+    """Configuration of the pool process."""
+
+    database: str
+    results: str
+    pool: PoolSettings = field(default_factory=PoolSettings)
+    ray: str | None = None
+    """Address of a Ray cluster; None runs local processes."""
+    idle_s: float = 60.0
+
+    def line(self) -> bytes:
+        """Return the configuration as an input line."""
+        return json.dumps(asdict(self)).encode() + b"\n"
+
+    @classmethod
+    def of_line(cls, line: str) -> PoolProcess:
+        """Parse an input line."""
+        values: dict[str, Any] = json.loads(line)
+        return cls(**{**values, "pool": PoolSettings(**values["pool"])})
+
+
+def new_runner(ray: str | None) -> Runner:
+    """Create the runner.
+
+    Raises:
+        StoreUnavailable: if Ray is configured and cannot be used.
+    """
+    if ray is not None:
+        from services.jobs.runners import OnRay
+
+        return OnRay(ray)
+    from services.jobs import runners
+
+    runners.load()
+    return runners.Forks()
+
+
+def main() -> int:
+    """Run until the input closes.
+
+    Returns:
+        The exit code.
+    """
+    keep_files_private()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: stopped.append(True))
+    stopped: list[bool] = []
+    settings = PoolProcess.of_line(sys.stdin.readline(MOST_LINE))
+    try:
+        runner = new_runner(settings.ray)
+        pool = JobPool(Database(settings.database, SCHEMA), Results(Path(settings.results)), runner, settings.pool)
+    except StoreUnavailable as error:
+        logging.error("%s", error)
+        return 2
+
+    def is_over() -> bool:
+        return bool(stopped) or pool.idle_s > settings.idle_s or bool(select.select([sys.stdin], [], [], 0)[0])
+
+    pool.run(is_over)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

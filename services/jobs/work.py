@@ -16,7 +16,7 @@ from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import RunOutcome
 from services.cli.exit_codes import user_sentence
 from services.jobs.records import JobProgress, JobState
-from services.jobs.task import Task
+from services.jobs.results import Task
 from services.registry.bundle_file import SUFFIX, pack
 from services.reports.build import write_reports
 from services.reports.nothing_shown import require_shown

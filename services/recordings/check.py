@@ -20,11 +20,8 @@ from typing import Any
 
 from gsplat_core.io.recordings import validate_recording
 from services.private_files import keep_files_private
-from services.recordings.archive_list import ArchiveInvalid
-from services.recordings.kinds import ARCHIVE
-from services.recordings.limits import RecordingLimits
-from services.recordings.unpack import unpack
-from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
+from services.recordings.archives import ARCHIVE, ArchiveInvalid, RecordingLimits, unpack
+from services.registry.limits import NICENESS, lower_limit, taken_bytes
 
 UPLOAD = "upload"
 _REPORTED_FACTS = (

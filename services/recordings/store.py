@@ -1,4 +1,7 @@
-"""Store of uploaded recordings."""
+"""Store of uploaded recordings: records, table, files and checks.
+
+Each change of the table needs a new file in `migrations/versions`.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,10 @@ import secrets
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +23,86 @@ import sqlalchemy as sa
 
 from gsplat_core.io.files import sync_folder
 from services.errors import CheckFailed, Conflict, NotFound, StoreUnavailable
-from services.recordings.kinds import ARCHIVE, kind_of
-from services.recordings.limits import RecordingLimits
-from services.recordings.records import Expired, RecordingRecord, State, recording_record
-from services.recordings.tables import RECORDINGS, SCHEMA
+from services.recordings.archives import ARCHIVE, RecordingLimits, kind_of
 from services.registry.checking import BroughtDown, RunningChecks, run_program
-from services.registry.database import Database
-from services.registry.rows import now
+from services.registry.database import Database, Schema
+from services.registry.records import now
 
+
+class State(StrEnum):
+    """State of a recording: `uploaded` → `ready`, or `rejected` with a reason. `missing` if a start
+    did not find its files."""
+
+    UPLOADED = "uploaded"
+    READY = "ready"
+    REJECTED = "rejected"
+    MISSING = "missing"
+
+
+@dataclass(frozen=True)
+class RecordingRecord:
+    """Uploaded recording."""
+
+    name: str
+    kind: str
+    """Kind of upload: `video` or `archive`."""
+    state: State
+    reason: str | None
+    digest: str
+    """SHA-256 of the uploaded file in hex."""
+    size_bytes: int
+    """Size of the uploaded file."""
+    kept_bytes: int
+    """Current size on the disk."""
+    uploaded_by: str
+    uploaded_at: datetime
+    description: Mapping[str, Any]
+    """Layout, frames, size, rate and fields; available once the recording is ready."""
+
+
+@dataclass(frozen=True)
+class Expired:
+    """Item deleted by retention, with the reason: a recording by name, or a replay by id."""
+
+    name: str
+    why: str
+
+
+def recording_record(row: sa.RowMapping) -> RecordingRecord:
+    """Convert a row to a recording record."""
+    return RecordingRecord(
+        name=row["name"],
+        kind="archive" if row["kind"] == "archive" else "video",
+        state=State(row["state"]),
+        reason=row["reason"],
+        digest=row["digest"],
+        size_bytes=row["size_bytes"],
+        kept_bytes=row["kept_bytes"],
+        uploaded_by=row["uploaded_by"],
+        uploaded_at=datetime.fromisoformat(row["uploaded_at"]),
+        description=dict(row["description"]),
+    )
+
+
+METADATA = sa.MetaData(naming_convention={"pk": "pk_%(table_name)s"})
+SCHEMA = Schema(Path(__file__).parent / "migrations", "alembic_version_recordings")
+RECORDINGS = sa.Table(
+    "recordings",
+    METADATA,
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("folder", sa.String(128), nullable=False),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("reason", sa.Text, nullable=True),
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Column("size_bytes", sa.BigInteger, nullable=False),
+    sa.Column("kept_bytes", sa.BigInteger, nullable=False),
+    sa.Column("uploaded_by", sa.String(200), nullable=False),
+    sa.Column("uploaded_at", sa.String(40), nullable=False),
+    sa.Column("description", sa.JSON, nullable=False),
+)
+"""Recordings. `folder` is below the store's folder, `size_bytes` is the upload's size, `kept_bytes`
+the current size."""
 PROGRAM = (sys.executable, "-P", "-m", "services.recordings.check")
 UPLOAD = "upload"
 MOST_REASON = 1000

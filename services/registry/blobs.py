@@ -1,20 +1,27 @@
-"""Storage for uploaded files: a folder, or an object store by URL (fsspec). A key refers to a
-complete file or to nothing."""
+"""Storage for uploaded files: a folder, or an object store by URL (fsspec). A key refers to a file that never changes.
+
+An upload is first staged: copied next to the store, measured and hashed. It is rejected if it is not a model.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import fsspec
 
-from gsplat_core.io.files import beside, sync_folder
-from services.errors import StoreUnavailable
+from gsplat_core.errors import BundleError
+from gsplat_core.io.files import beside, sync_folder, write_durably
+from gsplat_core.io.model_files import open_model_file
+from services.errors import Rejected, StoreUnavailable
+from services.registry.bundle_file import PIECE_BYTES, digest_of, members_of
+from services.registry.limits import RegistryLimits
 
 PART_SUFFIX = ".part"
 """Suffix of incomplete files and folders."""
@@ -186,3 +193,67 @@ def _store_errors(where: str) -> Iterator[None]:
         raise StoreUnavailable(
             f"the blob store {where} does not answer: {error}; check its address and credentials"
         ) from error
+
+
+@dataclass(frozen=True)
+class StagedUpload:
+    """Complete upload on the local disk, with its measurements."""
+
+    path: Path
+    size_bytes: int
+    digest: str
+    manifest_sha256: str
+    tensors_sha256: str
+
+
+def stage(file: Path, incoming: Path, digest: str | None, limits: RegistryLimits) -> StagedUpload:
+    """Copy an upload durably into `incoming`, so the caller can no longer change it, and parse its
+    container. On errors nothing is left behind.
+
+    Args:
+        file: the upload.
+        incoming: folder for the copy.
+        digest: SHA-256 stated by the sender, in hex, or None.
+        limits: budgets of an upload.
+
+    Raises:
+        Rejected: if the file is too large, has another digest, or another format.
+        StoreUnavailable: if the file cannot be read or the disk is full.
+    """
+    target = beside(incoming / "upload", PART_SUFFIX)
+    copy = _Copy(limits.upload_bytes)
+    try:
+        try:
+            with open_model_file(file) as source:
+                write_durably(target, copy.pieces(source))
+        except (OSError, BundleError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise StoreUnavailable(f"the upload cannot be kept: {reason}; free space, or upload it again") from error
+        found = copy.sha256.hexdigest()
+        if digest is not None and digest.lower() != found:
+            raise Rejected(f"the file has SHA-256 {found}, its sender said {digest[:80]}; upload it again")
+        with open(target, "rb") as staged:
+            manifest, tensors = members_of(staged, os.fstat(staged.fileno()).st_size)
+            return StagedUpload(target, copy.size, found, digest_of(staged, manifest), digest_of(staged, tensors))
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
+
+
+class _Copy:
+    """Copy loop that counts bytes against the limit and hashes them."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = most_bytes
+        self.size = 0
+        self.sha256 = hashlib.sha256()
+
+    def pieces(self, source: BinaryIO) -> Iterator[bytes]:
+        while piece := source.read(PIECE_BYTES):
+            self.size += len(piece)
+            if self.size > self._most_bytes:
+                raise Rejected(
+                    f"the file has more than {self._most_bytes} bytes; upload a smaller model, or raise the limit"
+                )
+            self.sha256.update(piece)
+            yield piece

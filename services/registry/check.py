@@ -32,7 +32,7 @@ from gsplat_core.io.model_files import open_model_file
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.scene.model import Model
 from services.private_files import keep_files_private
-from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
+from services.registry.limits import NICENESS, lower_limit, taken_bytes
 
 FAINTEST = 1 / 255
 """Smallest opacity that changes an 8-bit pixel."""

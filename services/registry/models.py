@@ -11,17 +11,21 @@ from typing import Any
 import sqlalchemy as sa
 
 from services.errors import Conflict, NotFound, StoreUnavailable
-from services.registry import activation
-from services.registry.blobs import open_blobs
+from services.registry import versions
+from services.registry.blobs import StagedUpload, open_blobs, stage
 from services.registry.bundle_file import SUFFIX
 from services.registry.checking import PROGRAM, RunningChecks, Verdict, run_check
 from services.registry.database import Database
-from services.registry.folder_lock import FolderLock
+from services.registry.folder import FolderLock, UnpackedModels, findings, folder_name, remove_leftovers
 from services.registry.limits import RegistryLimits
-from services.registry.publishing import add_version, check_by, check_name
-from services.registry.records import UNCHECKED, Change, ModelRecord, Recovery, State, VersionRecord
-from services.registry.recovery import findings, remove_leftovers
-from services.registry.rows import (
+from services.registry.records import (
+    MODELS,
+    UNCHECKED,
+    Change,
+    ModelRecord,
+    Recovery,
+    State,
+    VersionRecord,
     change_state,
     model_record,
     model_row,
@@ -30,9 +34,7 @@ from services.registry.rows import (
     version_row,
     version_rows,
 )
-from services.registry.staging import StagedUpload, stage
-from services.registry.tables import MODELS
-from services.registry.unpacked import UnpackedModels, folder_name
+from services.registry.versions import add_version, check_by, check_name
 
 DATABASE_FILE = "registry.sqlite"
 CHECKER = "registry"
@@ -172,11 +174,11 @@ class ModelRegistry:
         check_by(by)
         with self._database.reading() as connection:
             row = version_row(connection, name, version)
-        activation.check_activatable(version_record(row))
+        versions.check_activatable(version_record(row))
         self.folder_of(name, version)
         self._reached("files of the version checked")
         with self._database.writing() as connection:
-            change = activation.activate(connection, name, version, expected_current, by, self._reached)
+            change = versions.activate(connection, name, version, expected_current, by, self._reached)
         self._reached("activation committed")
         return change
 
@@ -197,7 +199,7 @@ class ModelRegistry:
         """
         check_by(by)
         with self._lock.shared(), self._database.writing() as connection:
-            change = activation.rollback(connection, name, expected_current, by, reason, self._reached)
+            change = versions.rollback(connection, name, expected_current, by, reason, self._reached)
             self._unpacked.folder_of(version_row(connection, name, change.version))
         self._reached("rollback committed")
         return change
@@ -214,7 +216,7 @@ class ModelRegistry:
             row = version_row(connection, name, version)
         with self._lock.shared():
             with self._database.writing() as connection:
-                change = activation.delete(connection, name, version, by)
+                change = versions.delete(connection, name, version, by)
                 if folder_name(row) not in {folder_name(each) for each in version_rows(connection)}:
                     self._unpacked.remove(row)
                 self._reached("unpacked copy deleted")

@@ -1,11 +1,18 @@
-"""Immutable records of versions, models and changes."""
+"""Records of the registry: versions, models and changes, their tables, and the queries that convert between rows and records.
+
+Each change of a table needs a new file in `migrations/versions`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
+
+import sqlalchemy as sa
+
+from services.errors import NotFound
 
 
 class State(StrEnum):
@@ -106,3 +113,136 @@ class Recovery:
     """Versions whose stored file is missing or has another size, with a message."""
     skipped: str | None = None
     """Reason if nothing was removed."""
+
+
+METADATA = sa.MetaData(
+    naming_convention={
+        "pk": "pk_%(table_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s",
+        "ix": "ix_%(table_name)s_%(column_0_name)s",
+    }
+)
+MODELS = sa.Table(
+    "models",
+    METADATA,
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("created_at", sa.String(40), nullable=False),
+    sa.Column("last_version", sa.Integer, nullable=False),
+    sa.Column("active", sa.Integer, nullable=True),
+)
+"""Models. `active` is the served version number; an activation updates only this row."""
+VERSIONS = sa.Table(
+    "versions",
+    METADATA,
+    sa.Column("name", sa.String(64), sa.ForeignKey("models.name"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("reason", sa.Text, nullable=True),
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Column("size_bytes", sa.BigInteger, nullable=False),
+    sa.Column("manifest_sha256", sa.String(64), nullable=False),
+    sa.Column("tensors_sha256", sa.String(64), nullable=False),
+    sa.Column("blob", sa.String(128), nullable=False),
+    sa.Column("uploaded_by", sa.String(200), nullable=False),
+    sa.Column("uploaded_at", sa.String(40), nullable=False),
+    sa.Column("changed_by", sa.String(200), nullable=False),
+    sa.Column("changed_at", sa.String(40), nullable=False),
+    sa.Column("description", sa.JSON, nullable=False),
+)
+"""Versions. Times are ISO 8601 in UTC. `blob` is the key of the uploaded file in the blob store."""
+ACTIVATIONS = sa.Table(
+    "activations",
+    METADATA,
+    sa.Column("name", sa.String(64), sa.ForeignKey("models.name"), primary_key=True),
+    sa.Column("step", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("version", sa.Integer, nullable=False),
+)
+"""History of active versions, oldest first. An activation appends a row; a rollback deletes it."""
+
+
+def now() -> datetime:
+    """Return the wall-clock time in UTC, truncated to milliseconds like the stored times."""
+    at = datetime.now(UTC)
+    return at.replace(microsecond=at.microsecond // 1000 * 1000)
+
+
+def model_row(connection: sa.Connection, name: str) -> sa.RowMapping:
+    """Return the row of a model.
+
+    Raises:
+        NotFound: if the model does not exist.
+    """
+    row = connection.execute(sa.select(MODELS).where(MODELS.c.name == name)).mappings().one_or_none()
+    if row is None:
+        raise NotFound(f"there is no model {name[:80]!r}; upload a version of it first")
+    return row
+
+
+def version_row(connection: sa.Connection, name: str, version: int) -> sa.RowMapping:
+    """Return the row of a version.
+
+    Raises:
+        NotFound: if the model or the version does not exist.
+    """
+    query = sa.select(VERSIONS).where(VERSIONS.c.name == name, VERSIONS.c.version == version)
+    row = connection.execute(query).mappings().one_or_none()
+    if row is None:
+        model_row(connection, name)
+        raise NotFound(f"model {name!r} has no version {version}; list its versions for those that are there")
+    return row
+
+
+def version_rows(connection: sa.Connection, name: str | None = None) -> list[sa.RowMapping]:
+    """Return the rows of all versions, or of one model, in order."""
+    query = sa.select(VERSIONS).order_by(VERSIONS.c.name, VERSIONS.c.version)
+    if name is not None:
+        query = query.where(VERSIONS.c.name == name)
+    return list(connection.execute(query).mappings())
+
+
+def change_state(
+    connection: sa.Connection, name: str, version: int, state: State, by: str, at: datetime, **values: Any
+) -> None:
+    """Update a version's state, the acting caller, the time and further columns."""
+    changed = {"state": str(state), "changed_by": by, "changed_at": at.isoformat(), **values}
+    connection.execute(
+        sa.update(VERSIONS).where(VERSIONS.c.name == name, VERSIONS.c.version == version).values(changed)
+    )
+
+
+def set_active(connection: sa.Connection, name: str, version: int) -> None:
+    """Set the active version of a model."""
+    connection.execute(sa.update(MODELS).where(MODELS.c.name == name).values(active=version))
+
+
+def activation_steps(connection: sa.Connection, name: str) -> list[tuple[int, int]]:
+    """Return (step, version) of every activation that was not rolled back, oldest first."""
+    query = sa.select(ACTIVATIONS.c.step, ACTIVATIONS.c.version).where(ACTIVATIONS.c.name == name)
+    return [(row.step, row.version) for row in connection.execute(query.order_by(ACTIVATIONS.c.step))]
+
+
+def version_record(row: sa.RowMapping) -> VersionRecord:
+    """Convert a row to a version record."""
+    return VersionRecord(
+        name=row["name"],
+        version=row["version"],
+        state=State(row["state"]),
+        reason=row["reason"],
+        digest=row["digest"],
+        size_bytes=row["size_bytes"],
+        uploaded_by=row["uploaded_by"],
+        uploaded_at=datetime.fromisoformat(row["uploaded_at"]),
+        changed_by=row["changed_by"],
+        changed_at=datetime.fromisoformat(row["changed_at"]),
+        description=dict(row["description"]),
+    )
+
+
+def model_record(row: sa.RowMapping) -> ModelRecord:
+    """Convert a row to a model record."""
+    return ModelRecord(
+        name=row["name"],
+        created_at=datetime.fromisoformat(row["created_at"]),
+        active=row["active"],
+        last_version=row["last_version"],
+    )

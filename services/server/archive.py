@@ -14,20 +14,16 @@ from prometheus_client.registry import Collector
 
 from services.audit.system_events import SystemEvents
 from services.errors import StoreUnavailable
-from services.jobs.pool import PoolSettings
-from services.jobs.process import PoolProcess
+from services.jobs.pool import PoolProcess, PoolSettings
+from services.jobs.pool_keeper import PoolKeeper
+from services.jobs.replays import RecordingRetention, ReplayRetention, Replays
 from services.jobs.results import Results
 from services.jobs.store import JobStore, uses_recording
-from services.missing_files import StoredFiles
-from services.recordings.limits import RecordingLimits
-from services.recordings.records import State
-from services.recordings.store import RecordingStore
-from services.registry.check_limits import NICENESS
+from services.missing_files import StoredFiles, StoredFilesWatch
+from services.recordings.archives import RecordingLimits
+from services.recordings.store import RecordingStore, State
+from services.registry.limits import NICENESS
 from services.registry.models import DATABASE_FILE
-from services.server.pool_keeper import PoolKeeper
-from services.server.replays import Replays
-from services.server.retention import RecordingRetention, ReplayRetention
-from services.server.stored_files import StoredFilesWatch
 from services.settings import ServiceSettings
 
 log = logging.getLogger(__name__)

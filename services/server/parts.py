@@ -26,7 +26,7 @@ from services.errors import (
     StoreUnavailable,
 )
 from services.exports.cache import ExportCache
-from services.exports.snapshots import SnapshotStore
+from services.exports.snapshots import ModelExports, SnapshotStore, StreamSnapshots
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from services.server import page
@@ -34,7 +34,6 @@ from services.server.archive import new_archive
 from services.server.displays import StreamDisplays
 from services.server.measures import StreamMeasures
 from services.server.shown_models import ShownModels
-from services.server.snapshots import ModelExports, StreamSnapshots
 from services.server.streams import SupervisedStreams
 from services.settings import ServiceSettings
 from services.supervisor.process import StreamEvent

@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from services.recordings.archive_list import MOST_LIST_BYTES, ArchiveInvalid
-from services.recordings.limits import RecordingLimits
-from services.recordings.unpack import unpack
+from services.recordings.archives import MOST_LIST_BYTES, ArchiveInvalid, RecordingLimits, unpack
 
 SMALL = RecordingLimits(unpacked_bytes=3 << 20, entry_bytes=2 << 20, entries=5)
 

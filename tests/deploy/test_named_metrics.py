@@ -17,10 +17,9 @@ from services.audit.system_events import SystemEvents
 from services.control.certificate import ServerCertificate
 from services.control.measures import Measures
 from services.control.storage import Storage
-from services.missing_files import StoredFiles
+from services.missing_files import StoredFiles, StoredFilesWatch
 from services.registry.database import Database
 from services.server.measures import STATES, StreamMeasures
-from services.server.stored_files import StoredFilesWatch
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 OF_PROMETHEUS = {"up": {"job", "instance"}}

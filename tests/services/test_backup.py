@@ -23,10 +23,9 @@ from services.control.app import AUDIT_FILE, KEYS_FILE
 from services.control.auth.keys import KeyStore
 from services.control.auth.roles import Role
 from services.errors import StoreUnavailable
-from services.jobs.tables import JOBS
-from services.recordings.records import State
-from services.recordings.tables import RECORDINGS
-from services.registry.tables import MODELS, VERSIONS
+from services.jobs.records import JOBS
+from services.recordings.store import RECORDINGS, State
+from services.registry.records import MODELS, VERSIONS
 from services.server.archive import Archive, new_archive
 from services.server.parts import registry_of
 from services.settings import ServiceSettings

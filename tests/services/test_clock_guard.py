@@ -12,7 +12,7 @@ from services.audit import AuditLog, Keeping
 from services.audit.files import closed_segments
 from services.audit.system_events import SystemEvents
 from services.clock_guard import CONFIRM_S, FILE, ClockGuard
-from services.server.retention import RecordingRetention, ReplayRetention
+from services.jobs.replays import RecordingRetention, ReplayRetention
 
 DAY_S = 86_400.0
 

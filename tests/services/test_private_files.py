@@ -46,7 +46,7 @@ def test_every_process_begins_with_a_umask_of_its_own(path):
 
 
 def test_the_programs_are_found():
-    assert {"launcher", "capture", "engine", "process", "check", "make"} <= {path.stem for path in programs()}
+    assert {"launcher", "capture", "engine", "pool", "check", "make"} <= {path.stem for path in programs()}
 
 
 def test_a_process_and_what_it_starts_create_private_files(tmp_path, open_umask):

@@ -60,7 +60,7 @@ class Server:
 
     def pool(self) -> int | None:
         """The process of the pool."""
-        return next((pid for pid in children(self.process.pid) if b"services.jobs.process" in command(pid)), None)
+        return next((pid for pid in children(self.process.pid) if b"services.jobs.pool" in command(pid)), None)
 
     def attempt(self) -> int | None:
         """The process of the attempt that runs."""

@@ -20,7 +20,7 @@ from services.control.routes.models import Number
 from services.control.routes.snapshots import SnapshotId
 from services.control.snapshot_parts import ExportedFile, Exports
 from services.control.state import part
-from services.exports.formats import ALL
+from services.exports.cache import ALL
 from services.settings import ResourceName
 
 router = new_router("exports")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from alembic import context
 
-from services.jobs.tables import METADATA
+from services.jobs.records import METADATA
 
 context.configure(
     connection=context.config.attributes["connection"],

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from alembic import context
 
-from services.recordings.tables import METADATA
+from services.recordings.store import METADATA
 
 context.configure(
     connection=context.config.attributes["connection"],

@@ -12,12 +12,11 @@ from starlette.websockets import WebSocketDisconnect
 from services.control.problems import Conflicting, Missing
 from services.control.routes.results import REPORT_POLICY
 from services.errors import NotFound
-from services.jobs.claims import Claims
 from services.jobs.records import JobProgress, JobState
+from services.jobs.replays import Replays
 from services.jobs.results import Results
-from services.jobs.store import JobStore
+from services.jobs.store import Claims, JobStore
 from services.server.parts import ERRORS
-from services.server.replays import Replays
 
 REPLAYS = "/v1/replays"
 

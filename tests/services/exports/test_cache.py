@@ -15,9 +15,7 @@ import pytest
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
 from services.errors import ExportBusy, ExportFailed, ExportRefused
-from services.exports.cache import ExportCache
-from services.exports.formats import ALL
-from services.exports.programs import ExportPrograms
+from services.exports.cache import ALL, ExportCache, ExportPrograms
 from services.registry.bundle_file import members_of
 from tests.services.supervisor.test_model_show import uniform
 
@@ -159,7 +157,7 @@ def test_the_program_itself(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "module", ["services.exports.cache", "services.exports.snapshots", "services.server.snapshots"]
+    "module", ["services.exports.cache", "services.exports.snapshots", "services.exports.snapshots"]
 )
 @pytest.mark.slow
 def test_this_process_loads_no_torch(module):

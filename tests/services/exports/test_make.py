@@ -8,7 +8,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from services.exports import make
-from services.exports.formats import ALL
+from services.exports.cache import ALL
 
 
 @pytest.fixture

@@ -13,8 +13,7 @@ from gsplat_core.errors import InvalidSetting
 from operators.output_folder import OutputFolder
 from operators.settings import CallerJobOptions, JobOptions
 from services.jobs.batch import Batch, recordings_in
-from services.jobs.records import JobState
-from services.jobs.tables import JOBS
+from services.jobs.records import JOBS, JobState
 
 
 @pytest.fixture

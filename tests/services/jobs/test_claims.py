@@ -6,9 +6,9 @@ import threading
 
 import pytest
 
-from services.jobs import claims as module
-from services.jobs.claims import Claims
+from services.jobs import store as module
 from services.jobs.records import JobProgress, JobState, NewJob
+from services.jobs.store import Claims
 
 NOTHING = JobProgress(0, None, None)
 

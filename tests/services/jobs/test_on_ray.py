@@ -20,7 +20,7 @@ WITHIN_S = 300.0
 
 @pytest.mark.filterwarnings("ignore")  # of Ray's own
 def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path):
-    from services.jobs.on_ray import OnRay
+    from services.jobs.runners import OnRay
 
     good = store.submit(
         [NewJob("a", str(recording)), NewJob("b", str(recording))], {"steps_per_frame": 2}, "operator"
@@ -52,7 +52,7 @@ def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path):
 @pytest.mark.parametrize("address", ["no address", "scheme://x"])
 @pytest.mark.filterwarnings("ignore")
 def test_an_address_without_ray_is_refused_with_a_sentence(address):
-    from services.jobs.on_ray import OnRay
+    from services.jobs.runners import OnRay
 
     with pytest.raises(StoreUnavailable, match=r"Ray at .* cannot be used"):
         OnRay(address)

@@ -11,11 +11,9 @@ from alembic.runtime.migration import MigrationContext
 
 from operators.settings import JobOptions
 from services.errors import Conflict, NotFound, Rejected
-from services.jobs.claims import Claims
-from services.jobs.records import JobState, NewJob
-from services.jobs.store import DAY_S, MOST_AT_ONCE, uses_recording
-from services.jobs.tables import METADATA, SCHEMA
-from services.registry import rows
+from services.jobs.records import METADATA, SCHEMA, JobState, NewJob
+from services.jobs.store import DAY_S, MOST_AT_ONCE, Claims, uses_recording
+from services.registry import records
 
 
 def test_the_migrations_make_the_tables_that_the_program_uses(new_store):
@@ -99,7 +97,7 @@ def test_cancelling_and_forgetting(new_store):
 def test_what_ended_too_long_ago_or_is_too_much(new_store, monkeypatch):
     store = new_store()
     ids = store.submit([NewJob(name) for name in "abcde"], {}, "operator").ids
-    began = rows.now()
+    began = records.now()
     for days, job_id in enumerate(ids[:4]):
         monkeypatch.setattr("services.jobs.store.now", lambda days=days: began + timedelta(days=days))
         store.cancel(job_id, "nurse")  # ended on day 0, 1, 2, 3; the fifth has not

@@ -11,9 +11,8 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from services.recordings import archive_list
-from services.recordings.archive_list import ArchiveInvalid, check_end, entries_of
-from services.recordings.limits import RecordingLimits
+from services.recordings import archives
+from services.recordings.archives import ArchiveInvalid, RecordingLimits, check_end, entries_of
 
 LIMITS = dataclasses.replace(RecordingLimits(), entries=3, unpacked_bytes=100, entry_bytes=60, ratio=10)
 
@@ -169,9 +168,9 @@ def test_encrypted_files_are_refused(bits: int, refused: bool) -> None:
     info.flag_bits = bits
     if refused:
         with pytest.raises(ArchiveInvalid, match="encrypted"):
-            archive_list._check_entry(info, 0, LIMITS)
+            archives._check_entry(info, 0, LIMITS)
     else:
-        archive_list._check_entry(info, 0, LIMITS)
+        archives._check_entry(info, 0, LIMITS)
 
 
 def test_other_methods_of_packing_are_refused() -> None:
@@ -189,20 +188,20 @@ def test_a_file_lies_where_the_list_says(offset: int, size: int, why: str | None
         info, start = archive.infolist()[0], archive.start_dir
     info.header_offset, info.compress_size = offset, size
     if why is None:
-        archive_list._check_places([info], file, start)
+        archives._check_places([info], file, start)
     else:
         with pytest.raises(ArchiveInvalid, match=why):
-            archive_list._check_places([info], file, start)
+            archives._check_places([info], file, start)
 
 
 def test_two_files_in_the_same_place_are_refused() -> None:
     file = packed(("a.png", b"x"), ("b.png", b"y"))
     with zipfile.ZipFile(file) as archive:
         infos, start = archive.infolist(), archive.start_dir
-    archive_list._check_places(infos[::-1], file, start)
+    archives._check_places(infos[::-1], file, start)
     infos[1].header_offset = infos[0].header_offset
     with pytest.raises(ArchiveInvalid, match="in the same place"):
-        archive_list._check_places(infos, file, start)
+        archives._check_places(infos, file, start)
 
 
 def test_a_leading_folder_is_removed_from_paths_alone() -> None:

@@ -10,8 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from services.recordings import check
-from services.recordings.archive_list import ArchiveInvalid
-from services.recordings.limits import RecordingLimits
+from services.recordings.archives import ArchiveInvalid, RecordingLimits
 
 
 @pytest.fixture

@@ -13,10 +13,9 @@ from alembic.runtime.migration import MigrationContext
 
 from gsplat_core.io.recordings import open_recording
 from services.errors import CheckFailed, Conflict, NotFound, Rejected
-from services.recordings.limits import RecordingLimits
-from services.recordings.records import State
-from services.recordings.tables import METADATA, RECORDINGS
-from services.registry.rows import now
+from services.recordings.archives import RecordingLimits
+from services.recordings.store import METADATA, RECORDINGS, State
+from services.registry.records import now
 
 VERDICT = """
 import json, pathlib, sys

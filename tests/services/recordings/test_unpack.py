@@ -9,9 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.recordings import unpack as unpacking
-from services.recordings.archive_list import ArchiveInvalid
-from services.recordings.limits import RecordingLimits
+from services.recordings import archives as unpacking
+from services.recordings.archives import ArchiveInvalid, RecordingLimits
 
 
 def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch):

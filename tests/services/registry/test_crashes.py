@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from services.registry.models import ModelRegistry
-from services.registry.rows import activation_steps
+from services.registry.records import activation_steps
 from tests.services.registry import dying
 from tests.services.registry.made import add_ready, assert_whole, packed_model
 from tests.services.registry.stub_check import ALWAYS_READY

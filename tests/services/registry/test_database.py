@@ -10,7 +10,7 @@ from alembic.runtime.migration import MigrationContext
 from services.errors import SchemaTooNew, StoreUnavailable
 from services.registry.database import Database
 from services.registry.models import ModelRegistry
-from services.registry.tables import METADATA, MODELS
+from services.registry.records import METADATA, MODELS
 from tests.services.registry.servers import new_database
 
 

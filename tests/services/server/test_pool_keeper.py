@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from services.errors import StoreUnavailable
-from services.server import pool_keeper as keepers
-from services.server.pool_keeper import PoolKeeper, relayed
+from services.jobs import pool_keeper as keepers
+from services.jobs.pool_keeper import PoolKeeper, relayed
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def program(monkeypatch):
 
     def use(code: str) -> PoolKeeper:
         async def started(*words, **options):
-            assert words[1:] == ("-P", "-m", "services.jobs.process")
+            assert words[1:] == ("-P", "-m", "services.jobs.pool")
             use.environment = options["env"]
             return await start(sys.executable, "-S", "-E", "-c", code, **options)
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 
 from services.jobs.records import NewJob
+from services.jobs.replays import DAY_S, RecordingRetention, ReplayRetention, Replays
 from services.jobs.results import Results
 from services.jobs.store import JobStore
-from services.recordings.records import Expired
-from services.server.replays import Replays
-from services.server.retention import DAY_S, RecordingRetention, ReplayRetention
+from services.recordings.store import Expired
 
 
 class FakeStore:

@@ -11,10 +11,10 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from services.control.problems import Conflicting, Unprocessable
 from services.errors import CommandRefused
-from services.exports.formats import ALL, ExportWish
+from services.exports import snapshots as parts
+from services.exports.cache import ALL, ExportWish
+from services.exports.snapshots import ModelExports, StreamSnapshots
 from services.registry.records import State
-from services.server import snapshots as parts
-from services.server.snapshots import ModelExports, StreamSnapshots
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 from services.errors import StoreUnavailable
-from services.jobs.process import PoolProcess
+from services.jobs.pool import PoolProcess
 from services.supervisor.restarts import Restarts
 
 log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ class PoolKeeper:
     async def _run(self) -> int:
         environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-P", "-m", "services.jobs.process",
+            sys.executable, "-P", "-m", "services.jobs.pool",
             stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE,
             env=environment, start_new_session=True,
         )  # fmt: skip

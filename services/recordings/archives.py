@@ -1,20 +1,76 @@
-"""Validation of a zip archive's directory before anything is unpacked.
+"""Uploaded files of recordings: budgets, type detection by the first bytes, and unpacking of zip archives.
 
-Python's zipfile loads a directory of any length and trusts it. The end of the file is therefore
-parsed here first, and every entry is checked by `entries_of`.
+The directory of an archive is validated before anything is unpacked.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 import struct
 import zipfile
-from dataclasses import dataclass
-from pathlib import PurePosixPath
+import zlib
+from dataclasses import dataclass, fields
+from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from services.recordings.limits import RecordingLimits
+from services.errors import Rejected
+
+GIB = 1 << 30
+
+
+@dataclass(frozen=True)
+class RecordingLimits:
+    """Inclusive limits for one recording."""
+
+    unpacked_bytes: int = 64 * GIB
+    """Total unpacked size of an archive in bytes."""
+    entry_bytes: int = 16 * GIB
+    """Unpacked size of one file in bytes."""
+    entries: int = 65_000
+    """Number of files and folders in an archive."""
+    ratio: int = 100
+    """Largest compression ratio of a file above one megabyte."""
+    check_memory_bytes: int = 4 * GIB
+    """Memory of the check beyond its libraries, in bytes."""
+    check_s: float = 3600.0
+    """Processor time of the check in seconds. Exceeding it rejects the recording."""
+    check_passed_s: float = 4 * 3600.0
+    """Wall-clock time of the check in seconds. Exceeding it means that the machine is too busy, and
+    the recording is not rejected."""
+    checks_at_once: int = 1
+    """Number of concurrent checks; further checks wait."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not getattr(self, field.name) > 0:
+                raise ValueError(f"RecordingLimits.{field.name} must be positive, got {getattr(self, field.name)!r}")
+
+
+ARCHIVE = "archive"
+
+
+def kind_of(file: Path) -> str:
+    """Return `archive`, or the suffix of a video (`.mp4`, `.avi`, `.mkv`).
+
+    Raises:
+        Rejected: if the type is unknown.
+    """
+    with open(file, "rb") as opened:
+        head = opened.read(16)
+    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return ARCHIVE
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide"):
+        return ".mp4"
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return ".avi"
+    if head.startswith(b"\x1a\x45\xdf\xa3"):
+        return ".mkv"
+    raise Rejected(
+        "the file is neither a video (MP4, AVI, Matroska) nor a zip archive; pack a recording's folder with `zip -r`"
+    )
+
 
 MOST_LIST_BYTES = 16 << 20
 MOST_PARTS = 5
@@ -170,3 +226,48 @@ def _with_paths_of_their_own(entries: list[Entry]) -> list[Entry]:
     if taken & folders:
         raise ArchiveInvalid("a file of the archive has the name of a folder in it")
     return entries
+
+
+PIECE_BYTES = 1 << 20
+
+
+def unpack(archive: Path, folder: Path, limits: RecordingLimits) -> None:
+    """Write the files of `archive` into the new folder `folder`. After an error, files unpacked so
+    far remain.
+
+    Raises:
+        ArchiveInvalid: if the archive breaks a rule.
+        OSError: if a file cannot be written.
+    """
+    with open(archive, "rb") as file:
+        stated = check_end(file)
+        try:
+            with zipfile.ZipFile(file) as opened:
+                entries = entries_of(opened, file, stated, limits)
+                folder.mkdir(mode=0o700)
+                for number, entry in enumerate(entries):
+                    _write(opened, entry, folder, number)
+        except (
+            zipfile.BadZipFile,
+            zipfile.LargeZipFile,
+            zlib.error,
+            EOFError,
+            NotImplementedError,  # raised by zipfile for unknown compression methods
+            ValueError,
+        ) as error:
+            raise ArchiveInvalid("the archive is damaged; pack and upload it again") from error
+
+
+def _write(archive: zipfile.ZipFile, entry: Entry, folder: Path, number: int) -> None:
+    path = folder / entry.path
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    written = 0
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    with os.fdopen(descriptor, "wb") as target, archive.open(entry.info) as source:
+        while piece := source.read(PIECE_BYTES):
+            written += len(piece)
+            if written > entry.info.file_size:
+                raise ArchiveInvalid(f"file {number + 1} of the archive is longer than its list says")
+            target.write(piece)
+    if written != entry.info.file_size:
+        raise ArchiveInvalid(f"file {number + 1} of the archive is cut off")

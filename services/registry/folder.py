@@ -1,21 +1,77 @@
-"""Unpacked versions as folders for `load_bundle`, created on demand from the stored file and
-verified on each access."""
+"""Folder of the registry: its lock, unpacked versions for `load_bundle`, and recovery at start.
+
+Publishing processes share the lock, cleanup holds it alone. Recovery deletes leftovers of dead processes, and only reports damage.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import logging
 import os
+import re
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gsplat_core.io.files import PartialFolder
 from services.errors import BlobDamaged, Rejected, StoreUnavailable
-from services.registry.blobs import BlobStore
-from services.registry.bundle_file import MANIFEST, PIECE_BYTES, TENSORS, unpack
+from services.registry.blobs import BlobStore, StoredBlob
+from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, unpack
+from services.registry.records import UNCHECKED, Recovery, State
+
+_RETRY_S = 0.05
+
+
+class FolderLock:
+    """File lock that is opened for each use, so threads of one process exclude each other too."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @contextlib.contextmanager
+    def shared(self) -> Iterator[None]:
+        """Hold the lock in shared mode; blocks during a cleanup."""
+        with self._opened() as descriptor:
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            yield
+
+    @contextlib.contextmanager
+    def alone(self, wait_s: float) -> Iterator[bool]:
+        """Try to hold the lock exclusively for up to `wait_s` seconds.
+
+        Yields:
+            True if the lock is held, False after the timeout.
+        """
+        until = time.monotonic() + wait_s
+        with self._opened() as descriptor:
+            while not _taken(descriptor):
+                if time.monotonic() >= until:
+                    yield False
+                    return
+                time.sleep(_RETRY_S)
+            yield True
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[int]:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            yield descriptor
+        finally:
+            os.close(descriptor)
+
+
+def _taken(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
 
 _log = logging.getLogger(__name__)
 
@@ -119,3 +175,61 @@ def _damaged(row: Mapping[Any, Any], what: str) -> BlobDamaged:
         f"the stored file of version {row['version']} of model {row['name']!r} {what}; restore it from a backup, or delete the version and"
         " upload it again"
     )
+
+
+_BLOB = re.compile(rf"[0-9a-f]{{64}}-[0-9a-f]{{16}}{re.escape(SUFFIX)}")
+"""Format of keys created by this program. Other files in the store are left alone."""
+Row = Mapping[Any, Any]
+
+
+def remove_leftovers(
+    rows: Sequence[Row], stored: Sequence[StoredBlob], blobs: BlobStore, incoming: Path, unpacked: UnpackedModels
+) -> tuple[str, ...]:
+    """Delete incomplete uploads, files without a version, and folders of deleted versions. Called
+    under the exclusive lock.
+
+    `stored` was listed before `rows` were read, so a file whose row was added in between is kept.
+
+    Returns:
+        Descriptions of the deleted items.
+    """
+    removed = []
+    for path in sorted(incoming.iterdir()):
+        path.unlink()
+        removed.append(f"half-written upload {path.name}")
+    named = {row["blob"] for row in rows}
+    for blob in stored:
+        if blob.abandoned and blob.key not in named and _BLOB.fullmatch(blob.key):
+            blobs.remove(blob.key)
+            removed.append(f"upload {blob.key} that no version names")
+    removed += [f"unpacked copy {name}" for name in unpacked.remove_others({folder_name(row) for row in rows})]
+    for what in removed:
+        _log.warning("removed at start: %s", what)
+    return tuple(removed)
+
+
+def findings(
+    rows: Sequence[Row], stored: Sequence[StoredBlob], removed: tuple[str, ...], skipped: str | None
+) -> Recovery:
+    """Report removed items, unchecked versions and damaged files."""
+    sizes = {blob.key: blob.size for blob in stored}
+    unchecked, damaged = [], []
+    for row in rows:
+        name, version = row["name"], row["version"]
+        if State(row["state"]) in UNCHECKED:
+            unchecked.append((name, version))
+        size = sizes.get(row["blob"])
+        if size != row["size_bytes"]:
+            what = "is gone" if size is None else f"has {size} bytes in place of {row['size_bytes']}"
+            damaged.append(
+                (
+                    name,
+                    version,
+                    f"the stored file of version {version} of model {name!r} {what}; restore it from a backup",
+                )
+            )
+    for *_, sentence in damaged:
+        _log.error("%s", sentence)
+    if skipped is not None:
+        _log.warning("%s", skipped)
+    return Recovery(removed, tuple(unchecked), tuple(damaged), skipped)

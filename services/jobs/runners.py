@@ -1,0 +1,209 @@
+"""Runners of attempts: forked processes of this machine, or a Ray cluster (extra `ray`)."""
+
+from __future__ import annotations
+
+import gc
+import os
+import resource
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any, NoReturn, Protocol
+
+from services.errors import StoreUnavailable
+from services.jobs.results import Task
+from services.private_files import keep_files_private
+from services.supervisor.process_end import ended_how
+
+
+class Runner(Protocol):
+    """Runner of concurrent tasks. Attempts report through their folder (`Task`); the runner only
+    starts and ends them."""
+
+    def start(self, task: Task) -> None:
+        """Start an attempt."""
+
+    def ended(self) -> Mapping[str, str]:
+        """Return the attempts that ended since the last call: job id and description of the end."""
+        ...
+
+    def kill(self, job_id: str) -> None:
+        """Kill an attempt; `ended` reports it. No effect on an ended attempt."""
+
+    def close(self) -> None:
+        """Kill all attempts."""
+
+
+ORPHANED = 3
+"""Exit code of a process whose pool has died."""
+
+
+def load() -> None:
+    """Import everything that attempts need. Call before the first fork, in a single-threaded
+    process."""
+    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked process
+    # could use CUDA.
+    os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
+    import services.jobs.work  # noqa: F401
+
+    gc.collect()
+    gc.freeze()  # excludes the imported objects from garbage collection, so their pages stay shared
+
+
+class Forks:
+    """Runner that forks attempts. Requires an earlier call to `load`."""
+
+    def __init__(self) -> None:
+        self._life_read, self._life_write = os.pipe()
+        self._pids: dict[int, str] = {}
+        """Job id per process."""
+
+    def start(self, task: Task) -> None:
+        """See `Runner`."""
+        pid = os.fork()
+        if pid == 0:
+            os.close(self._life_write)
+            _become(task, self._life_read)
+        self._pids[pid] = task.id
+
+    def ended(self) -> Mapping[str, str]:
+        """See `Runner`."""
+        found = {}
+        for pid in list(self._pids):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                found[self._pids.pop(pid)] = ended_how(status)
+        return found
+
+    def kill(self, job_id: str) -> None:
+        """See `Runner`."""
+        for pid, job in self._pids.items():
+            if job == job_id:
+                os.kill(pid, signal.SIGKILL)  # a child that was not reaped, so the id is not reused
+
+    def close(self) -> None:
+        """See `Runner`."""
+        for pid in self._pids:
+            os.kill(pid, signal.SIGKILL)
+        for pid in self._pids:
+            os.waitpid(pid, 0)
+        self._pids.clear()
+        os.close(self._life_write)
+        os.close(self._life_read)
+
+
+def _become(task: Task, life: int) -> NoReturn:
+    """Run an attempt in a forked process; never returns."""
+    code = 1
+    try:
+        os.setsid()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        _print_into(task)
+        threading.Thread(target=_end_with_the_pool, args=(life,), name="life", daemon=True).start()
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a core file would contain patient images
+        os.nice(task.niceness)
+        from services.jobs.work import work
+
+        work(task)
+        code = 0
+    except BaseException:  # noqa: BLE001 - the forked process must never continue as the pool
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _print_into(task: Task) -> None:
+    output = os.open(task.log, os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    nothing = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+    for source, target in ((nothing, 0), (output, 1), (output, 2)):
+        os.dup2(source, target)
+
+
+def _end_with_the_pool(life: int) -> None:
+    """Exit when the pool has ended. Only the pool holds the pipe's write end, so a read returns
+    after its death."""
+    os.read(life, 1)
+    os._exit(ORPHANED)
+
+
+ATTEMPTS_OF_A_PROCESS = 20
+"""Attempts after which Ray starts a new worker process, which bounds memory leaks."""
+
+
+def _attempt(values: dict[str, Any]) -> None:
+    """Run an attempt in a Ray worker process."""
+    from services.jobs.work import work
+
+    keep_files_private()
+    work(Task(**values))
+
+
+class OnRay:
+    """Runner on a Ray cluster.
+
+    Raises:
+        StoreUnavailable: if Ray is missing or does not answer.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Connect to Ray.
+
+        Args:
+            address: head of a cluster, or `local` for a cluster in this process.
+        """
+        try:
+            import ray
+        except ImportError as error:
+            raise StoreUnavailable(
+                "jobs.ray is set and Ray is not installed; install the extra `ray`, or leave it out"
+            ) from error
+        self._ray = ray
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # no usage statistics are sent
+        try:
+            ray.init(address, log_to_driver=False, include_dashboard=False if address == "local" else None)
+        except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+            raise StoreUnavailable(f"Ray at {address} cannot be used: {error}; check that it runs") from error
+        self._attempts: dict[Any, str] = {}
+        """Job id per attempt."""
+
+    def start(self, task: Task) -> None:
+        """See `Runner`."""
+        # Ray never retries an attempt; the pool does, if it still holds the claim.
+        remote = self._ray.remote(
+            max_retries=0, max_calls=ATTEMPTS_OF_A_PROCESS,
+            num_cpus=task.threads, num_gpus=1 if task.options.get("device") == "cuda" else 0,
+        )(_attempt)  # fmt: skip
+        self._attempts[remote.remote(asdict(replace(task, niceness=0)))] = task.id
+
+    def ended(self) -> Mapping[str, str]:
+        """See `Runner`."""
+        if not self._attempts:
+            return {}
+        done, _ = self._ray.wait(list(self._attempts), num_returns=len(self._attempts), timeout=0)
+        return {self._attempts.pop(attempt): self._how(attempt) for attempt in done}
+
+    def kill(self, job_id: str) -> None:
+        """See `Runner`."""
+        for attempt, job in self._attempts.items():
+            if job == job_id:
+                self._ray.cancel(attempt, force=True)
+
+    def close(self) -> None:
+        """See `Runner`."""
+        for attempt in self._attempts:
+            self._ray.cancel(attempt, force=True)
+        self._attempts.clear()
+        self._ray.shutdown()
+
+    def _how(self, attempt: Any) -> str:
+        try:
+            self._ray.get(attempt)
+        except (self._ray.exceptions.RayError, self._ray.exceptions.TaskCancelledError) as error:
+            return f"{type(error).__name__} of Ray"
+        return "exit code 0"
