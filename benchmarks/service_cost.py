@@ -30,8 +30,8 @@ from operators.sources.zeromq_message import pieces
 from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher, picture_from, subscribe
 from services.bus.runtime import RuntimeFolder
-from services.display.encoder import encoded
-from services.supervisor.captured_source import CapturedSource
+from services.display.hub import encoded
+from services.supervisor.capture import CapturedSource
 
 
 class Pattern(LiveSource):

@@ -13,9 +13,7 @@ from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest
 from services.cli.listening import check_host
 from services.display.hub import KINDS
-from services.openigtlink.messages import StreamMessages
-from services.openigtlink.sender import folder_of, send
-from services.openigtlink.server import MessageServer
+from services.openigtlink import MessageServer, StreamMessages, folder_of, send
 from services.settings import load_settings
 
 

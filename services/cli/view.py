@@ -15,7 +15,7 @@ from gsplat_core.io.model_sources import load_model
 from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest
 from services.cli.listening import check_host
-from services.model_view.viewer import ModelView
+from services.model_view import ModelView
 from services.registry.bundle_file import SUFFIX, unpack
 
 

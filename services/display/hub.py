@@ -1,25 +1,154 @@
-"""Distribution of a stream's pictures: each is encoded once per requested quality, and not at all
-without viewers."""
+"""Distribution of a stream's pictures to viewers: each is encoded once per requested quality, and not at all without viewers.
+
+A viewer holds the newest picture only, so a slow viewer skips pictures and delays no other.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import struct
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from types import TracebackType
 from typing import Any, Literal
 
+import numpy as np
+import simplejpeg
 import zmq
 import zmq.asyncio
+from numpy.typing import NDArray
 
+from gsplat_core.errors import InvalidSetting
 from services.bus.messages import Durations
 from services.bus.pictures import Picture, picture_from, subscribe
 from services.bus.runtime import LAYERS, Layer, StreamFolder
-from services.display.encoder import EncodedPicture, check_quality, dimmed, encoded
-from services.display.viewer import Viewer
 from services.errors import BadMessage
+
+LEAST_QUALITY, MOST_QUALITY = 10, 95
+BOUNDARY = "picture"
+"""Boundary between the parts of a multipart answer, as announced by `services.control.parts`."""
+DIMMED_TO = 0.5
+"""Brightness factor for pictures that must not be mistaken for live ones."""
+
+
+@dataclass(frozen=True)
+class EncodedPicture:
+    """Encoded picture, shared by all viewers."""
+
+    header: dict[str, object]
+    """JSON header: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`; for reconstructions also
+    `model_version`, `steps`, `psnr_db`, `previous_frame_db` and `next_frame_db`
+    (docs/design/processes.md)."""
+    jpeg: bytes
+
+    @cached_property
+    def message(self) -> bytes:
+        """Return the picture as one message: header length (4 bytes, big-endian), JSON header,
+        JPEG."""
+        header = json.dumps(self.header, separators=(",", ":")).encode()
+        return b"".join((struct.pack(">I", len(header)), header, self.jpeg))
+
+    @cached_property
+    def part(self) -> bytes:
+        """Return the picture as a part of a multipart answer."""
+        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(self.jpeg)}\r\n\r\n"
+        return b"".join((head.encode(), self.jpeg, b"\r\n"))
+
+
+def check_quality(quality: int) -> int:
+    """Check a JPEG quality.
+
+    Raises:
+        InvalidSetting: if it is out of range.
+    """
+    if not LEAST_QUALITY <= quality <= MOST_QUALITY:
+        raise InvalidSetting(f"quality is {quality}; it must be from {LEAST_QUALITY} to {MOST_QUALITY}")
+    return quality
+
+
+def encoded(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Encode RGB uint8 [H, W, 3] as JPEG, releasing the GIL."""
+    pixels = np.ascontiguousarray(image)
+    jpeg: bytes = simplejpeg.encode_jpeg(
+        pixels, quality=quality, colorspace="RGB", colorsubsampling="420", fastdct=True
+    )
+    return jpeg
+
+
+def dimmed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a darker greyscale copy of a picture, marking it as outdated."""
+    grey = (image.astype(np.float32).mean(axis=2, keepdims=True) * DIMMED_TO).astype(np.uint8)
+    return np.repeat(grey, 3, axis=2)
+
+
+SLOW = "slow client"
+DEAD_S = 30.0
+"""Seconds without a taken picture after which a viewer is dropped."""
+
+
+class Viewer(AsyncIterator[EncodedPicture]):
+    """Iterator over the newest picture at each step. Skipped pictures are counted.
+
+    async with hub.subscribe("shown") as viewer:
+        async for picture in viewer: ...
+    """
+
+    def __init__(self, quality: int, leave: Callable[[Viewer], None], drops: Counter[str]) -> None:
+        self.quality = quality
+        self._leave, self._drops = leave, drops
+        self._slot: EncodedPicture | None = None
+        self._changed = asyncio.Event()
+        self._closed = False
+        self._taken_s = asyncio.get_running_loop().time()
+        self.given = 0
+        """Pictures taken by the viewer."""
+
+    def offer(self, picture: EncodedPicture) -> None:
+        """Replace the pending picture by the newest one."""
+        now_s = asyncio.get_running_loop().time()
+        if self._slot is not None:
+            self._drops[SLOW] += 1
+            if now_s - self._taken_s > DEAD_S:
+                self._drops["dead client"] += 1
+                self.close()
+                return
+        self._slot = picture
+        self._changed.set()
+
+    def close(self) -> None:
+        """End the iteration."""
+        if not self._closed:
+            self._closed = True
+            self._leave(self)
+            self._changed.set()
+
+    async def __anext__(self) -> EncodedPicture:
+        while self._slot is None:
+            if self._closed:
+                raise StopAsyncIteration
+            self._changed.clear()
+            await self._changed.wait()
+        picture, self._slot = self._slot, None
+        if self._closed:
+            raise StopAsyncIteration
+        self._taken_s = asyncio.get_running_loop().time()
+        self.given += 1
+        return picture
+
+    async def __aenter__(self) -> Viewer:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
 
 log = logging.getLogger(__name__)
 Pictures = Literal["raw", "shown", Layer]

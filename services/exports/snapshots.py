@@ -28,7 +28,7 @@ from services.exports.cache import ExportCache, Exported
 from services.registry.bundle_file import SUFFIX, pack
 from services.registry.models import ModelRegistry
 from services.registry.records import State, VersionRecord
-from services.server.streams import SupervisedStreams
+from services.supervisor.stream import SupervisedStreams
 
 NUMBER = re.compile(r"[0-9a-f]{16}")
 ABOUT = "snapshot.json"

@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 
 from services.errors import StoreUnavailable
 from services.jobs.pool import PoolProcess
-from services.supervisor.restarts import Restarts
+from services.supervisor.process import Restarts
 
 log = logging.getLogger(__name__)
 RELAY_S = 1.0

@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Protocol
 from services.errors import StoreUnavailable
 from services.jobs.results import Task
 from services.private_files import keep_files_private
-from services.supervisor.process_end import ended_how
+from services.supervisor.launcher import ended_how
 
 
 class Runner(Protocol):

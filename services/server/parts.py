@@ -31,12 +31,10 @@ from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from services.server import page
 from services.server.archive import new_archive
-from services.server.displays import StreamDisplays
-from services.server.measures import StreamMeasures
-from services.server.shown_models import ShownModels
-from services.server.streams import SupervisedStreams
 from services.settings import ServiceSettings
+from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent
+from services.supervisor.stream import ShownModels, StreamDisplays, SupervisedStreams
 
 log = logging.getLogger(__name__)
 OWN_WORDS = re.compile(

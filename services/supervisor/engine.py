@@ -1,6 +1,6 @@
 """Engine process of a stream, `python -m services.supervisor.engine --spec FILE [--again]`.
 
-Reconstructs the frames of the stream's capture process live and publishes the rendered pictures.
+It works at a size relative to the stream's pictures, reports the figures of its graph, and writes snapshots of its model on command.
 """
 
 from __future__ import annotations
@@ -8,12 +8,21 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
 
 from gsplat_core.errors import UserError
+from gsplat_core.io.bundle import save_bundle
 from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.transfers import StagedCopies
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture
 from operators.applications.live import LiveApplication, LiveParts, low_latency, measured_size, new_parts, warm_up
@@ -21,25 +30,182 @@ from operators.applications.live_settings import LiveSettings
 from operators.applications.session import Session
 from operators.applications.working_size import WorkingSize, trial_run
 from operators.errors import SourceUnavailable
+from operators.graph.application import Application
+from operators.graph.tracking import Histogram
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
-from operators.settings import EngineOptions
+from operators.reconstruct import LiveReconstructOp
+from operators.settings import EngineOptions, check_option
 from operators.sources.source import SourceDescription
+from services.bus.messages import BOUNDS_S, text_of
 from services.bus.pictures import PicturePublisher
+from services.bus.runtime import read_json, write_json
+from services.errors import BadMessage, CommandRefused
 from services.private_files import keep_files_private
-from services.supervisor.captured_source import CapturedSource
-from services.supervisor.engine_size import engine_scale
-from services.supervisor.exit_codes import NO_USE
-from services.supervisor.graph_measures import graph_measures
-from services.supervisor.layers import Layers
-from services.supervisor.live_scene import scene_of
-from services.supervisor.live_snapshots import LiveSnapshots
+from services.supervisor.capture import CapturedSource
+from services.supervisor.launcher import NO_USE
 from services.supervisor.model_show import ModelShow
-from services.supervisor.priority import ENGINE_ON_CPU, step_back
-from services.supervisor.scratch import scratch_folder
-from services.supervisor.screen import Screen
+from services.supervisor.screen import Layers, LayerScene, Screen, header_of
 from services.supervisor.specs import EngineSpec
-from services.supervisor.worker import Worker, stream_folder_of
+from services.supervisor.worker import ENGINE_ON_CPU, Worker, scratch_folder, step_back, stream_folder_of
+
+SHARE_OF_INTERVAL = 0.5
+"""Largest share of the frame interval that processing one frame may take without viewers. Viewers,
+commands and the capture process share the same cores."""
+
+
+def engine_scale(
+    spec: EngineSpec, about: SourceDescription, kept: Path, measure: Callable[[SourceDescription, float], WorkingSize]
+) -> float:
+    """Return the scale of a stream's pictures for reconstruction.
+
+    An engine on a CPU without `engine_scale` measures once which size keeps up with the stream. A
+    restarted engine reuses the stored result, to show its first picture sooner.
+
+    Args:
+        spec: engine part of the stream specification.
+        about: description of the stream's pictures.
+        kept: file for the measured size. An invalid file is overwritten.
+        measure: returns the largest size that needs at most the given share of the frame interval.
+    """
+    if spec.engine_scale is not None:
+        return spec.engine_scale
+    if spec.device != "cpu":
+        return 1.0
+    size = [about.width_px, about.height_px, about.fps]
+    try:
+        found = read_json(kept)
+        scale = float(found["scale"])
+        check_option("scale", scale)
+        if found["size"] == size and scale <= 1:
+            return scale
+    except (OSError, BadMessage, UserError, KeyError, TypeError, ValueError):
+        pass  # nothing measured yet, or damaged file: measure again
+    chosen = measure(about, SHARE_OF_INTERVAL)
+    write_json(kept, {"size": size, "scale": chosen.scale, "frame_ms": round(1e3 * chosen.frame_s, 1)})
+    return chosen.scale
+
+
+def scene_of(shown: ShownPicture, newest: Model | Snapshot | None) -> LayerScene | None:
+    """Return the scene of a live picture with the newest model. None if the sizes differ, because
+    another scene has begun."""
+    rendered = shown.rendered
+    frame = rendered.frame
+    if newest is None or (newest.camera.width_px, newest.camera.height_px) != (frame.width_px, frame.height_px):
+        return None
+    camera = newest.camera if frame.pose is None else newest.camera.with_pose(frame.pose)
+    header = {**header_of(shown), "show": "live", "model_version": newest.version}
+    planes = rendered.depth, rendered.alpha
+    return LayerScene(newest, camera, frame.time_s, header, metric=frame.depth_is_metric, planes=planes)
+
+
+BOUNDS_NS = tuple(round(bound_s * 1e9) for bound_s in BOUNDS_S)
+
+
+def graph_measures(graph: Application) -> dict[str, Any]:
+    """Return path latencies, operator durations, and queue lengths and drops of a graph."""
+    tracker = graph.track()
+    return {
+        "paths": {name: _serialised(histogram) for name, histogram in tracker.paths().items()},
+        "operators": {name: _serialised(histogram) for name, histogram in tracker.operators().items()},
+        "queues": {stats.edge: {"queued": stats.queued, "dropped": stats.dropped} for stats in graph.edge_stats()},
+    }
+
+
+def _serialised(histogram: Histogram) -> dict[str, Any]:
+    """Return a histogram in the format of `services.bus.messages.Durations`."""
+    return {"counts": histogram.between(BOUNDS_NS), "sum_s": round(histogram.sum_ns * 1e-9, 6)}
+
+
+WAIT_S = 5.0
+"""Seconds to wait for the end of a frame."""
+
+
+class LiveSnapshots:
+    """Writer for the model of the running reconstruction.
+
+    Snapshots do not delay pictures. The model is copied after a frame's picture is published, and
+    written in the command thread in pieces, so that other threads can run.
+    """
+
+    def __init__(self) -> None:
+        self._graph: LiveApplication | None = None
+        self._copies: StagedCopies | None = None
+
+    @contextmanager
+    def of(self, graph: LiveApplication) -> Iterator[None]:
+        """Register the running reconstruction while the block runs."""
+        self._graph = graph
+        try:
+            yield
+        finally:
+            self._graph = None
+
+    def take(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Handle `snapshot {folder}`: write the model into a new folder.
+
+        Args:
+            arguments: arguments of the command.
+
+        Returns:
+            Header of the snapshot: sequence number, model version, Gaussian count and timings.
+
+        Raises:
+            BadMessage: if the folder is missing.
+            BundleError: if the bundle cannot be written.
+            CommandRefused: if no reconstruction runs or no frame arrives.
+        """
+        folder = Path(text_of(arguments, "folder"))
+        running: LiveReconstructOp | None = getattr(self._graph, "reconstruct", None)
+        if running is None:
+            raise CommandRefused("no live reconstruction runs; what is shown is a finished model, or nothing yet")
+        model, seq, pause_ns = self._asked(running)
+        began_s = time.monotonic()
+        self._write(model, folder)
+        return {
+            "seq": seq,
+            "model_version": model.version,
+            "gaussians": model.gaussians.count,
+            "time_window_s": list(model.time_window_s),
+            "pause_ms": round(pause_ns * 1e-6, 3),
+            "written_ms": round((time.monotonic() - began_s) * 1e3, 3),
+        }
+
+    def _asked(self, running: LiveReconstructOp) -> tuple[Model, int, int]:
+        """Request the model after the next frame.
+
+        The GPU snapshot is released here, because training needs another slot while one is held.
+
+        Returns:
+            A copy of the model, the frame's sequence number and the pause of the training in
+            nanoseconds.
+        """
+        request = running.request_model()
+        answer = request.wait(WAIT_S)
+        if answer is None:
+            why = request.refused or f"no frame has come for {WAIT_S:g} s"
+            raise CommandRefused(f"there is no model to write: {why}")
+        return self._copied(answer.model), answer.frame.seq, answer.pause_ns
+
+    def _copied(self, model: Model | Snapshot) -> Model:
+        """Copy the model. On a GPU, use a separate stream that waits only for the model's tensors."""
+        if model.device.type != "cuda":
+            return model.as_model()
+        if self._copies is None:
+            self._copies = StagedCopies(model.device)
+        stream = self._copies.stream
+        with torch.cuda.stream(stream):
+            if isinstance(model, Model):
+                stream.wait_stream(torch.cuda.default_stream(model.device))
+            return model.as_model()
+
+    def _write(self, model: Model, folder: Path) -> None:
+        if self._copies is None:
+            save_bundle(model, folder)
+        else:
+            with torch.cuda.stream(self._copies.stream):
+                save_bundle(model, folder, to_host=self._copies.to_host)
+
 
 LOOK_S = 0.05
 """Seconds between checks for a switch back to the live reconstruction."""

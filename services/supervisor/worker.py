@@ -1,20 +1,92 @@
-"""Runtime of capture and engine processes: exclusive role, heartbeats, commands, orderly stop, and
-self-termination without a supervisor."""
+"""Runtime of capture and engine processes: exclusive role, heartbeats, commands, orderly stop, priority and temporary folder."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import logging
 import os
+import shutil
 import signal
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
 from services.bus.messages import CommandServer, Handler, Heartbeats
 from services.bus.runtime import Role, StreamFolder
 from services.supervisor.specs import ProcessSpec
+
+ENGINE_ON_CPU = 5
+"""Nice value of an engine that trains on the CPU, which uses all available time. Capture, viewers
+and commands need little and run first."""
+
+
+def step_back(nice: int) -> None:
+    """Lower the priority of this process.
+
+    With `sched_autogroup_enabled` Linux applies nice values only within a session, and each stream
+    process has its own session. The session's priority is therefore lowered too.
+
+    Args:
+        nice: nice value to reach.
+    """
+    os.nice(max(0, nice - os.nice(0)))
+    with contextlib.suppress(OSError):  # no autogroups on this system, or read-only in this container
+        Path("/proc/self/autogroup").write_text(str(nice), encoding="ascii")
+
+
+PREFIX = "intrasplat-engine-"
+NEW_S = 2.0
+"""Age in seconds below which a folder may belong to a process that has not locked it yet."""
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Create a temporary folder and make it the default for this process. Folders of killed engines
+    are removed first."""
+    remove_dead()
+    before = tempfile.tempdir
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX))
+    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        tempfile.tempdir = os.fspath(folder)
+        yield folder
+    finally:
+        tempfile.tempdir = before
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
+
+
+def remove_dead() -> list[Path]:
+    """Delete this user's folders that no process holds.
+
+    Returns:
+        The deleted folders.
+    """
+    removed = []
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        try:
+            held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except OSError:  # owned by another user, a symbolic link, or already removed
+            continue
+        try:
+            found = os.fstat(held)
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if found.st_uid == os.geteuid() and time.time() - found.st_mtime > NEW_S:
+                shutil.rmtree(folder, ignore_errors=True)
+                removed.append(folder)
+        except BlockingIOError:
+            continue
+        finally:
+            os.close(held)
+    return removed
+
 
 log = logging.getLogger(__name__)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -19,7 +19,7 @@ from services.control.measures import Measures
 from services.control.storage import Storage
 from services.missing_files import StoredFiles, StoredFilesWatch
 from services.registry.database import Database
-from services.server.measures import STATES, StreamMeasures
+from services.supervisor.metrics import STATES, StreamMeasures
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 OF_PROMETHEUS = {"up": {"job", "instance"}}

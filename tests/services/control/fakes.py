@@ -12,7 +12,7 @@ from typing import Any
 
 from services.control.parts import NewStream, Parts
 from services.control.problems import Conflicting, Missing, Unprocessable
-from services.display.encoder import EncodedPicture
+from services.display.hub import EncodedPicture
 
 
 class NotThere(Exception):

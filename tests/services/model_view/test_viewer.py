@@ -15,7 +15,7 @@ from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
 from gsplat_core.scene.model import Model
 from services.cli.view import bundle_in
 from services.errors import Rejected
-from services.model_view.viewer import DISTANCE, ModelView, rotation_matrices, scene_to_view
+from services.model_view import DISTANCE, ModelView, rotation_matrices, scene_to_view
 from services.registry.bundle_file import pack
 from tests.gsplat_core.io.exports.test_exports import random_model
 from tests.services.supervisor.test_model_show import uniform

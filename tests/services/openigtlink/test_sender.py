@@ -13,9 +13,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from operators.errors import OutputError
 from services.bus.pictures import PicturePublisher
-from services.openigtlink.messages import StreamMessages, ijk_to_camera
-from services.openigtlink.sender import folder_of, send
-from services.openigtlink.server import MessageServer
+from services.openigtlink import MessageServer, StreamMessages, folder_of, ijk_to_camera, send
 
 pyigtl = pytest.importorskip("pyigtl", reason="pip install 'intrasplat[igtl]'")
 SOON_S = 300.0

@@ -7,9 +7,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
 from services.bus.messages import BOUNDS_S, Durations
-from services.server.graph_measures import GraphFamilies
-from services.server.measures import StreamMeasures
-from services.supervisor.process_end import cause_of
+from services.supervisor.launcher import cause_of
+from services.supervisor.metrics import GraphFamilies, StreamMeasures
 
 
 class Collected(Collector):
@@ -97,7 +96,7 @@ def test_the_live_model_is_one_series_however_often_it_is_published():
 
 def test_a_graph_tells_what_its_tracker_has_seen():
     from operators.graph import Application, Operator
-    from services.supervisor.graph_measures import graph_measures
+    from services.supervisor.engine import graph_measures
 
     class Source(Operator):
         def setup(self, spec):

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from services.server.streams import overall
 from services.supervisor.process import ProcessState
+from services.supervisor.stream import overall
 
 
 def process(state: str, picture: str | None = None) -> ProcessState:

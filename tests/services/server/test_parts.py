@@ -8,11 +8,11 @@ import tempfile
 import pytest
 
 from services.audit.system_events import SystemEvents
-from services.server.measures import StreamMeasures
 from services.server.parts import assembled, told
-from services.server.streams import StreamFacts, SupervisedStreams
 from services.settings import ServiceSettings
+from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent
+from services.supervisor.stream import StreamFacts, SupervisedStreams
 
 
 @pytest.mark.parametrize(

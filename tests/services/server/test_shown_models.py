@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from services.errors import CommandRefused, Conflict
-from services.server.shown_models import ShownModels
+from services.supervisor.stream import ShownModels
 
 
 class Registry:

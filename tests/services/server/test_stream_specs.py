@@ -8,9 +8,9 @@ from gsplat_core.errors import InvalidSetting
 from services.control.parts import NewStream
 from services.server import stream_specs
 from services.server.stream_specs import spec_of
-from services.server.streams import overall
 from services.supervisor.engine import live_settings
 from services.supervisor.process import ProcessState
+from services.supervisor.stream import overall
 
 
 def wanted(device="cpu", **options):

@@ -11,8 +11,7 @@ import pytest
 from services.bus.runtime import RuntimeFolder
 from services.control.parts import NewStream
 from services.control.problems import Conflicting, Missing, Unprocessable
-from services.server.displays import StreamDisplays
-from services.server.streams import SupervisedStreams
+from services.supervisor.stream import StreamDisplays, SupervisedStreams
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from operators.sources import registry
 from operators.sources.source import SourceState
 from services.supervisor import capture as capture_module
 from services.supervisor.capture import Capture
-from services.supervisor.exit_codes import FAILED
+from services.supervisor.launcher import FAILED
 from services.supervisor.specs import SourceSpec
 
 

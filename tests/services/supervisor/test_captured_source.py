@@ -14,7 +14,7 @@ from operators.sources.wire import description_to, frame_header, planes_of
 from operators.sources.zeromq_message import pieces
 from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher
-from services.supervisor.captured_source import CapturedSource
+from services.supervisor.capture import CapturedSource
 
 SOON_S = 300.0
 ABOUT = SourceDescription("made up", 6, 4, 25.0, Camera.from_focal(5.0, 6, 4), fields=frozenset({"depth", "mask"}))

@@ -10,9 +10,9 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from operators.errors import SourceUnavailable
 from services.supervisor import engine as engines
-from services.supervisor.exit_codes import NO_USE
-from services.supervisor.priority import ENGINE_ON_CPU
+from services.supervisor.launcher import NO_USE
 from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
+from services.supervisor.worker import ENGINE_ON_CPU
 
 
 def test_every_setting_of_the_specification_reaches_the_session(tmp_path):

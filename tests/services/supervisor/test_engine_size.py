@@ -9,7 +9,7 @@ import pytest
 from gsplat_core.scene.cameras import Camera
 from operators.applications.working_size import choose_working_size
 from operators.sources.source import SourceDescription
-from services.supervisor.engine_size import SHARE_OF_INTERVAL, engine_scale
+from services.supervisor.engine import SHARE_OF_INTERVAL, engine_scale
 from services.supervisor.specs import EngineSpec
 
 

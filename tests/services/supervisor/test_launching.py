@@ -9,9 +9,15 @@ import threading
 import pytest
 
 from services.bus.runtime import ProcessIdentity
-from services.supervisor.launcher import Launcher
-from services.supervisor.launching import SOCKET, ByLauncher, Direct, recorded_launcher
-from services.supervisor.process_end import is_of_no_use, last_words
+from services.supervisor.launcher import (
+    SOCKET,
+    ByLauncher,
+    Direct,
+    Launcher,
+    is_of_no_use,
+    last_words,
+    recorded_launcher,
+)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE, DepthColours
 from operators.messages import PictureState
 from operators.rasterize import displayed
 from operators.remembered import COVERED
-from services.supervisor.layer_drawing import LayerDrawing, LayerScene, label
+from services.supervisor.screen import LayerDrawing, LayerScene, label
 from tests.services.supervisor.test_model_show import uniform
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1)
@@ -47,7 +47,7 @@ def test_near_is_warmer_and_the_legend_has_both_depths():
 
 
 def test_planes_that_are_there_are_not_rendered_again(monkeypatch):
-    monkeypatch.setattr("services.supervisor.layer_drawing.render", None)
+    monkeypatch.setattr("services.supervisor.screen.render", None)
     model = wall_and_post()
     plane = np.full((120, 160), 7.0, np.float32)
     _, said = drawn("depth", model, planes=(plane, np.ones_like(plane)))

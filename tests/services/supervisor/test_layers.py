@@ -12,8 +12,8 @@ import zmq
 from gsplat_core.errors import InvalidSetting
 from services.bus.pictures import picture_from, subscribe
 from services.errors import BadMessage
-from services.supervisor import layers as layers_module
-from services.supervisor.layers import Layers
+from services.supervisor import screen as layers_module
+from services.supervisor.screen import Layers
 
 SOON_S = 300.0
 NOW = {"seq": 5, "state": "live", "show": "live", "new": True}

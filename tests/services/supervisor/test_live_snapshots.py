@@ -12,8 +12,8 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.scene.snapshots import SnapshotSlots
 from operators.reconstruct import ModelRequest
 from services.errors import BadMessage, CommandRefused
-from services.supervisor import live_snapshots
-from services.supervisor.live_snapshots import LiveSnapshots
+from services.supervisor import engine
+from services.supervisor.engine import LiveSnapshots
 from tests.services.supervisor.test_model_show import uniform
 
 
@@ -64,7 +64,7 @@ def test_a_snapshot_is_let_go_of_before_it_is_written(tmp_path, monkeypatch):
     waiting = [snapshot]
     del snapshot
     kept = []
-    monkeypatch.setattr(live_snapshots, "save_bundle", lambda *_: kept.append(held() is not None))
+    monkeypatch.setattr(engine, "save_bundle", lambda *_: kept.append(held() is not None))
     take(lambda request: request.answer(waiting.pop(), SimpleNamespace(seq=1), 0), tmp_path)
     assert kept == [False]
 
@@ -74,7 +74,7 @@ def test_what_cannot_be_written_is_refused_with_its_reason(tmp_path, monkeypatch
         LiveSnapshots().take({"folder": str(tmp_path)})
     with pytest.raises(CommandRefused, match="the reconstruction has ended"):
         take(lambda request: request.refuse("the reconstruction has ended"), tmp_path)
-    monkeypatch.setattr(live_snapshots, "WAIT_S", 0.05)
+    monkeypatch.setattr(engine, "WAIT_S", 0.05)
     with pytest.raises(CommandRefused, match="no frame has come"):
         take(lambda request: None, tmp_path)
     with pytest.raises(BadMessage, match="folder"):

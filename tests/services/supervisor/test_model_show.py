@@ -18,8 +18,7 @@ from gsplat_core.scene.model import Model
 from operators.sources.source import SourceState
 from services.errors import BadMessage, CommandRefused
 from services.supervisor import model_show
-from services.supervisor.finished_model import FinishedModel, NotFinite
-from services.supervisor.model_show import LATE_IN_A_ROW, ModelShow
+from services.supervisor.model_show import LATE_IN_A_ROW, FinishedModel, ModelShow, NotFinite
 from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec
 

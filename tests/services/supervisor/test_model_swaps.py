@@ -14,7 +14,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from services.bus.pictures import picture_from, subscribe
-from services.supervisor.launching import Direct
+from services.supervisor.launcher import Direct
 from services.supervisor.specs import SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
 

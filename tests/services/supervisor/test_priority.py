@@ -7,7 +7,7 @@ import sys
 
 PROGRAM = """
 import os
-from services.supervisor.priority import step_back
+from services.supervisor.worker import step_back
 began = os.nice(0)
 step_back(began + 3)
 step_back(began)

@@ -11,7 +11,7 @@ import pytest
 
 from services.errors import NoAnswer
 from services.supervisor import process as processes
-from services.supervisor.launching import Direct
+from services.supervisor.launcher import Direct
 from services.supervisor.process import ManagedProcess, Rate
 from services.supervisor.specs import EngineSpec, ProcessLimits, SourceSpec, StreamSpec
 

@@ -7,12 +7,11 @@ import logging
 import pytest
 
 from services.audit.system_events import SystemEvents
-from services.server.measures import StreamMeasures
 from services.server.parts import told
 from services.supervisor import process as processes
-from services.supervisor.launching import Direct
+from services.supervisor.launcher import Direct, last_words
+from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import SOURCE_GONE, ManagedProcess
-from services.supervisor.process_end import last_words
 from services.supervisor.specs import SourceSpec, StreamSpec
 
 LOGGED = "2026-11-23 19:00:00,123 {} services.supervisor.capture: {}\n"

@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.supervisor.process import Rate
-from services.supervisor.restarts import Restarts
+from services.supervisor.process import Rate, Restarts
 
 
 def test_the_first_start_is_at_once_and_waits_grow_to_a_cap():

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from services.supervisor import scratch
+from services.supervisor import worker
 
 ENGINE = """
 import sys, tempfile
 tempfile.tempdir = sys.argv[1]
-from services.supervisor.scratch import scratch_folder
+from services.supervisor.worker import scratch_folder
 with scratch_folder() as folder:
     open(tempfile.mkstemp()[1], "w").close()
     print(folder, flush=True)
@@ -45,21 +45,21 @@ def test_only_folders_of_killed_engines_are_removed(temporary):
     killed, dead = engine(temporary)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
-    new = temporary / f"{scratch.PREFIX}new"  # its process has not locked it yet
+    new = temporary / f"{worker.PREFIX}new"  # its process has not locked it yet
     new.mkdir()
     (temporary / "other").mkdir()
-    (temporary / f"{scratch.PREFIX}link").symlink_to(temporary / "other")
-    assert scratch.remove_dead() == [dead]
+    (temporary / f"{worker.PREFIX}link").symlink_to(temporary / "other")
+    assert worker.remove_dead() == [dead]
     assert alive.is_dir() and new.is_dir() and (temporary / "other").is_dir() and not dead.exists()
     running.communicate()  # it ends in order
     assert not alive.exists()
 
 
 def test_a_next_engine_removes_what_is_left_and_uses_its_own_folder(temporary):
-    left = temporary / f"{scratch.PREFIX}left"
+    left = temporary / f"{worker.PREFIX}left"
     left.mkdir()
     os.utime(left, (0, 0))
-    with scratch.scratch_folder() as folder:
+    with worker.scratch_folder() as folder:
         assert not left.exists() and Path(tempfile.mkdtemp()).parent == folder
         assert folder.stat().st_mode & 0o077 == 0
     assert list(temporary.iterdir()) == [] and tempfile.gettempdir() == str(temporary)

@@ -21,7 +21,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from services.bus.pictures import split, subscribe
 from services.bus.runtime import ProcessIdentity, RuntimeFolder
-from services.supervisor.launching import ByLauncher, Direct
+from services.supervisor.launcher import ByLauncher, Direct
 from services.supervisor.process import ManagedProcess, StreamEvent
 from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
@@ -141,7 +141,7 @@ def test_a_process_that_nobody_looks_after_ends(runtime):
 
 def test_capture_loads_no_torch(runtime):
     program = (
-        "import sys, services.supervisor.capture, services.supervisor.captured_source, operators.sources.synthetic\n"
+        "import sys, services.supervisor.capture, services.supervisor.capture, operators.sources.synthetic\n"
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
@@ -161,7 +161,7 @@ CONTROL_PLANE = """
 import asyncio, sys
 from pathlib import Path
 from services.bus.runtime import RuntimeFolder
-from services.supervisor.launching import ByLauncher
+from services.supervisor.launcher import ByLauncher
 from services.supervisor.specs import StreamSpec
 from services.supervisor.stream import StreamSupervisor
 

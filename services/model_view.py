@@ -1,4 +1,4 @@
-"""Browser viewer for a model's Gaussians, with free viewpoint and a time slider."""
+"""Viewer of a model's Gaussians in a browser, with free viewpoint and a time slider, by viser (extra `viser`)."""
 
 from __future__ import annotations
 

@@ -1,1 +1,0 @@
-"""Interactive model viewer in a browser, by viser (extra `viser`)."""
