@@ -27,9 +27,9 @@ import sqlalchemy as sa
 
 from gsplat_core.errors import UserError
 from gsplat_core.io.files import PartialFolder, open_regular, read_regular, sync_folder
+from services.api.app import AUDIT_FILE, KEYS_FILE
 from services.audit import verify
 from services.audit.files import MOST_LINE_BYTES, parse_line, read_head
-from services.control.app import AUDIT_FILE, KEYS_FILE
 from services.jobs.results import RUNNING
 from services.missing_files import StoredFiles, missing_files
 from services.registry.models import DATABASE_FILE

@@ -17,8 +17,8 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from services.api.parts import CheckResult
 from services.audit.system_events import SystemEvents
-from services.control.parts import CheckResult
 from services.errors import StoreUnavailable
 from services.jobs.records import JOBS, JobState
 from services.jobs.results import REPORT

@@ -30,8 +30,8 @@ from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
 from operators.sinks.callback import CallbackSinkOp
 from operators.sources.source import SourceDescription, ThreadedSource
+from services import api as service_routes
 from services.cli.app import app
-from services.control import routes as service_routes
 from services.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parent.parent

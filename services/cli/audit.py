@@ -9,10 +9,10 @@ from pathlib import Path
 
 import typer
 
+from services.api.app import AUDIT_FILE
 from services.audit import verify
 from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.streams import printable
-from services.control.app import AUDIT_FILE
 from services.settings import SettingsInvalid, load_settings
 
 

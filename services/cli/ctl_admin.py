@@ -20,8 +20,8 @@ from services.cli.tables import KEY_COLUMNS, Columns, table
 
 if TYPE_CHECKING:
     from services.client import Client
-    from services.control.routes.audit import AuditPage
-    from services.control.routes.streams import StreamView
+    from services.schemas.service import AuditPage
+    from services.schemas.streams import StreamView
 
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 AUDIT: Columns = {

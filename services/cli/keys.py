@@ -14,13 +14,12 @@ from pathlib import Path
 import typer
 
 from gsplat_core.errors import UserError
+from services.api.app import AUDIT_FILE, KEYS_FILE
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping
+from services.auth.keys import ApiKey, KeyConflict, KeyStore, append_key_change
+from services.auth.roles import Role
 from services.cli.exit_codes import OK
 from services.cli.tables import KEY_COLUMNS, table
-from services.control.app import AUDIT_FILE, KEYS_FILE
-from services.control.auth.key_changes import append_key_change
-from services.control.auth.keys import ApiKey, KeyConflict, KeyStore
-from services.control.auth.roles import Role
 from services.settings import ServiceSettings, load_settings
 from services.settings.sections import NAME_PATTERN
 

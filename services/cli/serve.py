@@ -9,13 +9,13 @@ from pathlib import Path
 
 import typer
 
+from services.api.app import new_app
+from services.api.assembly import assembled
+from services.api.health import bind_probe
+from services.api.observability import log_to_stderr, say_start
+from services.api.server import bind, certificate_of, serve
 from services.cli.exit_codes import OK
-from services.control.app import new_app
-from services.control.logs import log_to_stderr, say_start
-from services.control.probe import bind_probe
-from services.control.server import bind, certificate_of, serve
 from services.private_files import keep_files_private, make_state_private
-from services.server.parts import assembled
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
 
 

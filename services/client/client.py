@@ -14,12 +14,10 @@ from services.client.pictures import Picture, pictures
 from services.client.replays import ReplayMethods
 from services.client.requests import refused_by, waited_for
 from services.client.snapshots import SnapshotMethods
-from services.control.health import Readiness
-from services.control.routes.audit import AuditPage
-from services.control.routes.keys import KeyView, MadeKey, Myself
-from services.control.routes.models import ModelView, VersionView
-from services.control.routes.streams import StreamView
 from services.errors import ClientError
+from services.schemas.models import ModelView, VersionView
+from services.schemas.service import AuditPage, KeyView, MadeKey, Myself, Readiness
+from services.schemas.streams import StreamView
 
 TIMEOUT_S = 30.0
 WAITING = ("uploaded", "validated")

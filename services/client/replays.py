@@ -9,9 +9,8 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from services.client.requests import Requests, waited_for
-from services.control.routes.jobs import BatchView, ReplayView, Submitted
-from services.control.routes.models import VersionView
-from services.control.routes.recordings import RecordingView
+from services.schemas.models import VersionView
+from services.schemas.replays import BatchView, RecordingView, ReplayView, Submitted
 
 OPEN = ("queued", "running")
 

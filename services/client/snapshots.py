@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from services.client.requests import Requests
-from services.control.routes.snapshots import SnapshotView
+from services.schemas.streams import SnapshotView
 
 EXPORT_S = 330.0
 """Timeout of an export in seconds."""

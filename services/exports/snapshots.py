@@ -22,7 +22,7 @@ from typing import Any
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.files import sync_folder
-from services.control.problems import Conflicting, Unprocessable
+from services.api.problems import Conflicting, Unprocessable
 from services.errors import CommandRefused, ExportFailed, NoSnapshot
 from services.exports.cache import ExportCache, Exported
 from services.registry.bundle_file import SUFFIX, pack
@@ -150,7 +150,7 @@ CHECKED = (State.READY, State.ACTIVE, State.RETIRED)
 
 
 class StreamSnapshots:
-    """Implementation of `services.control.snapshot_parts.Snapshots`."""
+    """Implementation of `services.api.parts.Snapshots`."""
 
     def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, store: SnapshotStore) -> None:
         self._streams, self._registry, self._store = streams, registry, store
@@ -207,7 +207,7 @@ def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
 
 
 class ModelExports:
-    """Implementation of `services.control.snapshot_parts.Exports`."""
+    """Implementation of `services.api.parts.Exports`."""
 
     def __init__(self, registry: ModelRegistry, store: SnapshotStore, cache: ExportCache) -> None:
         self._registry, self._store, self._cache = registry, store, cache

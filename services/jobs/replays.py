@@ -12,8 +12,8 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from services.api import parts
 from services.audit.system_events import SystemEvents
-from services.control import replay_parts
 from services.errors import CheckFailed, NotFound, StoreUnavailable
 from services.jobs.records import JobRecord, JobState, NewJob, Submission
 from services.jobs.results import FILES, Results
@@ -22,7 +22,7 @@ from services.recordings.store import Expired, RecordingStore
 
 
 class Replays:
-    """Implementation of `services.control.replay_parts.Jobs`."""
+    """Implementation of `services.api.parts.Jobs`."""
 
     def __init__(self, store: JobStore, results: Results) -> None:
         self._store, self._results = store, results
@@ -72,7 +72,7 @@ class Replays:
                 gone.append(Expired(job_id, why))
         return gone
 
-    def files(self, job: replay_parts.JobRecord) -> list[str]:
+    def files(self, job: parts.JobRecord) -> list[str]:
         """See `Jobs`."""
         return self._results.files(job.folder) if job.state == JobState.DONE else []
 

@@ -1,2 +1,1 @@
-"""Composition of `intrasplat serve`: implements the control plane's protocols with supervisor,
-display, registry and console."""
+"""Conversion of an API stream to the specification of its processes."""

@@ -8,7 +8,7 @@ from typing import Any
 from operators.options import Section, options_for
 from operators.settings import check_stream_options
 from operators.sources.registry import check_address
-from services.control.parts import NewStream
+from services.api.parts import NewStream
 from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
 
 NVIDIA = Path("/proc/driver/nvidia/gpus")

@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
+from services.api.parts import NewStream, PictureKind
+from services.api.problems import Conflicting, Missing, Unprocessable
 from services.audit.system_events import SystemEvents
 from services.bus.messages import ANSWER_S
 from services.bus.runtime import Role, RuntimeFolder, StreamFolder
-from services.control.parts import NewStream, PictureKind
-from services.control.problems import Conflicting, Missing, Unprocessable
 from services.display.hub import KINDS, DisplayHub, EncodedPicture
 from services.errors import BusError, RegistryError
 from services.registry.models import ModelRegistry
@@ -128,7 +128,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """Implementation of `services.control.parts.StreamState`."""
+    """Implementation of `services.api.parts.StreamState`."""
 
     name: str
     source: str
@@ -199,7 +199,7 @@ def _withheld(engine: ProcessState) -> str | None:
 
 
 class SupervisedStreams:
-    """Implementation of `services.control.parts.Streams`; `running` is entered with the server."""
+    """Implementation of `services.api.parts.Streams`; `running` is entered with the server."""
 
     def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None], most: int = 16) -> None:
         """Create the manager without streams.
@@ -388,7 +388,7 @@ class SupervisedStreams:
 
 
 class StreamDisplays:
-    """Implementation of `services.control.parts.Display`."""
+    """Implementation of `services.api.parts.Display`."""
 
     def __init__(self, streams: SupervisedStreams) -> None:
         self._streams = streams

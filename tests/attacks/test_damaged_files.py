@@ -18,7 +18,7 @@ from gsplat_core.io.ply import load_ply
 from gsplat_core.io.surface_files import read_surface
 from operators.frame_log import read_frames
 from services.audit import verify
-from services.control.auth.keys import KeyStore, KeysUnreadable
+from services.auth.keys import KeyStore, KeysUnreadable
 from services.settings import load_settings
 
 READERS = {

@@ -8,9 +8,9 @@ import logging
 import pytest
 from starlette.testclient import TestClient
 
-from services.control import new_app
-from services.control.logs import JsonFormatter, facts
-from services.control.problems import PROBLEM_JSON
+from services.api import new_app
+from services.api.observability import JsonFormatter, facts
+from services.api.problems import PROBLEM_JSON
 from services.settings import ServiceSettings
 
 

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from tests.services.control.test_server import raw, serving
+from tests.services.api.test_server import raw, serving
 
 SIZE = 100_000
 

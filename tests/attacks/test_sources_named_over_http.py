@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from services.control.problems import Unprocessable
-from services.control.sources import check_source
+from services.api.problems import Unprocessable
+from services.api.streams import check_source
 from services.settings import SourceRules
 
 

@@ -16,9 +16,9 @@ from gsplat_core.io.files import open_regular, read_regular
 from operators.errors import OutputError
 from operators.output_folder import check_folder_path
 from services.audit import AuditLog
+from services.auth import keys as keys_module
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT
-from services.control.auth import keys as keys_module
 from services.reports.evaluated import load_evaluated
 from tests.services.registry.made import save_model
 

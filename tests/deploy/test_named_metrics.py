@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from services.api.certificate import ServerCertificate
+from services.api.observability import Measures
+from services.api.state import Storage
 from services.audit import AuditLog
 from services.audit.system_events import SystemEvents
-from services.control.certificate import ServerCertificate
-from services.control.measures import Measures
-from services.control.storage import Storage
 from services.missing_files import StoredFiles, StoredFilesWatch
 from services.registry.database import Database
 from services.supervisor.metrics import STATES, StreamMeasures
@@ -106,7 +106,7 @@ def test_states_of_streams_that_are_named_exist():
 
 
 def test_reasons_of_refusals_that_are_named_exist():
-    sources = "".join(path.read_text() for path in (DEPLOY.parent / "services" / "control").rglob("*.py"))
+    sources = "".join(path.read_text() for path in (DEPLOY.parent / "services" / "api").rglob("*.py"))
     for where, expression in ASKED:
         for label, value in MATCHER.findall(expression):
             if label == "reason":

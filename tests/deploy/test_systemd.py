@@ -37,7 +37,7 @@ def test_the_unit_is_closed(tool, units):
 
 
 def test_the_unit_waits_for_what_the_service_says():
-    """`sd_notify` (services/control/systemd.py) and these lines come together."""
+    """`sd_notify` (services/api/server.py) and these lines come together."""
     text = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
     assert "\nType=notify\n" in text and "\nNotifyAccess=main\n" in text
     assert re.search(r"^WatchdogSec=\d+s$", text, re.MULTILINE)

@@ -27,9 +27,9 @@ import services.cli.live
 import services.cli.replay
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
 from services.cli.app import run
-from services.control.parts import NewStream
-from services.control.routes.jobs import ReplayWanted
-from services.control.routes.streams import StreamWanted
+from services.api.parts import NewStream
+from services.api.replays import ReplayWanted
+from services.api.streams import StreamWanted
 from services.server.stream_specs import spec_of
 from services.settings import load_settings
 from services.supervisor.engine import live_settings

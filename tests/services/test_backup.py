@@ -15,19 +15,18 @@ import pytest
 import sqlalchemy as sa
 
 from services import backup as backups
+from services.api.app import AUDIT_FILE, KEYS_FILE
+from services.api.assembly import Archive, new_archive, registry_of
 from services.audit import AuditLog, verify
 from services.audit.system_events import SystemEvents
+from services.auth.keys import KeyStore
+from services.auth.roles import Role
 from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, restore_backup
 from services.cli.backup import backup_command, restore_command
-from services.control.app import AUDIT_FILE, KEYS_FILE
-from services.control.auth.keys import KeyStore
-from services.control.auth.roles import Role
 from services.errors import StoreUnavailable
 from services.jobs.records import JOBS
 from services.recordings.store import RECORDINGS, State
 from services.registry.records import MODELS, VERSIONS
-from services.server.archive import Archive, new_archive
-from services.server.parts import registry_of
 from services.settings import ServiceSettings
 
 AT = "2026-01-01T00:00:00+00:00"

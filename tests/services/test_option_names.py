@@ -14,11 +14,11 @@ from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS
 from operators.options import options_for
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
 from operators.sources.registry import SOURCES
+from services.api import streams
+from services.api.parts import NewStream
 from services.cli import app as command_line
-from services.control import sources
-from services.control.parts import NewStream
-from services.control.routes.jobs import ReplayWanted
-from services.control.routes.streams import StreamWanted
+from services.schemas.replays import ReplayWanted
+from services.schemas.streams import StreamWanted
 from services.server.stream_specs import spec_of
 from services.settings import SettingsInvalid, load_settings
 
@@ -149,7 +149,7 @@ def test_every_sink_is_accepted_by_runs_and_jobs(name, given):
 
 def test_every_source_has_a_rule():
     """A scheme without a rule could not be allowed by the settings."""
-    known = sources.OF_NETWORKS | sources.OF_FOLDERS | sources.OF_DEVICES | sources.OF_NOTHING
+    known = streams.OF_NETWORKS | streams.OF_FOLDERS | streams.OF_DEVICES | streams.OF_NOTHING
     assert set(SOURCES) == known
 
 

@@ -30,7 +30,7 @@ CHECKS = (
 )  # fmt: skip
 """All but those that take it for an error when a request that fits its schema is refused for what it says."""
 ENDLESS = "/v1/streams/{name}/mjpeg"
-"""Endless response while a stream runs, so it is called without one. `tests/services/control/test_display.py` has
+"""Endless response while a stream runs, so it is called without one. `tests/services/api/test_display.py` has
 the pictures."""
 ANSWER_S = 300.0
 

@@ -10,9 +10,9 @@ from functools import partial
 import pytest
 
 from services.audit import AuditLog
+from services.auth.keys import KeyStore
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
-from services.control.auth.keys import KeyStore
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def test_a_key_is_made_listed_and_revoked(tmp_path, capsys):
 
 
 def test_a_server_that_runs_writes_what_a_shell_changes(tmp_path, capsys):
-    from services.control.auth.key_changes import changed_outside
+    from services.auth.keys import changed_outside
 
     server = AuditLog(tmp_path / "audit.jsonl")
     keys = KeyStore(tmp_path / "keys.json")

@@ -7,8 +7,8 @@ import tempfile
 
 import pytest
 
+from services.api.assembly import assembled, told
 from services.audit.system_events import SystemEvents
-from services.server.parts import assembled, told
 from services.settings import ServiceSettings
 from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent

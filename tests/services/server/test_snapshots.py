@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.control.problems import Conflicting, Unprocessable
+from services.api.problems import Conflicting, Unprocessable
 from services.errors import CommandRefused
 from services.exports import snapshots as parts
 from services.exports.cache import ALL, ExportWish

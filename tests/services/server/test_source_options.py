@@ -10,7 +10,7 @@ from operators.settings import MAX_SEED
 from operators.sources.address import PROTOCOLS
 from operators.sources.address_options import PARSERS
 from operators.sources.registry import SOURCES, check_address
-from services.control.parts import NewStream
+from services.api.parts import NewStream
 from services.server.stream_specs import spec_of
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.control.parts import NewStream
+from services.api.parts import NewStream
 from services.server import stream_specs
 from services.server.stream_specs import spec_of
 from services.supervisor.engine import live_settings

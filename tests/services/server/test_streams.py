@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from services.api.parts import NewStream
+from services.api.problems import Conflicting, Missing, Unprocessable
 from services.bus.runtime import RuntimeFolder
-from services.control.parts import NewStream
-from services.control.problems import Conflicting, Missing, Unprocessable
 from services.supervisor.stream import StreamDisplays, SupervisedStreams
 
 

@@ -6,8 +6,8 @@ import logging
 
 import pytest
 
+from services.api.assembly import told
 from services.audit.system_events import SystemEvents
-from services.server.parts import told
 from services.supervisor import process as processes
 from services.supervisor.launcher import Direct, last_words
 from services.supervisor.metrics import StreamMeasures

@@ -1,0 +1,260 @@
+"""State shared by the routes of one application: parts, stores, open displays, cached answers, and checks of disk and audit log."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import shutil
+from collections import Counter, OrderedDict
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Protocol, TypeVar
+
+from fastapi import Header
+from prometheus_client import Metric
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+from starlette.requests import HTTPConnection
+
+from services.api.middleware import TokenBuckets
+from services.api.observability import Measures
+from services.api.parts import CheckResult, Parts
+from services.api.problems import Missing, NotBuiltIn, Problem, Unprocessable
+from services.audit import AuditError, AuditLog
+from services.auth.keys import KeyStore
+from services.auth.roles import Caller, Tickets
+from services.settings import ServiceSettings
+
+
+class ViewerCount:
+    """Counter of open displays with an upper limit."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._open = 0
+
+    @property
+    def full(self) -> bool:
+        """Return True if the limit is reached."""
+        return self._open >= self._most
+
+    @contextmanager
+    def one_more(self) -> Iterator[None]:
+        """Count one display while the block runs."""
+        self._open += 1
+        try:
+            yield
+        finally:
+            self._open -= 1
+
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=200,
+        description="A text of the caller's own. A request that is sent again with it is answered as the first time, while the server runs.",
+        examples=["9f1c2a6e-take-7"],
+    ),
+]
+MOST_KEPT = 1000
+
+
+class Repeated:
+    """Cache of recent answers by caller and idempotency key. For use in one event loop."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[str, str], tuple[str, asyncio.Task[Any]]] = OrderedDict()
+
+    async def once(self, caller: str, key: str | None, asked: str, act: Callable[[], Awaitable[Any]]) -> Any:
+        """Run `act` once per caller and key; later calls return the first result. Failed runs are
+        not cached.
+
+        Args:
+            caller: key id of the caller.
+            key: the Idempotency-Key; without it `act` always runs.
+            asked: fingerprint of the request.
+            act: performs the request.
+
+        Raises:
+            Unprocessable: if the key was used for a different request.
+        """
+        if key is None:
+            return await act()
+        known = self._kept.get((caller, key))
+        if known is not None and known[0] != asked:
+            raise Unprocessable("this Idempotency-Key was used for another request; take a new one")
+        if known is None or (known[1].done() and (known[1].cancelled() or known[1].exception() is not None)):
+            known = asked, asyncio.ensure_future(_awaited(act))
+            self._kept[caller, key] = known
+            while len(self._kept) > MOST_KEPT:
+                self._kept.popitem(last=False)
+        return await asyncio.shield(known[1])
+
+
+async def _awaited(act: Callable[[], Awaitable[Any]]) -> Any:
+    return await act()
+
+
+log = logging.getLogger(__name__)
+SPARE_BYTES = 256 * 2**20
+"""Free bytes that uploads leave for the audit log and the database. With less the service is
+degraded."""
+
+
+def folders_of(settings: ServiceSettings) -> dict[str, Path]:
+    """Return the data folders of the service, by name."""
+    data = settings.data_dir
+    return {
+        "data": data,
+        "recordings": settings.uploaded_recordings.folder or data / "recordings",
+        "replays": settings.jobs.folder or data / "replays",
+    }
+
+
+class Storage(Collector):
+    """Disks under the service's folders, and the writability of the audit log."""
+
+    def __init__(self, folders: Mapping[str, Path], audit: AuditLog) -> None:
+        self._folders, self._audit = folders, audit
+
+    def collect(self) -> Iterable[Metric]:
+        """Export free space, disk size and audit writability; see `Collector`."""
+        free = GaugeMetricFamily("intrasplat_disk_free_bytes", "Free space under a folder.", labels=["folder"])
+        size = GaugeMetricFamily("intrasplat_disk_bytes", "Size of the disk under a folder.", labels=["folder"])
+        for name, folder in self._folders.items():
+            try:
+                usage = shutil.disk_usage(_existing(folder))
+            except OSError as error:
+                log.warning("the free space of %s is not known: %s", folder, error)
+                continue
+            free.add_metric([name], usage.free)
+            size.add_metric([name], usage.total)
+        writable = GaugeMetricFamily(
+            "intrasplat_audit_writable", "0 after an entry of the audit log could not be written."
+        )
+        writable.add_metric([], float(self._audit.failure is None))
+        return [free, size, writable]
+
+    async def disk(self) -> CheckResult:
+        """Report free space per folder. Less than `SPARE_BYTES` makes the service degraded."""
+        return await asyncio.to_thread(self._disk)
+
+    async def audit(self) -> CheckResult:
+        """Report the audit log's writability. After a failure, append a test entry to detect
+        recovery."""
+        if self._audit.failure is None:
+            return CheckResult(True, "entries are written")
+        try:
+            await asyncio.to_thread(self._audit.append, "audit.writable", actor="system", subject="audit")
+        except AuditError as error:
+            return CheckResult(False, str(error))
+        return CheckResult(True, "entries are written again")
+
+    def _disk(self) -> CheckResult:
+        said, ok = [], True
+        for name, folder in self._folders.items():
+            try:
+                free = shutil.disk_usage(_existing(folder)).free
+            except OSError as error:
+                ok = False
+                said.append(f"{name}: {error.strerror}")
+                continue
+            ok = ok and free >= SPARE_BYTES
+            said.append(f"{name}: {free // 2**20} MiB free")
+        return CheckResult(ok, "; ".join(said) + ("" if ok else "; free space on that disk"), needed=False)
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder, or its nearest existing ancestor."""
+    while not os.path.lexists(folder) and folder != folder.parent:
+        folder = folder.parent
+    return folder
+
+
+Part = TypeVar("Part")
+
+
+class Persons(Protocol):
+    """Identity provider for users who sign in elsewhere (OpenID Connect)."""
+
+    async def caller_of(self, token: str) -> Caller:
+        """Return the caller that a token identifies.
+
+        Raises:
+            Unauthenticated: if the token is not valid.
+            Forbidden: if the user has no role here.
+            Unavailable: if the issuer's keys cannot be fetched.
+        """
+
+
+@dataclass(frozen=True)
+class ControlState:
+    """Parts, stores and limits of one application; obtained by `control_of`."""
+
+    settings: ServiceSettings
+    parts: Parts
+    keys: KeyStore
+    tickets: Tickets
+    audit: AuditLog
+    measures: Measures
+    key_rate: TokenBuckets
+    uploads_dir: Path
+    uploads: asyncio.Semaphore
+    viewers: ViewerCount
+    storage: Storage
+    persons: Persons | None = None
+    """OpenID Connect provider, if the settings configure one."""
+    uploads_of: Counter[str] = field(default_factory=Counter)
+    """Running uploads per key."""
+    draining: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the server starts to drain; endless responses then end."""
+    repeated: Repeated = field(default_factory=Repeated)
+    """Answers cached for idempotent requests."""
+    audit_reads: TokenBuckets = field(default_factory=lambda: TokenBuckets(1 / 60, 1))
+    """Limits audit entries about reading the audit log to one per key and filter each minute."""
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    """Background tasks that outlive their request."""
+
+
+def control_of(connection: HTTPConnection) -> ControlState:
+    """Return the state of the application that serves a connection."""
+    state: ControlState = connection.app.state.control
+    return state
+
+
+def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], name: str) -> Part:
+    """Return a part of this server.
+
+    Args:
+        connection: current request or WebSocket.
+        choose: selects the part.
+        name: name of the part for the error message.
+
+    Raises:
+        NotBuiltIn: if the part is absent.
+    """
+    found = choose(control_of(connection).parts)
+    if found is None:
+        raise NotBuiltIn(f"this server was started without {name}")
+    return found
+
+
+def known_problem(control: ControlState, error: BaseException) -> type[Problem] | None:
+    """Return the problem type for an error of a part, or None for an unknown error (a bug)."""
+    known = control.parts.errors
+    return next((known[each] for each in type(error).__mro__ if each in known), None)
+
+
+async def is_missing(control: ControlState, look: Callable[[], object]) -> bool:
+    """Return True if `look` raises an error that maps to Missing."""
+    try:
+        await asyncio.to_thread(look)
+    except Exception as error:
+        if (kind := known_problem(control, error)) is None:
+            raise
+        return issubclass(kind, Missing)
+    return False

@@ -1,0 +1,1 @@
+"""Authentication: API keys with roles, single-use tickets, and OpenID Connect."""

@@ -1,2 +1,0 @@
-"""Authentication and authorisation: API keys with roles, single-use tickets, and the guard of every
-route."""

@@ -1,0 +1,112 @@
+"""Records of streams in the API: settings, state, virtual camera and snapshots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+
+from operators.settings import stream_options_schema
+from services.schemas.models import VersionView
+from services.settings import ResourceName, StreamSettings
+from services.settings.sections import masked_address
+
+MOST_OPTIONS = 50
+Option = str | int | FiniteFloat | bool | None
+
+
+class StreamOptions(BaseModel):
+    """Source and reconstruction options by name; null restores the default."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    options: dict[str, Option] = Field(
+        max_length=MOST_OPTIONS, examples=[{"tool_mask": "builtin"}], json_schema_extra=stream_options_schema()
+    )
+
+
+class StreamWanted(StreamSettings):
+    """New stream."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    name: ResourceName
+    start: bool = Field(True, description="Start it at once.")
+    options: dict[str, Any] = Field({}, max_length=MOST_OPTIONS, json_schema_extra=stream_options_schema())
+
+    @field_validator("options")
+    @classmethod
+    def _plain(cls, options: dict[str, Any]) -> dict[str, Any]:
+        return StreamOptions(options=options).options
+
+
+class StreamView(BaseModel):
+    """Stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason`
+    explains it."""
+
+    model_config = ConfigDict(from_attributes=True)
+    name: str = Field(examples=["endoscope"])
+    source: str = Field(examples=["rtsp://10.0.0.5/stream"])
+    show: str = Field(examples=["live"])
+    device: str = Field(examples=["cuda:0"])
+    options: dict[str, Any]
+    state: str = Field(examples=["live"])
+    reason: str | None = None
+    processes: dict[str, dict[str, Any]] = Field(
+        {},
+        description="Capture and engine: `state`, `reason`, `pid`, `restarts`, `rate_hz` (frames captured, pictures shown a second), `heard_s` since the"
+        " last heartbeat, and its `figures`. Those of the engine have the newest `picture` with its `age_ms` and its `psnr_db`: the training error"
+        " of the frame that is displayed, not of one that was held out.",
+    )
+    viewers: dict[str, int] = Field({}, description="Open displays, by picture.", examples=[{"raw": 1, "shown": 2}])
+
+    @field_validator("source")
+    @classmethod
+    def _without_credentials(cls, source: str) -> str:
+        return masked_address(source)
+
+    @field_validator("options", "processes", "viewers", mode="before")
+    @classmethod
+    def _as_dict(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        return dict(values)
+
+
+class VirtualCamera(BaseModel):
+    """Position of the virtual camera relative to the endoscope, orbiting the point at the centre of
+    its picture."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}
+    )
+    azimuth_deg: float = Field(0.0, ge=-75, le=75, description="To the right.")
+    elevation_deg: float = Field(0.0, ge=-75, le=75, description="Upwards.")
+    zoom: float = Field(1.0, ge=0.25, le=4, description="How many times closer.")
+
+
+class SnapshotWanted(BaseModel):
+    """Use of a snapshot."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    model: ResourceName | None = Field(
+        None,
+        description="Make it the next version of this model; without it, it is kept as a file.",
+        examples=["liver"],
+    )
+
+
+class SnapshotView(BaseModel):
+    """Model of a stream at one frame."""
+
+    model_config = ConfigDict(from_attributes=True)
+    id: str | None = Field(None, examples=["1f0c9a3b5d7e8f20"], description="null: it became a version.")
+    stream: str = Field(examples=["theatre-1"])
+    taken_at: datetime | str
+    taken_by: str
+    seq: int = Field(description="Number of the frame.")
+    model_version: int = Field(description="As pictures name it.")
+    gaussians: int
+    time_window_s: list[float] = Field(description="First and last time that the model has.", examples=[[2.0, 5.0]])
+    pause_ms: float = Field(description="How long training stood still; the frame's picture was on its way before.")
+    size_bytes: int
+    digest: str = Field(description="SHA-256 of its manifest, which has that of its tensors.")
+    version: VersionView | None = Field(None, description="The model's version that it became.")

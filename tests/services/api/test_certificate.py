@@ -1,0 +1,259 @@
+"""The server's certificate: loaded again while it serves, whatever its files become meanwhile, and its expiry."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from services.api.certificate import ServerCertificate, expiry_of
+from services.audit.system_events import SystemEvents
+
+x509 = pytest.importorskip("cryptography.x509", reason="cryptography comes with the extra oidc")
+from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402
+from cryptography.hazmat.primitives.asymmetric import ec, rsa  # noqa: E402
+
+SOON = datetime(2030, 5, 17, 12, 30, 15, tzinfo=UTC)
+
+
+def made(until: datetime = SOON, name: str = "room-1.example", kind: str = "ec"):
+    """A self-signed certificate and its key."""
+    key = ec.generate_private_key(ec.SECP256R1()) if kind == "ec" else rsa.generate_private_key(65537, 2048)
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+    certificate = (
+        x509.CertificateBuilder().subject_name(subject).issuer_name(subject).public_key(key.public_key())
+        .serial_number(x509.random_serial_number()).not_valid_before(datetime(2020, 1, 1)).not_valid_after(until)
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False).sign(key, hashes.SHA256())
+    )  # fmt: skip
+    return certificate, key
+
+
+def pem(certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def key_pem(key, passphrase: bytes | None = None) -> bytes:
+    guard = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()
+    return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, guard)
+
+
+def put(folder: Path, certificate: bytes, key: bytes) -> tuple[Path, Path]:
+    """Write a pair as a renewal does: each file replaced."""
+    for name, content in (("cert.pem", certificate), ("key.pem", key)):
+        (folder / "new").write_bytes(content)
+        os.replace(folder / "new", folder / name)
+    return folder / "cert.pem", folder / "key.pem"
+
+
+@contextmanager
+def listening(certificate: ServerCertificate, pair: tuple[Path, Path]) -> Iterator[int]:
+    """A TLS server as `serve` has it: one context for its whole life. Its port."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*pair)
+    certificate.attach(context)
+    with socket.create_server(("127.0.0.1", 0)) as listener, context.wrap_socket(listener, server_side=True) as server:
+
+        def accept() -> None:
+            while True:
+                try:
+                    server.accept()[0].close()
+                except ssl.SSLError:
+                    continue
+                except OSError:
+                    return
+
+        thread = threading.Thread(target=accept)
+        thread.start()
+        yield server.getsockname()[1]
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+def shown(port: int, name: str | None) -> bytes:
+    """The certificate that a new connection gets."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with (
+        socket.create_connection(("127.0.0.1", port), timeout=10) as plain,
+        context.wrap_socket(plain, server_hostname=name) as client,
+    ):
+        return client.getpeercert(binary_form=True) or b""
+
+
+def der(certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.DER)
+
+
+@pytest.mark.parametrize("kind", ["ec", "rsa"])
+@pytest.mark.parametrize(
+    "until",
+    [SOON, datetime(2049, 12, 31, 23, 59, 59, tzinfo=UTC), datetime(2050, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)],
+)  # fmt: skip
+def test_the_expiry_is_the_certificates_own(until, kind):
+    certificate, _ = made(until, kind=kind)
+    assert datetime.fromtimestamp(expiry_of(der(certificate)), UTC) == certificate.not_valid_after_utc == until
+
+
+def test_what_is_no_certificate_has_no_expiry():
+    good = der(made()[0])
+    for bad in (b"", b"\x30", b"hello", good[:40], good[1:], bytes(len(good)), b"\x30\x84\xff\xff\xff\xff" + good):
+        with pytest.raises((ValueError, IndexError)):
+            expiry_of(bad)
+
+
+def test_the_first_of_a_chain_to_expire_counts(tmp_path):
+    leaf, key = made(SOON)
+    authority, _ = made(SOON - timedelta(days=400), "authority.example")
+    certificate = ServerCertificate(*put(tmp_path, b"a comment\n" + pem(leaf) + pem(authority), key_pem(key)))
+    assert certificate.expires_at == authority.not_valid_after_utc
+
+
+@pytest.mark.parametrize("name", ["room-1.example", None])
+def test_new_connections_get_a_renewed_certificate(tmp_path, name):
+    old, old_key = made()
+    new, new_key = made(SOON + timedelta(days=90), kind="rsa")
+    pair = put(tmp_path, pem(old), key_pem(old_key))
+    certificate = ServerCertificate(*pair)
+    with listening(certificate, pair) as port:
+        assert not certificate.look()
+        assert shown(port, name) == der(old)
+        put(tmp_path, pem(new), key_pem(new_key))
+        assert shown(port, name) == der(old)
+        assert certificate.look() and not certificate.look()
+        assert shown(port, name) == der(new)
+        assert certificate.expires_at == new.not_valid_after_utc
+
+
+def of_another_key(folder, new, key):
+    put(folder, pem(new), key_pem(made()[1]))
+
+
+def cut_off(folder, new, key):
+    put(folder, pem(new)[:300], key_pem(key))
+
+
+def empty(folder, new, key):
+    put(folder, b"", b"")
+
+
+def with_a_passphrase(folder, new, key):
+    put(folder, pem(new), key_pem(key, b"secret"))
+
+
+def gone(folder, new, key):
+    (folder / "cert.pem").unlink()
+
+
+def a_folder(folder, new, key):
+    (folder / "key.pem").unlink()
+    (folder / "key.pem").mkdir()
+
+
+def a_pipe(folder, new, key):
+    (folder / "cert.pem").unlink()
+    os.mkfifo(folder / "cert.pem")
+
+
+def only_half_renewed(folder, new, key):
+    (folder / "cert.pem").write_bytes(pem(new))
+
+
+@pytest.mark.parametrize(
+    "spoil", [of_another_key, cut_off, empty, with_a_passphrase, gone, a_folder, a_pipe, only_half_renewed]
+)
+def test_files_that_cannot_be_used_leave_the_certificate_before(tmp_path, caplog, spoil):
+    old, old_key = made()
+    new, new_key = made(SOON + timedelta(days=90))
+    pair = put(tmp_path, pem(old), key_pem(old_key))
+    certificate = ServerCertificate(*pair)
+    with listening(certificate, pair) as port:
+        assert asyncio.run(certificate.check()).ok
+        spoil(tmp_path, new, new_key)
+        assert not certificate.look()
+        assert shown(port, "room-1.example") == der(old)
+        assert certificate.expires_at == old.not_valid_after_utc
+        checked = asyncio.run(certificate.check())
+        assert not checked.ok and not checked.needed and "cannot be used" in checked.detail
+        assert "2030-05-17 12:30 UTC" in checked.detail
+        assert [record.levelname for record in caplog.records] == ["ERROR"]
+        assert not certificate.look() and len(caplog.records) == 1, "said once for each change"
+        if spoil is a_folder:
+            (tmp_path / "key.pem").rmdir()
+        put(tmp_path, pem(new), key_pem(new_key))
+        assert certificate.look()
+        assert shown(port, "room-1.example") == der(new)
+        assert asyncio.run(certificate.check()).ok
+
+
+@pytest.mark.parametrize("spoil", [of_another_key, cut_off, empty, with_a_passphrase, gone, a_folder, a_pipe])
+def test_such_files_are_refused_at_the_start(tmp_path, spoil):
+    new, key = made()
+    pair = put(tmp_path, pem(new), key_pem(key))
+    spoil(tmp_path, new, key)
+    with pytest.raises(OSError):
+        ServerCertificate(*pair)
+
+
+def test_an_expired_certificate_makes_the_service_degraded(tmp_path):
+    old, key = made(datetime(2021, 1, 1, tzinfo=UTC))
+    checked = asyncio.run(ServerCertificate(*put(tmp_path, pem(old), key_pem(key))).check())
+    assert (checked.ok, checked.needed) == (False, False)
+    assert "has expired at 2021-01-01 00:00 UTC; renew it" in checked.detail
+
+
+def test_what_prometheus_gets(tmp_path):
+    old, key = made()
+    certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)))
+
+    def values():
+        return {family.name: family.samples[0].value for family in certificate.collect()}
+
+    names = "intrasplat_certificate_expiry_timestamp_seconds", "intrasplat_certificate_reload_failed"
+    assert values() == dict(zip(names, (SOON.timestamp(), 0.0), strict=True))
+    gone(tmp_path, None, None)
+    certificate.look()
+    assert values() == dict(zip(names, (SOON.timestamp(), 1.0), strict=True))
+
+
+def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatch):
+    from services.api import certificate as module
+    from services.audit import AuditLog
+
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    audit, events = AuditLog(tmp_path / "audit.jsonl"), SystemEvents()
+    old, key = made()
+    certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)), events)
+
+    async def until(count: int) -> None:
+        end_s = time.monotonic() + 20
+        while audit.head.seq + 1 < count:
+            assert time.monotonic() < end_s
+            await asyncio.sleep(0.01)
+
+    async def renew() -> None:
+        async with events.written_to(audit), certificate.watched():
+            new, new_key = made(SOON + timedelta(days=1))
+            (tmp_path / "cert.pem").write_bytes(b"")
+            await until(1)
+            put(tmp_path, pem(new), key_pem(new_key))
+            end_s = time.monotonic() + 20
+            while certificate.expires_at != new.not_valid_after_utc:
+                assert time.monotonic() < end_s
+                await asyncio.sleep(0.01)
+            await until(2)
+
+    asyncio.run(renew())
+    entries = list(reversed(audit.newest(10)))
+    audit.close()
+    assert {entry.event for entry in entries} == {"certificate.reload"}
+    assert (entries[0].outcome, entries[-1].outcome) == ("failed", "done")
+    assert entries[-1].detail == {"expires_at": (SOON + timedelta(days=1)).isoformat()}

@@ -1,0 +1,103 @@
+"""Accepted host names of a server: addresses, localhost and those listed in the settings."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from pydantic import ValidationError
+from starlette.websockets import WebSocketDisconnect
+
+from services.api.middleware import KnownHosts
+from services.api.observability import Measures
+from services.settings.sections import ServerSettings
+
+
+def knows(host: str, /, **server: object) -> bool:
+    return KnownHosts(lambda *_: None, ServerSettings(**server), Measures()).knows(host)  # type: ignore[arg-type,return-value]
+
+
+@pytest.mark.parametrize("host", ["localhost", "localhost:8000", "127.0.0.1:8000", "[::1]:8000", "[::1]", "10.0.0.4"])
+def test_addresses_and_localhost_are_always_known(host):
+    assert knows(host) and knows(host, allowed_hosts=["room-1.example"])
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "room-1.example.evil", "", "a b", "evil.example:",
+     "evil.example:80:80", "user@localhost", "localhost/x", "[evil]", "*", "127.0.0.1, evil.example", "lоcalhost"],
+)  # fmt: skip
+def test_other_names_are_not(host):
+    assert not knows(host) and not knows(host, allowed_hosts=["room-1.example", "*.hospital.example"])
+
+
+def test_names_are_listed_whole_or_by_what_is_below_them():
+    listed = ["Room-1.example", "*.hospital.example"]
+    for host in (
+        "room-1.example",
+        "room-1.example:8443",
+        "room-1.example.",
+        "a.hospital.example",
+        "a.b.hospital.example",
+    ):
+        assert knows(host, allowed_hosts=listed), host
+    assert not knows("hospital.example", allowed_hosts=listed)
+    assert knows("theatre-pc", host="theatre-pc")
+
+
+def test_with_tls_the_certificate_says_the_names_unless_there_is_a_list():
+    tls = {"certfile": "/x", "keyfile": "/x"}
+    assert knows("room-1.example", **tls) and not knows("a b", **tls)
+    assert not knows("evil.example", **tls, allowed_hosts=["room-1.example"])
+
+
+@pytest.mark.parametrize("name", ["http://x", "x:80", "*", "a*b", "", ".x", "x/y", "[::1]", "*.*.x"])
+def test_what_is_no_name_is_no_setting(name):
+    with pytest.raises(ValidationError, match="is no name of a host"):
+        ServerSettings(allowed_hosts=[name])
+
+
+def test_a_page_of_another_name_gets_nothing(new_plane):
+    plane = new_plane(server={"allowed_hosts": []})
+    answer = plane.ask("GET", "/v1/streams", headers={"Host": "evil.example"})
+    assert answer.status_code == 421 and "server.allowed_hosts" in answer.json()["detail"]
+    assert plane.ask("GET", "/livez", headers={"Host": "evil.example"}).status_code == 421, "public routes, too"
+    assert plane.ask("GET", "/livez", headers={"Host": "localhost, localhost"}).status_code == 421
+    assert plane.ask("GET", "/livez", headers={"Host": "localhost:8000"}).status_code == 200
+    with pytest.raises(WebSocketDisconnect) as closed, plane.client.websocket_connect("/v1/streams/a/display"):
+        pass
+    assert closed.value.code == 1008
+    assert 'refused_total{reason="host"}' in plane.ask("GET", "/metrics", headers={"Host": "localhost"}).text
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+@pytest.mark.parametrize(
+    ("hosts", "taken"),
+    [
+        ([b"localhost"], True),
+        ([], True),
+        ([b"localhost", b"localhost"], False),
+        ([b"localhost", b"evil.example"], False),
+        ([b"evil.example", b"localhost"], False),
+        ([b"127.0.0.1", b"127.0.0.1"], False),
+        ([b"LOCALHOST", b"localhost", b"localhost"], False),
+    ],
+)
+def test_a_request_has_one_host(plane, kind, hosts, taken):
+    """A server before this one may have looked at the other of the two."""
+    reached, sent = [], []
+
+    async def app(scope, receive, send):
+        reached.append(scope)
+
+    async def receive():
+        return {"type": "websocket.connect"}
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": kind, "headers": [(b"host", host) for host in hosts], "app": plane.app, "state": {}}
+    asyncio.run(KnownHosts(app, ServerSettings(), Measures())(scope, receive, send))
+    assert bool(reached) == taken
+    if not taken:
+        assert sent[0].get("status") == 421 or sent[0] == {"type": "websocket.close", "code": 1008}

@@ -1,0 +1,104 @@
+"""Viewers that take nothing, over real sockets: each is dropped, and others go on."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from control_fakes import FakeDisplay, FakeStream, fake_parts
+
+from services.api import new_app
+from services.api.server import DrainingServer, bind, config_of
+from services.settings import ServiceSettings
+
+PICTURE = 300_000
+"""Bytes: a few fill every buffer on the way."""
+
+
+@pytest.fixture
+def served(tmp_path) -> Iterator[tuple[int, str, FakeDisplay, DrainingServer]]:
+    display = FakeDisplay(jpeg=bytes(PICTURE))
+    parts = fake_parts(display=display)
+    parts.streams.kept["endoscope"] = FakeStream("endoscope", "synthetic:", "live", "cpu", {}, "live")
+    settings = ServiceSettings(
+        paths={"data": tmp_path}, server={"port": 0, "drain_s": 2}, limits={"viewer_stall_s": 0.5}
+    )
+    app = new_app(settings, parts)
+    listener, ready = bind(settings), threading.Event()
+    server = DrainingServer(config_of(app, settings), app.state.control, ready.set)
+    thread = threading.Thread(target=lambda: server.run(sockets=[listener]))
+    thread.start()
+    assert ready.wait(300)
+    yield listener.getsockname()[1], (tmp_path / "admin.key").read_text().strip(), display, server
+    server.should_exit = True
+    thread.join(300)
+    listener.close()
+    assert not thread.is_alive()
+
+
+def request(path: str, key: str, *more: str) -> bytes:
+    lines = [f"GET {path} HTTP/1.1", "Host: localhost", f"Authorization: Bearer {key}", *more]
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
+
+
+UPGRADE = (
+    "Upgrade: websocket",
+    "Connection: Upgrade",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+)
+
+
+def until(condition) -> None:
+    for _ in range(500):
+        if condition():
+            return
+        time.sleep(0.02)
+    raise AssertionError("it did not happen")
+
+
+@pytest.mark.parametrize(("path", "more"), [("mjpeg", ()), ("display", UPGRADE)])
+@pytest.mark.slow
+def test_a_viewer_that_takes_nothing_is_dropped_and_others_go_on(served, path, more):
+    port, key, display, server = served
+    address = f"/v1/streams/endoscope/{path}"
+    with (
+        socket.create_connection(("127.0.0.1", port)) as stuck,
+        socket.create_connection(("127.0.0.1", port)) as healthy,
+    ):
+        stuck.sendall(request(address, key, *more))
+        healthy.sendall(request(address, key, *more))
+        healthy.settimeout(10)
+        until(lambda: display.open == 2 or not healthy.recv(65536))
+        taken = 0
+        deadline_s = time.monotonic() + 300
+        while display.open == 2 and time.monotonic() < deadline_s:
+            taken += len(healthy.recv(1 << 20))
+        assert display.open == 1, "the stuck one was dropped"
+        before = taken
+        while taken < before + 5 * PICTURE:
+            received = len(healthy.recv(1 << 20))
+            assert received
+            taken += received
+        # The system cuts the connection off; the client need not read the queued data.
+        until(lambda: len(server.server_state.connections) == 1)
+    until(lambda: display.open == 0)
+
+
+def test_metrics_count_it(served):
+    port, key, display, _ = served
+    with socket.create_connection(("127.0.0.1", port)) as stuck:
+        stuck.sendall(request("/v1/streams/endoscope/mjpeg", key))
+        until(lambda: display.open == 1)
+        until(lambda: display.open == 0)
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(request("/metrics", key, "Connection: close"))
+        text = b""
+        while part := client.recv(65536):
+            text += part
+    assert b'intrasplat_viewers_dropped_total{reason="stalled"} 1.0' in text
+    assert json.dumps("mjpeg").encode() in text

@@ -1,0 +1,114 @@
+"""A full disk: the audit log refuses, /readyz and the metrics say so, and the service goes on by itself once there is space."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections import namedtuple
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from starlette.testclient import TestClient
+
+from services.api import Parts, new_app, state
+from services.api.app import AUDIT_FILE
+from services.audit import AuditLog, verify
+from services.settings import ServiceSettings
+
+Usage = namedtuple("Usage", "total used free")
+WANTED = {"name": "room", "source": "synthetic:", "start": False}
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """Call to fill the disk under the head of the audit log, and again to free it."""
+    real = os.replace
+
+    def refuse(source, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(source))
+
+    def set_full(full):
+        monkeypatch.setattr(os, "replace", refuse if full else real)
+
+    return set_full
+
+
+def test_a_change_is_refused_while_the_audit_log_cannot_be_written(plane, full_disk):
+    before = plane.events()
+    full_disk(True)
+    answer = plane.ask("POST", "/v1/streams", json=WANTED)
+    assert answer.status_code == 503 and "No space left on device" in answer.json()["detail"]
+    ready = plane.client.get("/readyz?verbose")
+    assert (ready.status_code, ready.json()["status"]) == (503, "not ready")
+    assert "No space left on device" in ready.json()["checks"]["audit"]["detail"]
+    assert "intrasplat_audit_writable 0.0" in plane.ask("GET", "/metrics").text
+    assert plane.client.get("/livez").status_code == 200
+    full_disk(False)
+    assert plane.client.get("/readyz").json() == {"status": "ready"}
+    assert "intrasplat_audit_writable 1.0" in plane.ask("GET", "/metrics").text
+    assert plane.ask("DELETE", "/v1/streams/room").status_code == 204
+    assert plane.events() == [*before, ("audit.writable", "audit", "done"), ("stream.delete", "room", "done")]
+    assert verify(plane.control.settings.data_dir / AUDIT_FILE).intact
+
+
+def test_the_end_of_a_service_whose_disk_is_full_is_no_bug(tmp_path, full_disk, caplog):
+    app = new_app(ServiceSettings(paths={"data": tmp_path}), Parts())
+    with TestClient(app):
+        full_disk(True)
+    full_disk(False)
+    assert "the end of the service is not in the audit log" in caplog.text
+    AuditLog(tmp_path / AUDIT_FILE).close()  # it was closed: nothing else holds it
+    assert verify(tmp_path / AUDIT_FILE).intact
+
+
+@pytest.mark.parametrize(
+    ("free", "status"), [(state.SPARE_BYTES, "ready"), (state.SPARE_BYTES - 1, "degraded"), (0, "degraded")]
+)
+def test_little_free_space_is_degraded(plane, monkeypatch, free, status):
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: Usage(10 * state.SPARE_BYTES, 0, free))
+    ready = plane.client.get("/readyz?verbose").json()
+    assert ready["status"] == status and f"data: {free // 2**20} MiB free" in ready["checks"]["disk"]["detail"]
+    families = text_string_to_metric_families(plane.ask("GET", "/metrics").text)
+    samples = next(family.samples for family in families if family.name == "intrasplat_disk_free_bytes")
+    assert {sample.labels["folder"]: sample.value for sample in samples} == {
+        folder: free for folder in ("data", "recordings", "replays")
+    }
+
+
+def test_a_folder_of_its_own_is_looked_at(new_plane, tmp_path, monkeypatch):
+    asked = []
+
+    def usage(folder):
+        asked.append(folder)
+        return Usage(10 * state.SPARE_BYTES, 0, 0 if folder == tmp_path / "elsewhere" else 5 * state.SPARE_BYTES)
+
+    (tmp_path / "elsewhere").mkdir()
+    plane = new_plane(uploaded_recordings={"folder": tmp_path / "elsewhere" / "not" / "made"})
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    ready = plane.client.get("/readyz?verbose").json()
+    assert ready["status"] == "degraded" and "recordings: 0 MiB free" in ready["checks"]["disk"]["detail"]
+
+
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(errno.ENOSPC, 507), (errno.EDQUOT, 507), (errno.EROFS, 503), (errno.EIO, 503), (errno.EMFILE, 503)],
+)
+@pytest.mark.parametrize("store", ["keys", "registry", "streams"])
+def test_a_store_whose_disk_refuses_is_no_bug(plane, monkeypatch, caplog, store, number, status):
+    """An error of the disk in any store is an answer that names it, and not a traceback."""
+
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number), "/secret/path")
+
+    if store == "keys":
+        monkeypatch.setattr(plane.control.keys, "create", refuse)
+        answer = plane.ask("POST", "/v1/keys", json={"name": "new", "role": "viewer"})
+    elif store == "registry":
+        monkeypatch.setattr(plane.parts.models, "rollback", refuse)
+        answer = plane.ask("POST", "/v1/models/liver/rollback")
+    else:
+        monkeypatch.setattr(plane.parts.streams, "create", refuse)
+        answer = plane.ask("POST", "/v1/streams", json={"name": "x", "source": "synthetic:"})
+    assert answer.status_code == status and os.strerror(number) in answer.json()["detail"]
+    assert "/secret" not in answer.text and "Traceback" not in caplog.text
