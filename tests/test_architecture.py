@@ -134,6 +134,23 @@ WITHOUT_TORCH = [
 """Modules that the control plane's process loads."""
 
 
+CLIENT_WITHOUT_FASTAPI = (
+    "services.client",
+    "services.schemas.streams",
+    "services.schemas.models",
+    "services.schemas.replays",
+    "services.schemas.service",
+)
+
+
+def test_the_client_and_the_schemas_load_no_server_framework():
+    program = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\nassert not {'fastapi', 'starlette', 'uvicorn', 'sqlalchemy', 'torch', 'cv2'} & set(sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *CLIENT_WITHOUT_FASTAPI], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_control_plane_loads_neither_torch_nor_opencv():
     """Import all modules in one process and check for torch and OpenCV after each."""
     program = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\n    assert not {'torch', 'cv2'} & set(sys.modules), name"

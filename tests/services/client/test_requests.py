@@ -13,8 +13,15 @@ import httpx2
 import pytest
 
 from services.client import requests
-from services.client.pictures import picture_of, tls_context
-from services.client.requests import MOST_KEY_CHARACTERS, MOST_PROBLEM_BYTES, Requests, checked_key, checked_url
+from services.client.requests import (
+    MOST_KEY_CHARACTERS,
+    MOST_PROBLEM_BYTES,
+    Requests,
+    checked_key,
+    checked_url,
+    picture_of,
+    tls_context,
+)
 from services.errors import ClientError, Refused, Unreachable
 
 URL = "http://room-1.example:8000"
