@@ -13,8 +13,7 @@ def main() -> None:
     import _signal  # type: ignore[import-not-found]
 
     _signal.signal(_signal.SIGINT, lambda number, frame: os._exit(130))
-    from services.cli.interrupt import end_on_interrupt
-    from services.cli.streams import StandardStreams
+    from services.cli.terminal import StandardStreams, end_on_interrupt
 
     end_on_interrupt()
     streams = StandardStreams()

@@ -4,35 +4,176 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
-from services.cli import model_commands, recording_commands, service
+from services.cli import service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     BatchOutOption,
+    DeviceOption,
     EvaluatedArgument,
     EvaluateOptions,
     EvaluationOutOption,
+    ExportedFileArgument,
     FolderArgument,
     JsonOption,
     LiveOutOption,
+    MeshArgument,
+    ModelArgument,
     OutOption,
+    PackedFileArgument,
     RecordingArgument,
     RecordKeepOption,
+    RendererOption,
+    RenderOutOption,
+    ScaleOption,
     SourceArgument,
     SynthesizeOptions,
+    path_option,
     require_plain_numbers,
     takes_options,
     takes_run_options,
 )
-from services.cli.streams import sentence
+from services.cli.terminal import sentence
+
+
+def render(
+    model: ModelArgument,
+    out: RenderOutOption,
+    fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
+    scale: ScaleOption = 1.0,
+    device: DeviceOption = "cpu",
+    renderer: RendererOption = "alpha",
+    view: Annotated[
+        str, typer.Option(help="From where: recorded, orbit, stereo (side by side), or a camera path (a .json file).")
+    ] = "recorded",
+    baseline: Annotated[
+        float | None,
+        typer.Option(
+            help="Distance between the eyes of stereo, in the model's unit.", show_default="0.06 of the depth"
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Render a model over its time window to a video or to images."""
+    from operators.applications.render import ViewWish
+    from services.cli.models import render_command
+
+    chosen = {"scale": scale, "device": device, "renderer": renderer, "view": ViewWish(view, baseline)}
+    return render_command(model, out, fps, overwrite=overwrite, as_json=json, **chosen)
+
+
+def pack(
+    model: ModelArgument,
+    file: PackedFileArgument,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Pack a model into one file for upload to the service."""
+    from services.cli.models import pack_command
+
+    return pack_command(model, file, overwrite=overwrite, as_json=json)
+
+
+def export(
+    model: ModelArgument,
+    file: ExportedFileArgument,
+    format: Annotated[
+        str | None,
+        typer.Option(
+            help="ply, splat, glb, ply-sequence; of the surface mesh-ply, mesh-glb, points-ply.",
+            show_default="by the file's ending",
+        ),
+    ] = None,
+    time: Annotated[
+        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+    ] = None,
+    times: Annotated[
+        int | None, typer.Option(help="Of a sequence: how many times of the window.", show_default="30")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Export a model for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its
+    surface."""
+    from services.cli.models import export_command
+
+    return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)
+
+
+def measure(
+    model: ModelArgument,
+    start: Annotated[str, typer.Option("--from", help="A pixel of the recorded camera's picture, as X,Y.")],
+    end: Annotated[
+        str | None, typer.Option("--to", help="Another one: the distance, and the length along the surface.")
+    ] = None,
+    time: Annotated[
+        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Measure points, distances and lengths on a model's surface, each with its standard error."""
+    from services.cli.models import measure_command
+
+    return measure_command(model, time, start, end, as_json=json)
+
+
+def compare(
+    model: ModelArgument,
+    mesh: MeshArgument,
+    time: Annotated[
+        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+    ] = None,
+    pairs: Annotated[
+        str | None,
+        typer.Option(
+            help="Points that belong together, model = mesh: x,y,z=x,y,z;... Three or more, where they start."
+        ),
+    ] = None,
+    inlier: Annotated[
+        float | None,
+        typer.Option(help="Distance of an inlier, in the mesh's unit.", show_default="0.02 of the mesh's extent"),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Align a model's surface rigidly to a mesh (.ply, .stl or .obj, for example from CT) and
+    report the distances."""
+    from services.cli.models import compare_command
+
+    return compare_command(model, mesh, time, pairs, inlier, as_json=json)
+
+
+PosesOutOption = Annotated[Path, path_option("--out", "The file: poses.npy, to be put beside the recording's images.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")]
+
+
+def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
+    """Read a recording completely and report its defects."""
+    from services.cli.recordings import validate_command
+
+    return validate_command(recording, as_json=json)
+
+
+def poses(
+    recording: RecordingArgument,
+    out: PosesOutOption,
+    max_frames: Annotated[int | None, typer.Option(help="Read only so many frames.", show_default="all")] = None,
+    overwrite: OverwriteOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Estimate the pose of a moving endoscope at each frame, from the pictures alone."""
+    from services.cli.recordings import poses_command
+
+    return poses_command(recording, out, max_frames, overwrite=overwrite, as_json=json)
+
 
 # Base class of usage errors. Its module differs between typer releases; its subclasses do not.
 _USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
-
 app = typer.Typer(
     name="intrasplat",
     help="Live, deforming 3D reconstruction from endoscopic video. Research use only, not a medical device.",
@@ -108,7 +249,7 @@ def replay(recording: RecordingArgument, out: OutOption, options: Mapping[str, A
     """Reconstruct a recording as if it were live: train on each frame as it arrives, display it,
     score it."""
     from operators.applications.replay import ReplaySettings
-    from services.cli.replay import replay_command
+    from services.cli.runs import replay_command
 
     return replay_command(ReplaySettings(recording, out, **options), as_json=json)
 
@@ -147,7 +288,7 @@ def live(
 ) -> int:
     """Reconstruct a stream live: display each frame's reconstruction within its time budget, with
     its age."""
-    from services.cli.live import live_command, live_settings
+    from services.cli.runs import live_command, live_settings
 
     with live_settings(source, out, record, record_keep or (), **options) as settings:
         return live_command(settings, keep=out is not None, as_json=json)
@@ -160,7 +301,7 @@ def reconstruct(
 ) -> int:
     """Reconstruct offline: train on all training frames, then evaluate the held-out ones."""
     from operators.applications.replay import ReplaySettings
-    from services.cli.reconstruct import reconstruct_command
+    from services.cli.runs import reconstruct_command
 
     chosen = ReconstructOptions(**options)
     return reconstruct_command(ReplaySettings(recording, out, **chosen.options(JobOptions)), chosen.steps, as_json=json)
@@ -186,7 +327,7 @@ def evaluate(
 def synthesize(out: OutOption, options: SynthesizeOptions, json: JsonOption = False) -> int:
     """Create a recording with exact ground truth: tissue, tool, stereo, depth, masks and poses,
     with optional extras."""
-    from services.cli.synthesize import synthesize_command
+    from services.cli.recordings import synthesize_command
 
     return synthesize_command(out, options, as_json=json)
 
@@ -199,6 +340,6 @@ def doctor(json: JsonOption = False) -> int:
     return doctor_command(as_json=json)
 
 
-model_commands.add_to(app)
-recording_commands.add_to(app)
+for _command in (render, pack, export, measure, compare, validate, poses):
+    app.command()(_command)
 service.add_to(app)

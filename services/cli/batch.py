@@ -17,8 +17,7 @@ import typer
 from gsplat_core.depth.registry import check_depth
 from operators.settings import JobOptions
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
-from services.cli.interrupt import ASKING
-from services.cli.streams import printable
+from services.cli.terminal import ASKING, printable
 from services.jobs.batch import Batch, Counts, Summary
 from services.jobs.pool import PoolSettings, new_runner
 

@@ -14,10 +14,9 @@ from gsplat_core.plain_numbers import plain_float
 from operators.applications.evaluate import EvaluationSettings, evaluate
 from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
-from services.cli.interrupt import InterruptRequest
 from services.cli.options import EvaluateOptions
 from services.cli.progress import ProgressPrinter
-from services.cli.streams import printable
+from services.cli.terminal import InterruptRequest, printable
 from services.reports.evaluated import load_evaluated
 from services.reports.evaluation_build import build_evaluation, write_evaluation
 from services.reports.evaluation_geometry import geometry_lines

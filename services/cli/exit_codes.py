@@ -8,8 +8,8 @@ import sys
 import traceback
 from collections.abc import Iterable, Iterator
 
-from services.cli.interrupt import INTERRUPTED as INTERRUPTED
-from services.cli.streams import sentence
+from services.cli.terminal import INTERRUPTED as INTERRUPTED
+from services.cli.terminal import sentence
 
 OK = 0
 BUG = 1

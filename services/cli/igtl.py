@@ -1,7 +1,8 @@
-"""Implementation of `intrasplat igtl`."""
+"""Implementation of `intrasplat igtl`, and the check of listen addresses for servers without keys or encryption."""
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import sys
 from pathlib import Path
@@ -10,11 +11,31 @@ import typer
 
 from gsplat_core.errors import InvalidSetting
 from services.cli.exit_codes import OK
-from services.cli.interrupt import InterruptRequest
-from services.cli.listening import check_host
+from services.cli.terminal import InterruptRequest
 from services.display.hub import KINDS
 from services.openigtlink import MessageServer, StreamMessages, folder_of, send
 from services.settings import load_settings
+
+
+def check_host(host: str, plaintext: bool, why: str) -> None:
+    """Check that an address is a loopback address, unless `plaintext` is set.
+
+    Args:
+        host: address to listen on.
+        plaintext: allow other addresses.
+        why: explanation for the error message.
+
+    Raises:
+        InvalidSetting: if the address is reachable from other machines.
+    """
+    try:
+        here = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        here = False
+    if not here and not plaintext:
+        raise InvalidSetting(
+            f"{host} is beyond this machine: {why}; give --plaintext on a network that is closed to others"
+        )
 
 
 def igtl_command(

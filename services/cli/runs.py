@@ -1,21 +1,36 @@
-"""Common parts of `replay` and `reconstruct`: progress, interruption, reports, summary."""
+"""Implementation of `intrasplat replay`, `reconstruct` and `live`: progress, interruption, reports, summary."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any
 
 import typer
 
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.sessions import WriterOptions
+from operators.applications.live import LiveApplication, live
+from operators.applications.live_settings import LiveSettings
 from operators.applications.progress import ProgressCallback
+from operators.applications.reconstruct import reconstruct
+from operators.applications.recording import new_recording_folder
+from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Report, RunOutcome
+from operators.metrics import ScoredFrame
 from services.cli.exit_codes import INTERRUPTED, OK
-from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter
-from services.cli.streams import printable
+from services.cli.terminal import InterruptRequest, printable
 from services.reports.build import write_reports
 from services.reports.nothing_shown import require_shown
-from services.reports.schema import RunReport
+from services.reports.schema import LiveFacts, RunReport
 
 Run = Callable[[ProgressCallback, Callable[[], bool], Report], RunOutcome]
 
@@ -87,3 +102,183 @@ def next_frame_line(report: RunReport) -> list[str]:
         return []
     name = "next frame, predicted before training on it"
     return quality_line(name, measured.psnr_tissue_db, measured.previous_frame_db)
+
+
+def replay_command(settings: ReplaySettings, *, as_json: bool) -> int:
+    """Replay, write the reports and print their paths.
+
+    Returns:
+        The exit code.
+    """
+    return report_run(lambda *callbacks: replay(settings, *callbacks), settings.out, as_json=as_json)
+
+
+def reconstruct_command(settings: ReplaySettings, steps: int, *, as_json: bool) -> int:
+    """Reconstruct offline, write the reports and print their paths.
+
+    Returns:
+        The exit code.
+    """
+    return report_run(lambda *callbacks: reconstruct(settings, steps, *callbacks), settings.out, as_json=as_json)
+
+
+_KEPT = re.compile(r"(\d+(?:\.\d+)?) *([A-Za-z]+)", re.ASCII)
+_UNITS = {
+    "mib": ("bytes", 2.0**20), "gib": ("bytes", 2.0**30), "tib": ("bytes", 2.0**40),
+    "min": ("seconds", 60.0), "h": ("seconds", 3600.0), "d": ("seconds", 86400.0),
+}  # fmt: skip
+_LEAST = {"bytes": 64.0 * 2**20, "seconds": 60.0}
+STATUS_PERIOD_S = 1.0
+PLAIN_PERIOD_S = 5.0
+
+
+class LiveStatus:
+    """Status line of the display on stderr: refreshed on a terminal, printed periodically
+    otherwise."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._terminal = not quiet and sys.stderr.isatty()
+        self._period_s = STATUS_PERIOD_S if self._terminal else PLAIN_PERIOD_S
+        self._printed_s = 0.0
+        self._frames = 0
+        self._written = False
+
+    def __enter__(self) -> LiveStatus:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal and self._written:
+            print(file=sys.stderr)  # noqa: T201 - ends the refreshed line
+
+    def __call__(self, graph: LiveApplication, scored: ScoredFrame) -> None:
+        """Process one scored frame."""
+        now_s = time.monotonic()
+        if self._quiet or now_s - self._printed_s < self._period_s:
+            return
+        frames, since_s = graph.display.pictures, now_s - self._printed_s
+        rate = (frames - self._frames) / since_s if self._written else 0.0
+        self._printed_s, self._frames = now_s, frames
+        state = "" if graph.display.state is None else graph.display.state.value
+        line = (
+            f"{state:<11} {rate:5.1f} pictures/s  age {graph.display.age_p50_ms:5.1f} ms"
+            f"  training error {scored.quality.psnr_tissue_db:5.2f} dB (previous frame {scored.previous_frame_db:5.2f} dB)"
+            f"  {graph.reconstruct.newest_gaussians} Gaussians"
+        )
+        print(f"\r{line}" if self._terminal else line, end="" if self._terminal else "\n", file=sys.stderr, flush=True)  # noqa: T201
+        self._written = True
+
+
+@contextmanager
+def live_settings(
+    source: str,
+    out: Path | None,
+    record: bool = False,
+    record_keep: Sequence[str] = (),
+    **settings: Any,
+) -> Iterator[LiveSettings]:
+    """Provide the settings of a run. Without `out`, results go to a temporary folder and recording
+    is not possible.
+
+    Raises:
+        InvalidSetting: if a setting is not valid.
+    """
+    if record and out is None:
+        raise InvalidSetting("--record needs a folder that stays; give --out, in which recordings/ is made")
+    if record_keep and not record:
+        raise InvalidSetting(f"--record-keep {record_keep[0]} bounds what --record writes; give --record, too")
+    kept = recording_kept(record_keep)
+    if out is not None:
+        recording = new_recording_folder(out) if record else None
+        yield LiveSettings(source=source, out=out, record=recording, recording=kept, **settings)
+        return
+    with TemporaryDirectory(prefix="intrasplat-live-") as folder:
+        yield LiveSettings(source=source, out=Path(folder) / "out", **settings)
+
+
+def recording_kept(texts: Sequence[str]) -> WriterOptions:
+    """Parse retention limits of session recordings: a size such as `20GiB`, an age such as `90min`,
+    or both.
+
+    Raises:
+        InvalidSetting: if a text is malformed.
+    """
+    bounds: dict[str, float] = {}
+    for text in texts:
+        match = _KEPT.fullmatch(text.strip())
+        kind, factor = _UNITS.get(match[2].lower() if match else "", ("", 0.0))
+        if match is None or not kind or kind in bounds:
+            raise InvalidSetting(
+                f"record-keep is {text!r}; give a size in MiB, GiB or TiB, or a time in min, h or d, each once, such as 20GiB or 48h"
+            )
+        bounds[kind] = float(match[1]) * factor
+        if not _LEAST[kind] <= bounds[kind] < 1e15:
+            raise InvalidSetting(f"record-keep is {text!r}; it must be at least 64MiB, or 1min")
+    options, size, age_s = WriterOptions(), bounds.get("bytes"), bounds.get("seconds")
+    return replace(
+        options,
+        keep_bytes=None if size is None else int(size),
+        keep_s=age_s,
+        # Recordings are deleted by whole segments.
+        segment_bytes=options.segment_bytes if size is None else min(options.segment_bytes, int(size / 8)),
+        segment_s=options.segment_s if age_s is None else min(options.segment_s, age_s / 8),
+        with_earlier=bool(bounds),
+    )
+
+
+def live_command(settings: LiveSettings, *, keep: bool, as_json: bool) -> int:
+    """Run live, write the reports and print the result. Without `keep` the results are deleted.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        NothingShown: if the run showed no frame.
+    """
+    written: list[RunReport] = []
+
+    def report(outcome: RunOutcome, folder: Path) -> None:
+        written.append(write_reports(outcome, folder))
+
+    with InterruptRequest() as interrupt, LiveStatus(quiet=as_json) as status:
+        outcome = live(settings, stop_requested=interrupt, on_scored=status, report=report)
+    if written:
+        print_live(written[0], settings.out if keep else None, as_json=as_json)
+    require_shown(outcome)
+    if not written:
+        typer.echo("ended before there was anything to show", err=True)
+        return INTERRUPTED if interrupt.requested else OK
+    # A stream has no end, so an interrupt is its regular end.
+    return OK
+
+
+def print_live(report: RunReport, out: Path | None, *, as_json: bool) -> None:
+    """Print the report as JSON, or its main figures and the path of the page."""
+    if as_json:
+        typer.echo(report.model_dump_json(indent=2))
+        return
+    for note in report.notes:
+        typer.echo(f"note: {printable(note)}", err=True)
+    if report.live is not None:
+        typer.echo(_summary(report, report.live))
+    if out is not None:
+        typer.echo(str(out / "report.html"))
+
+
+def _summary(report: RunReport, facts: LiveFacts) -> str:
+    lines = [
+        f"{report.frames.ingested} frames in {report.run.wall_s:.1f} s, {facts.pictures} pictures shown,"
+        f" {sum(facts.dropped.values())} passed over; ended: {printable(report.run.stop_reason)}",
+        f"age of what was shown: p50 {facts.age_p50_ms:.1f} ms, p99 {facts.age_p99_ms:.1f} ms, most {facts.age_max_ms:.1f} ms",
+    ]
+    # The first second, in which the model is initialised, is excluded from these figures.
+    name = "displayed frame (training error)"
+    lines += quality_line(name, facts.settled_psnr_tissue_db, facts.previous_frame_db)
+    lines += quality_line(f"worst {name}", facts.worst_psnr_tissue_db, None)
+    lines += next_frame_line(report)
+    for name, counts in (("not trained on", facts.withheld), ("new scenes", facts.scenes), ("states", facts.states)):
+        if counts:
+            lines.append(f"{name}: " + ", ".join(f"{count} x {reason}" for reason, count in counts.items()))
+    return "\n".join(lines)

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from services.cli import ctl_models
 from services.cli.ctl import ctl
 from services.cli.options import JsonOption, path_argument, path_option
 
@@ -28,7 +27,6 @@ def add_to(app: typer.Typer) -> None:
     app.command()(view)
     app.add_typer(keys, name="keys")
     app.add_typer(audit, name="audit")
-    assert ctl_models.ctl is ctl  # importing ctl_models has added its commands to ctl
     app.add_typer(ctl, name="ctl")
 
 
@@ -62,7 +60,7 @@ def backup(
     json: JsonOption = False,
 ) -> int:
     """Copy all data of the service into a new folder, whether it runs or not."""
-    from services.cli.backup import backup_command
+    from services.cli.serve import backup_command
 
     return backup_command(target, config, data, as_json=json)
 
@@ -75,7 +73,7 @@ def restore(
     json: JsonOption = False,
 ) -> int:
     """Check a backup and restore it into the service's folders, which must be empty."""
-    from services.cli.backup import restore_command
+    from services.cli.serve import restore_command
 
     return restore_command(backup, config, data, check=check, as_json=json)
 
@@ -124,7 +122,7 @@ def view(
 @keys.command("list")
 def keys_list(config: ConfigOption = None, data: DataOption = None, json: JsonOption = False) -> int:
     """List the keys, without their secrets."""
-    from services.cli.keys import keys_list_command
+    from services.cli.serve import keys_list_command
 
     return keys_list_command(config, data, as_json=json)
 
@@ -145,7 +143,7 @@ def keys_add(
 ) -> int:
     """Create a key and print its token, which is not stored and cannot be shown again. A running
     server accepts it at once."""
-    from services.cli.keys import keys_add_command
+    from services.cli.serve import keys_add_command
 
     return keys_add_command(config, data, name, role, expires_days, stream or ())
 
@@ -157,7 +155,7 @@ def keys_revoke(
     data: DataOption = None,
 ) -> int:
     """Revoke a key. A running server refuses it at once."""
-    from services.cli.keys import keys_revoke_command
+    from services.cli.serve import keys_revoke_command
 
     return keys_revoke_command(config, data, key_id)
 
@@ -174,6 +172,6 @@ def audit_verify(
     json: JsonOption = False,
 ) -> int:
     """Detect entries that were changed, removed, inserted or truncated."""
-    from services.cli.audit import audit_verify_command
+    from services.cli.serve import audit_verify_command
 
     return audit_verify_command(file, config, head, as_json=json)

@@ -13,8 +13,8 @@ from gsplat_core.errors import BundleError
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.io.model_sources import load_model
 from services.cli.exit_codes import OK
-from services.cli.interrupt import InterruptRequest
-from services.cli.listening import check_host
+from services.cli.igtl import check_host
+from services.cli.terminal import InterruptRequest
 from services.model_view import ModelView
 from services.registry.bundle_file import SUFFIX, unpack
 

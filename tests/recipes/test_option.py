@@ -23,8 +23,8 @@ PROGRAM = """
 import json, sys
 from pathlib import Path
 
-import services.cli.live
-import services.cli.replay
+import services.cli.runs
+import services.cli.runs
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
 from services.cli.app import run
 from services.api.parts import NewStream
@@ -62,8 +62,8 @@ def shown(settings, *, keep, as_json):
     return 0
 
 
-services.cli.replay.replay_command = replayed
-services.cli.live.live_command = shown
+services.cli.runs.replay_command = replayed
+services.cli.runs.live_command = shown
 assert run(["replay", str(recording), "--out", str(folder / "a"), "--example", "1"]) == 0
 assert run(["live", str(recording), "--example", "2"]) == 0
 assert run(["replay", str(recording), "--out", str(folder / "a"), "--example", "10"]) == 2

@@ -22,7 +22,7 @@ from services.audit.system_events import SystemEvents
 from services.auth.keys import KeyStore
 from services.auth.roles import Role
 from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, restore_backup
-from services.cli.backup import backup_command, restore_command
+from services.cli.serve import backup_command, restore_command
 from services.errors import StoreUnavailable
 from services.jobs.records import JOBS
 from services.recordings.store import RECORDINGS, State

@@ -64,7 +64,7 @@ def given(monkeypatch, tmp_path):
                 found.update(options)
 
         monkeypatch.setattr("operators.applications.replay.ReplaySettings", keep)
-        monkeypatch.setattr("services.cli.live.live_settings", keep)
+        monkeypatch.setattr("services.cli.runs.live_settings", keep)
         monkeypatch.setattr(
             "services.cli.batch.batch_command", lambda folder, out, workers, options, **_: keep(**options)
         )

@@ -18,11 +18,11 @@ from control_fakes import FakeStream, fake_parts
 from gsplat_core.errors import InvalidSetting
 from services.api import new_app
 from services.api.parts import CheckResult
-from services.cli import ctl_admin
+from services.cli import ctl as ctl_module
 from services.cli.app import run
-from services.cli.ctl_admin import moment, stream_row
+from services.cli.ctl import moment, stream_row
 from services.cli.exit_codes import BAD_INPUT, OK
-from services.cli.tables import table
+from services.cli.terminal import table
 from services.client import Client
 from services.schemas.streams import StreamView
 from services.settings import ServiceSettings
@@ -197,10 +197,10 @@ def test_the_audit_log_is_followed(ctl, service, monkeypatch, capsys):
             raise Enough
         service.make_key(f"new-{looks}", "viewer")
 
-    monkeypatch.setattr(ctl_admin.time, "sleep", sleep)
+    monkeypatch.setattr(ctl_module.time, "sleep", sleep)
     service.make_key("old", "viewer")
     with pytest.raises(Enough):
-        ctl_admin._show_audit(service, {"event": "key.create"}, 1, True)
+        ctl_module._show_audit(service, {"event": "key.create"}, 1, True)
     lines = [line for line in capsys.readouterr().out.splitlines() if "key.create" in line]
     assert [next(name for name in ("old", "new-1", "new-2", "new-3") if name in line) for line in lines] == ["old", "new-1", "new-2", "new-3"]  # fmt: skip
 
@@ -219,7 +219,7 @@ def test_watch_and_health(ctl):
 
 
 def test_watch_survives_a_server_that_does_not_answer_for_a_while(service, monkeypatch, capsys):
-    real, looks = ctl_admin._status, 0
+    real, looks = ctl_module._status, 0
 
     def sometimes(client, stream):
         nonlocal looks
@@ -228,7 +228,7 @@ def test_watch_survives_a_server_that_does_not_answer_for_a_while(service, monke
             return real(Client("http://127.0.0.1:1", "x"), stream)
         return real(client, stream)
 
-    monkeypatch.setattr(ctl_admin, "_status", sometimes)
+    monkeypatch.setattr(ctl_module, "_status", sometimes)
     assert run(["ctl", "watch", "--looks", "3", "--every", "0.2"]) == OK
     out = capsys.readouterr().out
     assert out.count("STREAM ") == 2 and out.count("no answer since the last look") == 1

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from services.cli.interrupt import InterruptRequest
+from services.cli.terminal import InterruptRequest
 
 
 def test_the_first_signal_asks_and_the_second_raises():

@@ -6,7 +6,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.sessions import WriterOptions
-from services.cli.live import live_settings, recording_kept
+from services.cli.runs import live_settings, recording_kept
 
 
 def test_without_a_bound_everything_is_kept():

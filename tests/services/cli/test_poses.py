@@ -14,7 +14,7 @@ from gsplat_core.io.recordings import open_recording
 from gsplat_core.poses import focal_length
 from gsplat_core.poses.focal_length import FocalLength
 from gsplat_core.poses.odometry import Breathing
-from services.cli import poses
+from services.cli import recordings
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 from tests.gsplat_core.geometry.moving_scope import FOCAL, HEIGHT, SIDEWAYS, WIDTH, video
@@ -115,21 +115,21 @@ def test_a_scope_that_may_stand_still_is_said(clip, capsys):
 
 
 def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch):
-    plain = poses.trajectory_of
+    plain = recordings.trajectory_of
 
     def told(frames, camera):
         found = plain(frames, camera)
         return replace(found, breathing=Breathing((0.294, 1.11), 0.02 * found.path))
 
-    monkeypatch.setattr(poses, "trajectory_of", told)
+    monkeypatch.setattr(recordings, "trajectory_of", told)
     said = said_of(capsys, clip())
     assert (said["breathing_hz"], said["uncertain"]) == ([0.294, 1.11], 0.02)
     assert any("0.29 and 1.11 times a second" in note and "2.0% of the trajectory" in note for note in said["notes"])
 
 
 def test_tissue_that_moves_otherwise_is_said(clip, capsys, monkeypatch):
-    plain = poses.trajectory_of
-    monkeypatch.setattr(poses, "trajectory_of", lambda *given: replace(plain(*given), error_px=1.5))
+    plain = recordings.trajectory_of
+    monkeypatch.setattr(recordings, "trajectory_of", lambda *given: replace(plain(*given), error_px=1.5))
     said = said_of(capsys, clip())
     assert (said["breathing_hz"], said["uncertain"]) == ([], None)
     assert any("points are off by 1.5 px: the tissue moves by itself" in note for note in said["notes"])

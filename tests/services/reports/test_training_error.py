@@ -10,8 +10,7 @@ import pytest
 
 from operators.messages import PictureState, ShownPicture
 from operators.metrics import NextFrameResult
-from services.cli.live import LiveStatus, _summary
-from services.cli.runs import print_report
+from services.cli.runs import LiveStatus, _summary, print_report
 from services.reports.build import _next_frame
 from services.reports.html import render_html
 from services.reports.pictures import keyframe_pictures

@@ -1,29 +1,62 @@
-"""Implementation of `intrasplat poses`."""
+"""Implementation of the commands for recordings: `intrasplat validate`, `poses` and `synthesize`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import typer
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
-from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.recording import FileRecording
+from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.poses.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
 from gsplat_core.poses.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.progress import Progress
 from operators.errors import OutputError
-from operators.output_folder import check_file_path
+from operators.output_folder import check_file_path, check_folder_path
 from operators.storage import storage_errors
-from services.cli.exit_codes import OK
-from services.cli.interrupt import InterruptRequest
+from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.options import SynthesizeOptions
 from services.cli.progress import ProgressPrinter
-from services.cli.streams import printable
+from services.cli.terminal import InterruptRequest, printable
+
+
+def validate_command(recording: Path, *, as_json: bool) -> int:
+    """Print the properties and defects of a recording.
+
+    Returns:
+        The exit code; 2 if the recording cannot be used.
+    """
+    report = validate_recording(recording)
+    if as_json:
+        typer.echo(json.dumps({"ok": report.ok, **asdict(report)}, indent=2))
+        return OK if report.ok else BAD_INPUT
+    width = max((len(name) for name in report.facts), default=0)
+    for name, value in report.facts.items():
+        typer.echo(f"{name:{width}}  {_shown(value)}")
+    for warning in report.warnings:
+        typer.echo(f"warning: {printable(str(warning))}")
+    for problem in report.problems:
+        typer.echo(f"error: {printable(str(problem))}", err=True)
+    if report.ok:
+        typer.echo("the recording can be used")
+    return OK if report.ok else BAD_INPUT
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join(_shown(part) for part in value)
+    return "-" if value is None else printable(str(value))
+
 
 MOSTLY = 0.75
 """Share of the motion that the endoscope must explain; below it a static endoscope is reported as
@@ -144,3 +177,55 @@ def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording,
         typer.echo(f"{name:{width}}  {value if value not in ([], None) else '-'}")
     for note in notes:
         typer.echo(f"note: {printable(note)}")
+
+
+def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) -> int:
+    """Write a synthetic recording and print its path. An interrupt leaves an existing recording
+    unchanged."""
+    extras = Extras(
+        scene=options.scene,
+        third=options.third,
+        flow=options.flow,
+        tracks=options.tracks,
+        behind=options.behind,
+        smoke=options.smoke,
+        depth_noise_mm=options.depth_noise,
+        exposure_changes=options.exposure_changes,
+        breathing_ratio=options.breathing_ratio,
+        rate_wander=options.rate_wander,
+        scope_path=options.scope_path,
+    )
+    with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as show:
+
+        def progress(done: int, total: int) -> None:
+            if interrupt():
+                raise KeyboardInterrupt
+            show(Progress("synthesize", done, total))
+
+        with storage_errors(out):
+            check_folder_path(out)
+            synthesize(
+                out,
+                frames=options.frames,
+                width_px=options.width,
+                height_px=options.height,
+                fps=options.fps,
+                seed=options.seed,
+                camera="moving" if options.moving_camera else "fixed",
+                extras=extras,
+                progress=progress,
+            )
+    recording = open_recording(out)
+    if as_json:
+        facts = {
+            "path": str(out),
+            "frames": recording.frame_count,
+            "width_px": recording.width_px,
+            "height_px": recording.height_px,
+            "fps": recording.fps,
+            "digest": recording.digest,
+        }
+        typer.echo(json.dumps(facts, indent=2))
+    else:
+        typer.echo(str(out))
+    return OK

@@ -1,0 +1,301 @@
+"""Implementation of the commands for finished models: `intrasplat render`, `pack`, `export`, `measure` and `compare`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from gsplat_core.errors import BundleError, InvalidSetting
+from gsplat_core.geometry.measure import Length, Measurement, SurfacePoint
+from gsplat_core.geometry.mesh import mesh_of
+from gsplat_core.geometry.registration import ClosestPoints, distances, from_pairs, moved_by, register
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.exports.export import export_model
+from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
+from gsplat_core.io.manifest import parse_manifest
+from gsplat_core.io.model_sources import load_model
+from gsplat_core.io.surface_files import read_surface
+from operators.applications.render import render_model
+from operators.errors import OutputError
+from operators.output_folder import check_file_path
+from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK
+from services.cli.progress import ProgressPrinter
+from services.cli.terminal import InterruptRequest
+from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack
+
+
+def render_command(model: Path, out: Path, fps: float, *, as_json: bool, **options: Any) -> int:
+    """Render a model and print the path of the result. `options` are passed to `render_model`."""
+    with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
+        frames = render_model(model, out, fps=fps, progress=progress, stop_requested=interrupt, **options)
+    if as_json:
+        typer.echo(
+            json.dumps({"path": str(out), "frames": frames, "fps": fps, "interrupted": interrupt.requested}, indent=2)
+        )
+    else:
+        typer.echo(str(out))
+    return INTERRUPTED if interrupt.requested else OK
+
+
+def pack_command(model: Path, file: Path, *, overwrite: bool, as_json: bool) -> int:
+    """Check a model, pack it into one file and print the path.
+
+    Raises:
+        BundleError: if the model cannot be used.
+        OutputError: if the file cannot be written.
+    """
+    _check_target(model, file, overwrite)
+    load_bundle(model)
+    _check_saved_whole(model)
+    try:
+        size = pack(model, file, overwrite=overwrite)
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {file}: {error.strerror or error}; free space or choose another name"
+        ) from error
+    if as_json:
+        typer.echo(json.dumps({"path": str(file), "bytes": size, "sha256": _sha256(file)}, indent=2))
+    else:
+        typer.echo(str(file))
+    return OK
+
+
+def _check_target(model: Path, file: Path, overwrite: bool) -> None:
+    if file.suffix != SUFFIX:
+        raise OutputError(f"{file} does not end in {SUFFIX}; give the packed file a name that does")
+    check_file_path(file, [model], overwrite=overwrite, option="FILE")
+
+
+def _check_saved_whole(model: Path) -> None:
+    """Refuse a save that was interrupted between its two renames. Such a bundle loads, but its two
+    files do not match."""
+    manifest = parse_manifest((model / MANIFEST).read_bytes(), MANIFEST) if (model / MANIFEST).exists() else None
+    if manifest is None or manifest.tensors_sha256 != _sha256(model / TENSORS):
+        raise BundleError(f"{model} was not saved to its end; load it and save it again before it is packed")
+
+
+def _sha256(path: Path) -> str:
+    sha256 = hashlib.sha256()
+    with open(path, "rb") as file:
+        while piece := file.read(PIECE_BYTES):
+            sha256.update(piece)
+    return sha256.hexdigest()
+
+
+def export_command(
+    model: Path, file: Path, format_name: str | None, time_s: float | None, times: int | None, *, overwrite: bool,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Export a model and print the path of the file.
+
+    Raises:
+        BundleError: if the model cannot be used.
+        InvalidSetting: if an option does not fit.
+        ExportError: if the model cannot be exported to the format.
+        OutputError: if the file cannot be written.
+    """
+    wish = ExportWish(format_of(file) if format_name is None else format_named(format_name), time_s, times)
+    if file.suffix.lower() != wish.format.suffix:
+        raise OutputError(
+            f"{file} does not end in {wish.format.suffix}, as a file of the format {wish.format.name} does; give such a name"
+        )
+    check_file_path(file, [model], overwrite=overwrite, option="FILE")
+    loaded = load_model(model)
+    try:
+        size = export_model(loaded, file, wish, overwrite=overwrite)
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {file}: {error.strerror or error}; free space or choose another name"
+        ) from error
+    if as_json:
+        said = {"path": str(file), "format": wish.format.name, "bytes": size, "gaussians": loaded.gaussians.count}
+        typer.echo(json.dumps({**said, "times_s": wish.times_in(loaded.time_window_s)}, indent=2))
+    else:
+        typer.echo(str(file))
+    return OK
+
+
+PIXEL = re.compile(r"\s*(\d+(?:\.\d+)?)\s*,\s*(\d+(?:\.\d+)?)\s*", re.ASCII)
+
+
+def measure_command(model: Path, time_s: float | None, start: str, end: str | None, *, as_json: bool) -> int:
+    """Measure on a model's surface and print the result.
+
+    Raises:
+        BundleError: if the model cannot be used.
+        InvalidSetting: if a pixel is outside the picture or was never observed.
+    """
+    loaded = load_model(model)
+    time_s = loaded.time_window_s[1] if time_s is None else time_s
+    pixels = [pixel_of(text) for text in (start, end) if text is not None]
+    measurement = Measurement(loaded, time_s)
+    points = [measurement.point(*pixel) for pixel in pixels]
+    said: dict[str, Any] = {"time_s": time_s, "unit": measurement.unit, "metric": measurement.metric}
+    said["depth_origin"] = None if measurement.origin is None else measurement.origin.value
+    said["points"] = [_point(point) for point in points]
+    if len(points) == 2:
+        said["distance"] = _length(measurement.distance(*points))
+        said["along_surface"] = _length(measurement.length_along(*points))
+    typer.echo(json.dumps(said, indent=2) if as_json else _text(said))
+    return OK
+
+
+def pixel_of(text: str) -> tuple[float, float]:
+    """Parse a pixel "X,Y" (column, row).
+
+    Raises:
+        InvalidSetting: if the text is malformed.
+    """
+    found = PIXEL.fullmatch(text)
+    if found is None:
+        raise InvalidSetting(f"{text!r:.60} is no pixel; give its column and row, as 120,85")
+    return float(found[1]), float(found[2])
+
+
+def _point(point: SurfacePoint) -> dict[str, Any]:
+    return {
+        "pixel": list(point.pixel),
+        "position": list(point.position),
+        "error": point.position_error,
+        "depth": point.depth,
+        "depth_error": point.depth_error,
+        "opacity": point.opacity,
+    }
+
+
+def _length(length: Length) -> dict[str, float]:
+    return {"value": length.value, "error": length.error}
+
+
+def _text(said: dict[str, Any]) -> str:
+    unit = "mm" if said["metric"] else "(relative: the model's lengths have no known unit)"
+    lines = []
+    for point in said["points"]:
+        x, y, z = point["position"]
+        at = f"({point['pixel'][0]:g}, {point['pixel'][1]:g})"
+        lines.append(f"point at {at}: {x:.2f} {y:.2f} {z:.2f}, error {point['error']:.2f} {unit}")
+    for name, label in (("distance", "straight"), ("along_surface", "along the surface")):
+        if name in said:
+            lines.append(f"{label}: {said[name]['value']:.2f} +- {said[name]['error']:.2f} {unit}")
+    return "\n".join(lines)
+
+
+INLIER_SHARE = 0.02
+"""Default inlier distance as a share of the surface's extent."""
+MOST_SIZE_RATIO = 20.0
+"""Largest size ratio of two surfaces aligned without point pairs."""
+MOST_SCALE = 1.25
+"""Largest ratio of point pair distances between the mesh and a metric model."""
+LEAST_INLIERS = 0.05
+"""Share of inliers below which two surfaces do not match."""
+
+
+def compare_command(
+    model: Path, mesh: Path, time_s: float | None, pairs: str | None, inlier: float | None, *, as_json: bool
+) -> int:
+    """Align a model's surface to a mesh and print the distances.
+
+    Raises:
+        BundleError: if the model cannot be used.
+        InvalidSetting: if the mesh or the pairs cannot be used, or the alignment is ambiguous.
+    """
+    if inlier is not None and not 0 < inlier < float("inf"):
+        raise InvalidSetting(f"the distance of inliers is {inlier:g}; it must be positive")
+    loaded = load_model(model)
+    if pairs is None and not loaded.metric:
+        raise InvalidSetting(
+            "the model's lengths have no known unit, so that its size beside the mesh is not known; give --pairs, three or more"
+        )
+    time_s = loaded.time_window_s[1] if time_s is None else time_s
+    loaded.check_time(time_s)
+    seen = mesh_of(loaded, time_s)
+    surface = ClosestPoints(*read_surface(mesh))
+    points = seen.vertices.astype(np.float64)
+    if pairs is None:
+        initial = None
+        _check_sizes(points, surface)
+    else:
+        model_points, mesh_points = _read_pairs(pairs)
+        initial = from_pairs(model_points, mesh_points, with_scale=not loaded.metric)
+        if loaded.metric:
+            _check_scale(from_pairs(model_points, mesh_points, with_scale=True))
+    found = register(points, surface, initial)
+    _, summary = distances(moved_by(found.transform, points), surface, inlier or INLIER_SHARE * surface.extent)
+    lies_apart = summary.inlier_share < LEAST_INLIERS
+    said = {
+        "unit": "the mesh's",
+        "metric": loaded.metric,
+        "time_s": time_s,
+        "registration": {**asdict(found), "transform": found.transform.tolist()},
+        "signed_distances": asdict(summary),
+        "surfaces_match": not lies_apart,
+    }
+    if as_json:
+        typer.echo(json.dumps(said, indent=2))
+    else:
+        typer.echo(
+            f"{summary.points} points, in the mesh's unit: mean {summary.mean:+.3f}, RMSE {summary.rmse:.3f}, half within"
+            f" {summary.absolute_p50:.3f}, 90 % within {summary.absolute_p90:.3f}, 95 % within {summary.absolute_p95:.3f};"
+            f" {summary.inlier_share:.1%} are closer than {summary.inlier_distance:.3g}"
+        )
+    if lies_apart:
+        typer.echo(
+            f"error: the surfaces do not lie on each other: only {summary.inlier_share:.1%} of the points are closer than"
+            f" {summary.inlier_distance:.3g}; give --pairs, or check that both have the same unit",
+            err=True,
+        )
+        return BAD_INPUT
+    return OK
+
+
+def _check_sizes(points: np.ndarray, surface: ClosestPoints) -> None:
+    """Check that two surfaces have similar sizes.
+
+    Raises:
+        InvalidSetting: if the sizes suggest different units.
+    """
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if not surface.extent / MOST_SIZE_RATIO < extent < surface.extent * MOST_SIZE_RATIO:
+        raise InvalidSetting(
+            f"the model's surface is {extent:.3g} mm across and the mesh {surface.extent:.3g}, a factor of {surface.extent / max(extent, 1e-300):.3g}:"
+            " they cannot have the same unit; export the mesh in millimetres, or give --pairs where the model shows a small part of it"
+        )
+
+
+def _check_scale(with_scale: np.ndarray) -> None:
+    """Check that the point pairs have similar distances in the mesh and in a metric model.
+
+    Raises:
+        InvalidSetting: if the scales differ.
+    """
+    scale = float(np.cbrt(np.linalg.det(with_scale[:3, :3])))
+    if not 1 / MOST_SCALE < scale < MOST_SCALE:
+        raise InvalidSetting(
+            f"the pairs are {scale:.3g} times as far from each other in the mesh as in the model, which is in millimetres;"
+            " export the mesh in millimetres, or check the pairs"
+        )
+
+
+def _read_pairs(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Parse point pairs "x,y,z=x,y,z; ...".
+
+    Returns:
+        Points of the model and of the mesh, float64 [N, 3] each.
+
+    Raises:
+        InvalidSetting: if the text is malformed.
+    """
+    try:
+        values = np.array([[side.split(",") for side in pair.split("=")] for pair in text.split(";")], np.float64)
+    except ValueError as error:
+        raise InvalidSetting(f"the pairs {text!r:.80} cannot be read; give x,y,z=x,y,z;... (model = mesh)") from error
+    if values.ndim != 3 or values.shape[1:] != (2, 3) or not np.isfinite(values).all():
+        raise InvalidSetting(f"the pairs {text!r:.80} cannot be read; give x,y,z=x,y,z;... (model = mesh)")
+    return values[:, 0], values[:, 1]

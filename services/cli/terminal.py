@@ -1,0 +1,314 @@
+"""Terminal of the program: standard streams that may be closed, full or broken, tables, and signals.
+
+The first Ctrl-C asks the run to stop, the second ends it.
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import errno
+import io
+import math
+import os
+import re
+import select
+import signal
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from types import FrameType, TracebackType
+from typing import Any, TextIO
+
+OUTPUT_CLOSED = 141
+"""Exit code that a shell reports after a broken pipe: 128 plus the number of SIGPIPE."""
+_READER_GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ECONNRESET)
+"""Errors of a closed pipe, terminal or descriptor."""
+_NAMES = "intrasplat-names"
+
+
+class _Descriptor(io.RawIOBase):
+    """Raw stream that writes to a descriptor. After the first error, which is kept, all output is
+    dropped."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self.error: OSError | None = None
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def write(self, data: Any) -> int:
+        while self.error is None:
+            try:
+                return os.write(self._descriptor, data)
+            except BlockingIOError:
+                # another program set the pipe to non-blocking, and it is full
+                select.select([], [self._descriptor], [])
+            except OSError as error:
+                self.error = error
+        return len(data)
+
+
+class StandardStreams:
+    """Replacement of `sys.stdout` and `sys.stderr` for the rest of the process."""
+
+    def __init__(self) -> None:
+        _occupy_closed_descriptors()
+        codecs.register_error(_NAMES, _as_the_system_spells_it)
+        self._out, sys.stdout = _guarded(sys.stdout, 1)
+        self._err, sys.stderr = _guarded(sys.stderr, 2)
+
+    def code(self, code: int) -> int:
+        """Flush all output and return the final exit code.
+
+        If the reader closed the output, 0 becomes OUTPUT_CLOSED without a message. Another write
+        error, such as a full disk, prints one sentence, and 0 becomes 2.
+
+        Args:
+            code: exit code of the command.
+        """
+        sys.stdout.flush()
+        error = self._out.error if self._out is not None else None
+        if error is not None and code == 0:
+            if error.errno in _READER_GONE:
+                code = OUTPUT_CLOSED
+            else:
+                code = 2
+                print(f"error: standard output cannot be written ({error.strerror}); free space or choose another place for it", file=sys.stderr)  # fmt: skip  # noqa: T201
+        sys.stderr.flush()
+        return code
+
+
+def _occupy_closed_descriptors() -> None:
+    """Open /dev/null for closed standard streams. Otherwise the next opened file would get the
+    descriptor and receive printed text."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+
+
+def _guarded(stream: TextIO | None, descriptor: int) -> tuple[_Descriptor | None, TextIO]:
+    if stream is None:
+        # closed at program start, so no program reads the output
+        return None, open(os.devnull, "w", encoding="utf-8", errors="replace")
+    raw = _Descriptor(descriptor)
+    errors = _NAMES if descriptor == 1 else "backslashreplace"
+    buffer = io.BufferedWriter(raw)
+    return raw, io.TextIOWrapper(
+        buffer, stream.encoding, errors, line_buffering=descriptor == 2 or raw.isatty(), write_through=descriptor == 2
+    )
+
+
+def _as_the_system_spells_it(error: UnicodeError) -> tuple[bytes | str, int]:
+    """Encoding error handler: undecodable bytes of file names are written unchanged, other missing
+    characters as escapes."""
+    assert isinstance(error, UnicodeEncodeError)
+    character = ord(error.object[error.start])
+    if 0xDC80 <= character <= 0xDCFF:
+        return bytes([character - 0xDC00]), error.start + 1
+    return error.object[error.start].encode("ascii", "backslashreplace"), error.start + 1
+
+
+MOST_WORD = 240
+"""Longest word in a message; a longer value is shortened in the middle."""
+
+
+def sentence(text: str) -> str:
+    """Return an error text on one line, with long values shortened so the remedy stays visible."""
+    return re.sub(rf"\S{{{MOST_WORD + 1},}}", lambda word: f"{word[0][:160]}...{word[0][-60:]}", printable(text))
+
+
+def printable(text: str) -> str:
+    """Return a text on one line, with control characters escaped, because file names may contain
+    terminal sequences."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
+
+
+WIDEST = 60
+"""Widest cell in characters, except in the last column."""
+Columns = Mapping[str, str]
+"""Headings by field name; a dot selects a nested field (`figures.age_ms`)."""
+KEY_COLUMNS: Columns = {
+    "id": "ID", "role": "ROLE", "created_at": "CREATED", "expires_at": "EXPIRES", "expired": "EXPIRED",
+    "last_used_at": "LAST USED", "streams": "STREAMS", "name": "NAME",
+}  # fmt: skip
+_EMPTY = {"expires_at": "never", "last_used_at": "never", "streams": "all"}
+
+
+def table(columns: Columns, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Format a table as lines. Columns without values are omitted, except the first.
+
+    Args:
+        columns: headings by field.
+        rows: one mapping per line; missing fields give empty cells.
+
+    Returns:
+        The headings, then one line per row.
+    """
+    cells = [[_text(field, _value(row, field)) for field in columns] for row in rows]
+    first = next(iter(columns))
+    kept = [
+        index for index, field in enumerate(columns) if not rows or field == first or any(line[index] for line in cells)
+    ]
+    lines = [[list(columns.values())[index] for index in kept], *([line[index] for index in kept] for line in cells)]
+    lines = [[*(_cut(text) for text in line[:-1]), line[-1]] for line in lines]
+    widths = [max(len(line[place]) for line in lines) for place in range(len(kept))]
+    return ["  ".join(f"{text:{width}}" for text, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= WIDEST else f"{text[: WIDEST - 1]}…"
+
+
+def _value(row: Mapping[str, Any], field: str) -> Any:
+    found: Any = row
+    for part in field.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return found
+
+
+def _text(field: str, value: Any) -> str:
+    """Format a cell on one line: times to the second with their zone, sizes in binary units."""
+    if value is None or value == "":
+        return _EMPTY.get(field, "")
+    if field.endswith("_at") or field == "at":
+        return _time(str(value))
+    if field.endswith("_bytes") and isinstance(value, int | float):
+        return size(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.1f}" if math.isfinite(value) else ""
+    if isinstance(value, Mapping):
+        return printable(", ".join(f"{name} {each}" for name, each in value.items()))
+    if isinstance(value, list | tuple):
+        return printable(", ".join(map(str, value)))
+    return printable(str(value))
+
+
+def _time(text: str) -> str:
+    try:
+        return datetime.fromisoformat(text).astimezone().strftime("%Y-%m-%d %H:%M:%S %z")
+    except (ValueError, OverflowError, OSError):  # the server's text may be no time
+        return printable(text)
+
+
+def size(count: float) -> str:
+    """Format a number of bytes in binary units."""
+    for unit in ("B", "KiB", "MiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:.1f} GiB"
+
+
+INTERRUPTED = 130
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+INSISTING = (signal.SIGINT, signal.SIGTERM)
+"""Signals whose repetition ends the run at once. Not SIGHUP, which a closing terminal may send
+repeatedly."""
+GRACE_S = 2.0
+"""Seconds that a run has to unwind after the second signal before the process is terminated."""
+
+
+def end_on_interrupt() -> None:
+    """Make Ctrl-C end the process at once. During startup nothing needs saving, and an interrupted
+    import would print a traceback."""
+    signal.signal(signal.SIGINT, _end)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    _say("interrupted")
+    _end_now()
+
+
+def _end_now() -> None:
+    files = sys.modules.get("gsplat_core.io.files")
+    if files is not None:
+        files.remove_unfinished()
+    os._exit(INTERRUPTED)
+
+
+class InterruptRequest:
+    """Context manager that turns SIGINT, SIGTERM and SIGHUP into a flag, acknowledged on stderr at
+    once. Calling the object returns the flag.
+
+    A second SIGINT or SIGTERM raises KeyboardInterrupt. If a long computation blocks that for
+    GRACE_S, the process is terminated.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, object] = {}
+        self._wakeup_before = -1
+
+    def __call__(self) -> bool:
+        return self.requested
+
+    def __enter__(self) -> InterruptRequest:
+        # The interpreter writes signal numbers into the pipe at arrival; handlers run only when the
+        # main thread returns to Python code.
+        receiver, self._sender = os.pipe()
+        os.set_blocking(self._sender, False)
+        self._wakeup_before = signal.set_wakeup_fd(self._sender, warn_on_full_buffer=False)
+        for number in ASKING:
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # nohup: the run must outlive its terminal
+            self._before[number] = signal.signal(number, self._handle)
+        threading.Thread(target=_acknowledge, args=(receiver,), name="signals", daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._before.clear()
+        signal.set_wakeup_fd(self._wakeup_before)
+        os.close(self._sender)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.requested and number in INSISTING:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def _acknowledge(receiver: int) -> None:
+    """Acknowledge each signal at its arrival, until the write end of the pipe is closed."""
+    seen = 0
+    ended = threading.Event()
+    with os.fdopen(receiver, "rb", buffering=0) as signals:
+        while numbers := signals.read(64):
+            for number in numbers:
+                if number not in ASKING or (seen and number not in INSISTING):
+                    continue
+                seen += 1
+                if seen == 1:
+                    _say(
+                        "interrupted: finishing the frame on its way, then writing what there is; once more ends at once"
+                    )
+                elif seen == 2:
+                    _say("interrupted again: ending at once")
+                    threading.Thread(target=_end_after, args=(ended,), name="end", daemon=True).start()
+    ended.set()
+
+
+def _end_after(ended: threading.Event) -> None:
+    if not ended.wait(GRACE_S):
+        _end_now()
+
+
+def _say(text: str) -> None:
+    """Write a line to stderr from any thread, bypassing buffers."""
+    with contextlib.suppress(OSError):  # the terminal is closed
+        os.write(2, f"{text}\n".encode())
