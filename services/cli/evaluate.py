@@ -17,11 +17,9 @@ from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.options import EvaluateOptions
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest, printable
-from services.reports.evaluated import load_evaluated
 from services.reports.evaluation_build import build_evaluation, write_evaluation
-from services.reports.evaluation_geometry import geometry_lines
-from services.reports.evaluation_rows import decibels, future, measured
-from services.reports.evaluation_schema import EvaluationReport
+from services.reports.evaluation_rows import decibels, future, geometry_lines, measured
+from services.reports.evaluation_schema import EvaluationReport, load_evaluated
 
 
 def evaluation_settings(recording: Path, options: EvaluateOptions) -> EvaluationSettings:

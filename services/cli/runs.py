@@ -28,8 +28,7 @@ from operators.metrics import ScoredFrame
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest, printable
-from services.reports.build import write_reports
-from services.reports.nothing_shown import require_shown
+from services.reports.build import require_shown, write_reports
 from services.reports.schema import LiveFacts, RunReport
 
 Run = Callable[[ProgressCallback, Callable[[], bool], Report], RunOutcome]

@@ -18,8 +18,7 @@ from services.cli.exit_codes import user_sentence
 from services.jobs.records import JobProgress, JobState
 from services.jobs.results import Task
 from services.registry.bundle_file import SUFFIX, pack
-from services.reports.build import write_reports
-from services.reports.nothing_shown import require_shown
+from services.reports.build import require_shown, write_reports
 
 SAY_S = 0.2
 MODEL = "model"

@@ -1,7 +1,8 @@
-"""Conversion of a run's outcome to its report files."""
+"""Conversion of a run's outcome to its report files, and the error for a run without displayed frames."""
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import torch
@@ -11,17 +12,20 @@ from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.evaluation.depth import DepthShare
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.session import RunOutcome
+from operators.checks import StageCounts
 from operators.display import LiveDisplayResult
+from operators.errors import NothingShown
 from operators.frame_log import LogLine
 from operators.ingest import SourceResult
 from operators.metrics import NextFrameResult, OnScreenResult, QualityResult
+from operators.out_of_body import WITHHELD as OUT_OF_BODY
+from operators.out_of_body import OutOfBodyFrames
 from operators.reconstruct import ModelResult, TrainedEyes, TrainingCounts
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
 from operators.truth import TruthResult
 from services.reports.html import write_html
-from services.reports.live import live_facts
 from services.reports.machine import machine_facts
 from services.reports.pictures import hidden_pictures, keyframe_pictures
 from services.reports.schema import (
@@ -31,6 +35,7 @@ from services.reports.schema import (
     FrameCounts,
     FrameEntry,
     Latency,
+    LiveFacts,
     ModelFacts,
     NextFrameQuality,
     OperatorTimes,
@@ -42,6 +47,51 @@ from services.reports.schema import (
     TruthFacts,
 )
 from services.version import product_version
+
+
+def live_facts(outcome: RunOutcome) -> LiveFacts | None:
+    """Collect the results of a live run's operators; None for other runs."""
+    screen, scores = outcome.find(LiveDisplayResult), outcome.find(OnScreenResult)
+    training = outcome.find(TrainingCounts)
+    if screen is None or scores is None or training is None:
+        return None
+    age = screen.age
+    return LiveFacts(
+        settled_psnr_tissue_db=_rounded(scores.settled_db),
+        worst_psnr_tissue_db=_rounded(scores.worst_db),
+        previous_frame_db=_rounded(scores.previous_frame_db),
+        pictures=screen.pictures,
+        age_p50_ms=round(age.p50_ms, 2),
+        age_p95_ms=round(age.p95_ms, 2),
+        age_p99_ms=round(age.p99_ms, 2),
+        age_max_ms=round(age.max_ms, 2),
+        first_picture_ms=_rounded(screen.first_picture_ms),
+        states=screen.states,
+        dropped=_passed_over(outcome, training),
+        withheld=training.withheld,
+        scenes=training.scenes,
+        analysis={
+            part.name: dict(part.found)
+            for part in outcome.parts.values()
+            if isinstance(part, StageCounts) and part.found
+        },
+        frames_trained=training.frames,
+        steps=training.steps,
+        rehearsed_steps=training.rehearsed,
+        unscored=scores.unscored,
+        not_on_screen=scores.not_on_screen,
+    )
+
+
+def _passed_over(outcome: RunOutcome, training: TrainingCounts) -> dict[str, int]:
+    counts = dict(outcome.dropped_by_edge)
+    if training.passed_over:
+        counts["reconstruct"] = training.passed_over
+    return counts
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
 
 
 def build_report(outcome: RunOutcome) -> RunReport:
@@ -214,3 +264,72 @@ def _quality(tracker: QualityTracker) -> Quality:
 def _ms(value: float) -> float:
     """Round milliseconds to microseconds, the resolution of the clock."""
     return round(value, 3)
+
+
+CHECK_PICTURE = "check what the source sends"
+REMEDIES = {
+    OUT_OF_BODY: "--out-of-body off lets these frames pass",
+    "no tissue": "--tool-mask none takes every pixel for tissue",
+    "tool mask lost": "--tool-mask none takes every pixel for tissue",
+    "damaged": "check the connection, or the file",
+    **dict.fromkeys(("black", "one colour", "noise", "duplicate", "frozen", "torn", "out of order"), CHECK_PICTURE),
+    **dict.fromkeys(("blur", "smoke", "cut in doubt"), "a longer run shows such a stream after a second or two"),
+}
+"""Remedy for each reason of withheld frames."""
+
+
+def require_shown(outcome: RunOutcome) -> None:
+    """Check that a run displayed a frame.
+
+    An interrupted run without withheld frames is accepted, because it may have ended before its
+    first picture.
+
+    Raises:
+        NothingShown: if not; the message has the frame counts, the reasons and the remedy.
+    """
+    if displayed(outcome):
+        return
+    source = outcome.find(SourceResult)
+    frames = 0 if source is None else source.frames
+    live = outcome.command == "live"
+    withheld = withheld_frames(outcome)
+    if outcome.interrupted and not withheld:
+        return
+    if source is None or not frames:
+        name = "the source" if source is None else source.description.name
+        state = source.state_sentence if source is not None and source.state_sentence else outcome.stop_reason
+        hint = "check that it is sending, or give more --seconds" if live else "check that it holds frames"
+        raise NothingShown(f"nothing was shown: no frame came from {name} in {outcome.wall_s:.1f} s ({state}); {hint}")
+    came = f"nothing was shown: {frames} {'frame' if frames == 1 else 'frames'} came"
+    if not withheld:
+        hint = "give more --seconds, or a smaller --scale" if live else "check the recording"
+        raise NothingShown(f"{came}, and the run ended before one was on the screen ({outcome.stop_reason}); {hint}")
+    counts = ", ".join(f"{_named(outcome, reason)}: {count}" for reason, count in withheld.most_common())
+    if live:
+        remedies = "; ".join(dict.fromkeys(REMEDIES.get(reason, CHECK_PICTURE) for reason, _ in withheld.most_common()))
+        where = ""
+    else:
+        remedies, where = "record the stream again with settings that let its frames pass", " when they were recorded"
+        if set(withheld) == {"damaged"}:
+            remedies, where = REMEDIES["damaged"], ""
+    raise NothingShown(f"{came}, {withheld.total()} withheld{where} ({counts}); {remedies}")
+
+
+def withheld_frames(outcome: RunOutcome) -> Counter[str]:
+    """Count a run's withheld frames by reason, from the gates of a live run or from the recording."""
+    training, source = outcome.find(TrainingCounts), outcome.find(SourceResult)
+    if training is not None:
+        return Counter(training.withheld)
+    found = Counter() if source is None else Counter(source.withheld)
+    if source is not None and source.damaged:
+        found["damaged"] = source.damaged
+    return found
+
+
+def _named(outcome: RunOutcome, reason: str) -> str:
+    """Return a reason, extended by the main evidence for the out-of-body gate."""
+    gate = outcome.find(OutOfBodyFrames)
+    if reason != OUT_OF_BODY or gate is None or not gate.withheld:
+        return reason
+    most = max(gate.withheld, key=lambda evidence: gate.withheld[evidence])
+    return f"{reason}, mostly for {most}"

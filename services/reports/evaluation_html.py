@@ -1,24 +1,324 @@
-"""Self-contained page `evaluation.html`."""
+"""Self-contained page `evaluation.html`: curves, tiles and tables. Each function renders one section."""
 
 from __future__ import annotations
 
 from html import escape
 from pathlib import Path
 
+from gsplat_core.evaluation.live import MOST_BEHIND
 from operators.storage import write_whole
-from services.reports.evaluation_charts import charts_section, hold_section
-from services.reports.evaluation_geometry import geometry_section
-from services.reports.evaluation_schema import EvaluationReport
-from services.reports.evaluation_tables import (
-    ages_section,
-    depth_section,
-    facts_section,
-    notes_section,
-    places_section,
-    table_section,
-    tiles_section,
-)
+from services.reports.charts import NARROW, Chart, Line
+from services.reports.evaluation_rows import at_age, decibels, future, geometry_section, measured
+from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, ScoreFacts
 from services.reports.html import POLICY, style
+
+_LINES = {
+    "live": ("Live", (("previous_frame_db", "Previous frame shown instead", "base"),)),
+    "causal": (
+        "Causal prediction",
+        (
+            ("psnr_tissue_db", "Previous frame shown instead", "base"),
+            ("half_velocity_flow_db", "Half of a constant-velocity flow", "third"),
+        ),
+    ),
+    "heldout": (
+        "Held-out frames",
+        (
+            ("previous_frame_db", "Previous frame", "base"),
+            ("neighbour_mean_db", "Mean of both neighbours (sees the future)", "second"),
+            ("half_way_flow_db", "Half-way flow (sees the future)", "third"),
+        ),
+    ),
+    "retention": ("Final model", ()),
+}
+"""Curve name per protocol, and the keys, names and styles of its baselines."""
+_TITLES = {
+    "live": "Live: on the screen when the next frame came (training error)",
+    "causal": "Causal: predicted, then learned from",
+    "heldout": "Held out",
+    "retention": "Retention: the last seconds again",
+}
+
+
+def charts_section(report: EvaluationReport) -> str:
+    """Return the charts of tissue PSNR per frame, one per protocol."""
+    charts = "".join(_chart(report, name) for name in _LINES if report.series.get(name))
+    return charts
+
+
+def _chart(report: EvaluationReport, protocol: str) -> str:
+    name, baselines = _LINES[protocol]
+    own = report.series[protocol]
+    first_s, last_s = own[0]["time_s"], own[-1]["time_s"]
+    lines = []
+    for key, label, dash in baselines:
+        points = [
+            (entry["time_s"], entry[key])
+            for entry in (own if protocol == "live" else report.series.get("baselines", []))
+            if entry.get(key) is not None and first_s <= entry["time_s"] <= last_s  # type: ignore[operator]
+        ]
+        if points:
+            lines.append(Line(label, *_columns(points), dash))
+    lines.append(Line(name, *_columns([(e["time_s"], e["psnr_tissue_db"]) for e in own]), "main"))
+    per_entry = report.series_frames_per_entry.get(protocol, 1)
+    summed_up = f" Each point is the mean of {per_entry} frames." if per_entry > 1 else ""
+    chart = Chart(
+        title=f"{_TITLES[protocol]}, tissue PSNR over time",
+        description="Higher is better; baselines are drawn as broken lines." + summed_up,
+        x_label="time in the recording, s",
+        y_label="tissue PSNR, dB",
+        lines=tuple(lines),
+        x_unit=" s",
+        y_unit=" dB",
+    )
+    return f"<section><h2>{_TITLES[protocol]}</h2>{chart.figure()}</section>"
+
+
+def _columns(points: list[tuple]) -> tuple[list[float], list[float | None]]:
+    return [x for x, _ in points], [y for _, y in points]
+
+
+def hold_section(report: EvaluationReport) -> str:
+    """Return the frame-hold curve: the score of a raw frame displayed late. A live picture is
+    useful if it scores above the curve at its age."""
+    copies = [each for each in report.baselines if each.age_frames is not None and each.psnr_tissue_db is not None]
+    if len(copies) < 2:
+        return ""
+    ages = [float(each.age_frames or 0) for each in copies]
+    lines = [
+        Line("Raw frame, so many frames late", ages, [each.psnr_tissue_db for each in copies], "base"),
+        Line("the same, over tissue in both frames", ages, [each.psnr_both_db for each in copies], "third"),
+    ]
+    live = report.live
+    if live is not None and live.age_when_shown is not None and live.score.psnr_tissue_db is not None:
+        age = live.age_when_shown.p50_ms * report.recording.fps / 1000
+        lines.append(
+            Line("Live, at the median age (training error)", [age], [live.score.psnr_tissue_db], "second", marks=True)
+        )
+    chart = Chart(
+        title="Frame-hold curve",
+        description="Tissue PSNR of a raw frame that is shown late, against the frame that is seen by then.",
+        x_label="frames late",
+        y_label="tissue PSNR, dB",
+        lines=tuple(lines),
+        x_unit=" frames",
+        y_unit=" dB",
+        width=NARROW,
+    )
+    return f"<section><h2>Frame-hold curve</h2>{chart.figure()}</section>"
+
+
+def tiles_section(report: EvaluationReport) -> str:
+    """Return the tiles with the main scores of each protocol."""
+    tiles = []
+    for each in measured(report):
+        more = each.what
+        versus = each.versus
+        if versus is not None:
+            gain, baseline = versus
+            more = f'<span class="{"good" if gain >= 0 else "bad"}">{gain:+.2f} dB</span> against: {escape(future(baseline).lower())}'
+        tiles.append(_tile(f"{each.name}, tissue", decibels(each.score.psnr_tissue_db), "dB", more))
+    if report.live is not None and report.live.age_when_shown is not None:
+        ages = report.live.age_when_shown
+        tiles.append(
+            _tile("Age when shown", f"{ages.p50_ms:.1f}", "ms", f"p99 {ages.p99_ms:.1f}, max {ages.max_ms:.1f} ms")
+        )
+    return f'<ul class="tiles">{"".join(tiles)}</ul>' if tiles else ""
+
+
+def _tile(name: str, value: str, unit: str, more: str) -> str:
+    return f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
+
+
+def table_section(report: EvaluationReport) -> str:
+    """Return the table of protocols and baselines."""
+    found = measured(report)
+    known = [value for each in report.baselines if (value := each.psnr_tissue_db) is not None]
+    known += [value for each in found if (value := each.score.psnr_tissue_db) is not None]
+    low, high = (min(known) - 1, max(known) + 1) if known else (0.0, 1.0)
+    body = ""
+    for each in found:
+        body += _score_row(f"{each.name}: {each.what}", each.score, low, high)
+        body += "".join(_baseline_row(baseline, low, high) for baseline in each.baselines)
+    if not found:
+        body = "".join(_baseline_row(baseline, low, high) for baseline in report.baselines)
+    if not body:
+        return ""
+    return (
+        '<section><h2>Against doing nothing</h2><p class="lead">PSNR in dB, mean over frames; "whole frame" divides the same error by all'
+        " pixels, as many papers do.</p><table><thead><tr>"
+        '<th scope="col">What is shown</th><th scope="col" class="n">frames</th><th scope="col" class="n">tissue</th>'
+        '<th scope="col" class="n">whole frame</th><th scope="col" class="n">SSIM</th><th scope="col" class="n">worst frame</th>'
+        f'<th scope="col" class="ends"><span>{low:.0f}</span><span>{high:.0f}</span></th></tr></thead><tbody>{body}</tbody></table>'
+        f'<p class="note">{_left_out(report)}</p></section>'
+    )
+
+
+def _score_row(name: str, score: ScoreFacts, low: float, high: float) -> str:
+    ssim = "–" if score.ssim is None else f"{score.ssim:.4f}"
+    worst = "–" if score.worst_db is None else f"{score.worst_db:.2f} ({score.worst_seq})"
+    cells = "".join(
+        f'<td class="n">{value}</td>'
+        for value in (f"{score.frames:,}", decibels(score.psnr_tissue_db), decibels(score.psnr_frame_db), ssim, worst)
+    )
+    return f'<tr class="ours"><th scope="row">{escape(name)}</th>{cells}{_rail(score.psnr_tissue_db, low, high)}</tr>'
+
+
+def _baseline_row(baseline: BaselineFacts, low: float, high: float) -> str:
+    cells = "".join(
+        f'<td class="n">{value}</td>'
+        for value in (
+            f"{baseline.frames:,}",
+            decibels(baseline.psnr_tissue_db),
+            decibels(baseline.psnr_frame_db),
+            "",
+            "",
+        )
+    )
+    rail = _rail(baseline.psnr_tissue_db, low, high)
+    return f'<tr><th scope="row">{escape(future(baseline))}</th>{cells}{rail}</tr>'
+
+
+def _rail(value: float | None, low: float, high: float) -> str:
+    if value is None:
+        return '<td class="track"></td>'
+    share = 100 * (value - low) / (high - low)
+    return f'<td class="track"><span class="rail"><span class="dot" style="left:{share:.1f}%"></span></span></td>'
+
+
+def _left_out(report: EvaluationReport) -> str:
+    said = [
+        f"{each.name}: not scored {', '.join(f'{count:,} ({escape(reason)})' for reason, count in each.score.left_out.items())}."
+        for each in measured(report)
+        if each.score.left_out
+    ]
+    if report.left_out:
+        said.append(
+            f"Baselines: not scored {', '.join(f'{n:,} ({escape(why)})' for why, n in report.left_out.items())}."
+        )
+    return " ".join(said)
+
+
+def ages_section(report: EvaluationReport) -> str:
+    """Return the table of picture ages at display."""
+    live = report.live
+    if live is None:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{name}</th><td class="n">{ages.p50_ms:,.1f}</td><td class="n">{ages.p95_ms:,.1f}</td>'
+        f'<td class="n">{ages.p99_ms:,.1f}</td><td class="n">{ages.max_ms:,.1f}</td></tr>'
+        for name, ages in (
+            ("When it was shown", live.age_when_shown),
+            ("When the next frame came", live.age_on_screen),
+        )
+        if ages is not None
+    )
+    late = ", ".join(
+        f"{count:,} by {k}{' or more' if k == MOST_BEHIND else ''}" for k, count in live.behind.items() if k
+    )
+    said = f"{live.in_time:,} frames were on the screen before the next one came" + (
+        f"; late: {late} frames. " if late else ". "
+    )
+    if live.age_when_shown is not None:
+        age_frames = live.age_when_shown.p50_ms * report.recording.fps / 1000
+        hold = at_age(report, age_frames)
+        if hold is not None:
+            said += f"A raw frame shown {max(1.0, age_frames):.1f} frames late scores {hold:.2f} dB. "
+    said += "Pictures by state: " + ", ".join(f"{escape(name)} {count:,}" for name, count in live.states.items()) + "."
+    return (
+        '<section><h2>Age of what was shown</h2><table><thead><tr><th scope="col"></th><th scope="col" class="n">p50 ms</th>'
+        '<th scope="col" class="n">p95</th><th scope="col" class="n">p99</th><th scope="col" class="n">max</th></tr></thead>'
+        f'<tbody>{rows}</tbody></table><p class="note">{said}</p></section>'
+    )
+
+
+def depth_section(report: EvaluationReport) -> str:
+    """Return the depth errors on the held-out frames."""
+    depth = None if report.heldout is None else report.heldout.depth
+    if depth is None:
+        return ""
+    facts = {
+        "Mean absolute error": f"{depth.mae_mm:.3f} mm",
+        "Root mean squared error": f"{depth.rmse_mm:.3f} mm",
+        "Relative error": f"{100 * depth.relative:.2f} %",
+        "Root mean squared error, one factor per frame": f"{depth.scaled_rmse_mm:.3f} mm",
+        "Covered": f"{100 * depth.covered:.1f} % of the pixels whose depth is known",
+        "Frames": f"{depth.frames:,}",
+    }
+    return (
+        f'<section><h2>Depth, held-out frames</h2><table class="facts"><tbody>{_rows(facts)}</tbody></table></section>'
+    )
+
+
+def places_section(report: EvaluationReport) -> str:
+    """Return the table of revisited places."""
+    if report.retention is None or not report.retention.places:
+        return ""
+    heads = "".join(
+        f'<th scope="col"{css}>{name}</th>'
+        for css, name in (
+            ("", "First stay"),
+            ("", "Second stay"),
+            (' class="n"', "first again, dB"),
+            (' class="n"', "second again, dB"),
+            ("", "First frames of the second stay, dB"),
+        )
+    )
+    body = ""
+    for place in report.retention.places:
+        soon = [
+            f"{escape(name)}: {', '.join(decibels(value) for value in each.first_db)}"
+            for name, found in report.returns.items()
+            for each in found
+            if each.again_s == place.again_s
+        ]
+        body += (
+            f"<tr><td>{place.first_s[0]:.2f} to {place.first_s[1]:.2f} s</td><td>{place.again_s[0]:.2f} to {place.again_s[1]:.2f} s</td>"
+            f'<td class="n">{decibels(place.first.psnr_tissue_db)}</td><td class="n">{decibels(place.again.psnr_tissue_db)}</td>'
+            f"<td>{'; '.join(soon) or '–'}</td></tr>"
+        )
+    return (
+        '<section><h2>Places seen twice</h2><p class="lead">Both stays rendered by the final model.</p>'
+        f"<table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></section>"
+    )
+
+
+def facts_section(report: EvaluationReport) -> str:
+    """Return the facts about model, recording and machine."""
+    recording, evaluated, model = report.recording, report.evaluated, report.evaluated.model
+    start_s, end_s = evaluated.time_window_s
+    facts = {
+        "Recording": f"{recording.frames} frames, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
+        "Evaluated": evaluated.path,
+        "Made by": evaluated.command or "not known",
+        "Model": f"{model.gaussians:,} Gaussians, {model.parameters:,} parameters, {start_s:.2f} to {end_s:.2f} s",
+        "Device, renderer": f"{evaluated.device}, {evaluated.renderer}",
+        "Time taken": f"{evaluated.wall_s:.1f} s",
+        **evaluated.machine,
+    }
+    if report.causal is not None:
+        causal = report.causal
+        facts["Causal learning"] = (
+            f"{causal.steps_per_frame} steps a frame, {causal.field} field, motion prior {causal.motion_prior}, seed {causal.seed}"
+        )
+    rows = _rows(facts)
+    digests = {"Recording": recording.digest, "Model": model.sha256}
+    rows += "".join(
+        f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v
+    )
+    return f'<section><h2>Evaluation</h2><table class="facts"><tbody>{rows}</tbody></table></section>'
+
+
+def notes_section(report: EvaluationReport) -> str:
+    """Return the notes."""
+    if not report.notes:
+        return ""
+    items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
+    return f'<section><h2>Notes</h2><ul class="notes">{items}</ul></section>'
+
+
+def _rows(facts: dict[str, str]) -> str:
+    return "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
 
 
 def write_evaluation_html(report: EvaluationReport, path: Path) -> None:

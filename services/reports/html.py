@@ -1,29 +1,574 @@
-"""Self-contained page `report.html`; only the video is a separate file next to it."""
+"""Self-contained page `report.html`; only the video is a separate file next to it. Each function renders one section."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from html import escape
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
+from urllib.parse import quote
 
 from operators.storage import write_whole
-from services.reports.hidden_sections import hidden_section
-from services.reports.live_sections import live_section
+from services.reports.charts import NARROW, Chart, Line
 from services.reports.pictures import HiddenPictures, KeyframePictures
-from services.reports.schema import RunReport
-from services.reports.sections import (
-    baselines_section,
-    facts_section,
-    latency_section,
-    notes_section,
-    operators_section,
-    pictures_section,
-    quality_over_time_section,
-    tiles_section,
-)
-from services.reports.video import video_section
+from services.reports.schema import DepthErrors, FrameEntry, LiveFacts, RunReport, TruthFacts
+
+
+def _decibels(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _tile(name: str, value: str, unit: str, more: str) -> str:
+    return f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
+
+
+def against(psnr_db: float | None, baseline_db: float | None) -> str:
+    """Return HTML with the gain over the previous frame, and the previous frame's score."""
+    if psnr_db is None or baseline_db is None:
+        return "no baseline"
+    gain = psnr_db - baseline_db
+    kind = "good" if gain >= 0 else "bad"
+    return f'<span class="{kind}">{gain:+.2f} dB</span> against the previous frame ({baseline_db:.2f} dB)'
+
+
+def _quality_tiles(report: RunReport) -> list[str]:
+    """Return the tiles of the run's main quality scores. A training error is never the only score."""
+    quality, baselines = report.quality, report.quality.baselines
+    tiles = []
+    if (next_frame := quality.next_frame) is not None:
+        value, previous_db = next_frame.psnr_tissue_db, next_frame.previous_frame_db
+        more = f"{against(value, previous_db)}; before training on the frame"
+        tiles.append(_tile("Next frame, predicted", _decibels(value), "dB", more))
+    if (heldout := quality.heldout) is not None:
+        more = against(heldout.psnr_tissue_db, baselines.heldout_previous_frame_db)
+        tiles.append(_tile("Held-out frames", _decibels(heldout.psnr_tissue_db), "dB", more))
+    # a live run has its own tile, without the first second
+    if (live := quality.live) is not None and report.live is None:
+        more = f"training error; {against(live.psnr_tissue_db, baselines.previous_frame_db)}"
+        tiles.append(_tile("Displayed frame", _decibels(live.psnr_tissue_db), "dB", more))
+    return tiles
+
+
+def tiles_section(report: RunReport) -> str:
+    """Return the tiles with the main figures."""
+    frames, wall = report.frames, report.run.wall_s
+    rate = frames.displayed / wall if wall else 0.0
+    damaged = f", {frames.damaged:,} damaged" if frames.damaged else ""
+    tiles = [
+        *_quality_tiles(report),
+        _tile(
+            "Frames displayed",
+            f"{frames.displayed:,}",
+            f"of {frames.ingested:,}",
+            f"{frames.dropped:,} dropped{damaged}",
+        ),
+    ]
+    if report.latency_ms and report.live is None:  # a live run states the age of its pictures in place of the latency
+        path = _display_path(report)
+        latency = report.latency_ms[path]
+        tiles.append(
+            _tile(
+                "Latency to display",
+                f"{latency.p50:,.0f}",
+                "ms",
+                f"p95 {latency.p95:,.0f} ms, max {latency.max:,.0f} ms",
+            )
+        )
+    tiles.append(_tile("Run time", f"{wall:,.1f}", "s", f"{rate:.2f} frames a second"))
+    if report.model:
+        tiles.append(
+            _tile(
+                "Gaussians",
+                f"{report.model.gaussians:,}",
+                "",
+                f"{report.model.parameters:,} parameters, {escape(report.run.field)} field",
+            )
+        )
+    return f'<ul class="tiles">{"".join(tiles)}</ul>'
+
+
+def _display_path(report: RunReport) -> str:
+    """Return the path that ends at the display."""
+    return next((path for path in report.latency_ms if path.endswith("video")), next(iter(report.latency_ms)))
+
+
+def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | None, report: RunReport) -> str:
+    """Return raw picture, reconstruction, error and depth of the keyframes."""
+    if not keyframes:
+        return ""
+    cells = ["".join(f'<div class="head">{name}</div>' for name in ("Raw", "Reconstruction", "Error", "Depth"))]
+    for pictures in keyframes:
+        rendered, quality = pictures.scored.rendered, pictures.scored.quality
+        seq = rendered.frame.seq
+        tags = "" if rendered.trained else '<span class="tag held">held out</span>'
+        if seq == worst_seq:
+            tags += '<span class="tag worst">lowest PSNR</span>'
+        near_far = pictures.depth_range
+        # Without recorded depth the scale is unknown: the model's depth is relative, not in
+        # millimetres.
+        unit = " mm" if rendered.frame.depth_is_metric else ", scale not known"
+        depth = f"depth {near_far[0]:.1f} to {near_far[1]:.1f}{unit}" if near_far else "no depth"
+        cells.append(
+            f'<div class="row"><b>Frame {seq}</b><span>{rendered.frame.time_s:.2f} s</span><span>model {rendered.model_version}</span>'
+            f"<span>{_finite(quality.psnr_tissue_db)} dB tissue{_kind(rendered.trained)}</span>"
+            f"<span>previous frame {_finite(pictures.scored.previous_frame_db)} dB</span><span>SSIM {_finite(quality.ssim, 4)}</span><span>{depth}</span>{tags}</div>"
+        )
+        for name, uri in (
+            ("raw", pictures.raw),
+            ("reconstruction", pictures.reconstruction),
+            ("error", pictures.error),
+            ("depth", pictures.depth),
+        ):
+            cells.append(f'<img src="{uri}" alt="frame {seq}, {name}" loading="lazy">')
+    return (
+        "<section><h2>Frames</h2>"
+        '<p class="lead">Where the reconstruction is grey and dark with a light outline, it shows tissue that the frame does not, behind a tool or outside '
+        "of the field of view: remembered as it was seen last, not as it is now. "
+        'Error <span class="scale inferno"></span> from 0 to 32 grey levels or more; '
+        'depth <span class="scale viridis"></span> from near to far; grey marks tools, which are not scored, and unknown depth.</p>'
+        f'<div class="frames">{"".join(cells)}</div></section>'
+    )
+
+
+def _kind(trained: bool) -> str:
+    return " (training error)" if trained else ""
+
+
+def _finite(value: float, digits: int = 2) -> str:
+    return f"{value:.{digits}f}" if value == value else "–"
+
+
+def quality_over_time_section(report: RunReport) -> str:
+    """Return the chart of tissue PSNR per frame, with the previous-frame baseline."""
+    trained = [entry for entry in report.series if entry.trained]
+    held_out = [entry for entry in report.series if not entry.trained]
+    if not report.series:
+        return ""
+    lines = []
+    if trained:
+        shown = "training frames" if report.quality.live is None else "displayed frame"
+        name = f"Reconstruction, {shown} (training error)"
+        lines.append(Line(name, [e.time_s for e in trained], [e.psnr_tissue_db for e in trained], "main"))
+    predicted = [entry for entry in report.series if entry.next_frame_db is not None]
+    if predicted:
+        name = "Next frame, predicted before training on it"
+        lines.append(
+            Line(
+                name,
+                [e.time_s for e in predicted],
+                [e.next_frame_db for e in predicted],
+                "third",
+                marks=_is_sampled(report),
+            )
+        )
+    lines.append(
+        Line(
+            "Previous frame shown instead",
+            [e.time_s for e in report.series],
+            [e.previous_frame_db for e in report.series],
+            "base",
+        )
+    )
+    if held_out:
+        lines.append(
+            Line(
+                "Reconstruction, held-out frames",
+                [e.time_s for e in held_out],
+                [e.psnr_tissue_db for e in held_out],
+                "second",
+                marks=True,
+            )
+        )
+    summed_up = (
+        f" Each point is the mean of {report.series_frames_per_entry} frames."
+        if report.series_frames_per_entry > 1
+        else ""
+    )
+    chart = Chart(
+        title="Tissue PSNR over time",
+        description="Higher is better. A reconstruction under the dashed line shows less than a frozen video would."
+        + summed_up,
+        x_label="time in the recording, s",
+        y_label="tissue PSNR, dB",
+        lines=tuple(lines),
+        x_unit=" s",
+        y_unit=" dB",
+    )
+    return f"<section><h2>Quality over time</h2>{chart.figure()}</section>"
+
+
+def _is_sampled(report: RunReport) -> bool:
+    """Return True if only some frames are predicted; their scores are drawn as points without a
+    line."""
+    return report.live is not None
+
+
+def baselines_section(report: RunReport) -> str:
+    """Return the table of the reconstruction's scores and the trivial baselines."""
+    quality, baselines = report.quality, report.quality.baselines
+    rows: list[tuple[str, float | None, bool]] = []
+    if quality.live is not None:
+        rows += [
+            (
+                f"IntraSplat, displayed frame (training error), {quality.live.frames} frames",
+                quality.live.psnr_tissue_db,
+                True,
+            ),
+            ("Previous frame shown instead", baselines.previous_frame_db, False),
+        ]
+    if (next_frame := quality.next_frame) is not None:
+        name = f"IntraSplat, next frame predicted before training on it, {next_frame.frames} frames"
+        rows += [
+            (name, next_frame.psnr_tissue_db, True),
+            ("Those frames: previous frame shown instead", next_frame.previous_frame_db, False),
+        ]
+    if quality.training is not None:
+        rows.append(
+            (
+                f"IntraSplat, training frames (training error), {quality.training.frames} frames",
+                quality.training.psnr_tissue_db,
+                True,
+            )
+        )
+    if quality.heldout is not None:
+        rows.append((f"IntraSplat, held out, {quality.heldout.frames} frames", quality.heldout.psnr_tissue_db, True))
+    rows += [
+        ("Held-out frames: previous frame", baselines.heldout_previous_frame_db, False),
+        ("Held-out frames: mean of both neighbours (sees the future)", baselines.heldout_neighbour_mean_db, False),
+        ("Held-out frames: mean of all training frames", baselines.train_mean_db, False),
+    ]
+    known = [value for _, value, _ in rows if value is not None]
+    low, high = (min(known) - 1, max(known) + 1) if known else (0.0, 1.0)
+    body = ""
+    for name, value, ours in rows:
+        if value is None:
+            continue
+        share = 100 * (value - low) / (high - low)
+        body += (
+            f'<tr{" class=ours" if ours else ""}><th scope="row">{escape(name)}</th><td class="n">{value:.2f}</td>'
+            f'<td class="track"><span class="rail"><span class="dot" style="left:{share:.1f}%"></span></span></td></tr>'
+        )
+    extra = ""
+    for name, part in (
+        ("Displayed frame (training error)", quality.live),
+        ("Held out", quality.heldout),
+        ("Training frames (training error)", quality.training),
+    ):
+        if part is not None:
+            ssim = "–" if part.ssim is None else f"{part.ssim:.4f}"
+            extra += f"{name}: whole-frame PSNR {_decibels(part.psnr_frame_db)} dB, SSIM {ssim}. "
+    return (
+        '<section><h2>Against doing nothing</h2><p class="lead">Tissue PSNR in dB, mean over frames.</p>'
+        f'<table><thead><tr><th scope="col">What is shown</th><th scope="col" class="n">dB</th><th scope="col" class="ends"><span>{low:.0f}</span><span>{high:.0f}</span></th></tr></thead>'
+        f'<tbody>{body}</tbody></table><p class="note">{extra}</p></section>'
+    )
+
+
+def _longest_paths(report: RunReport) -> dict[str, str]:
+    """Return the longest path from the source to each leaf operator; `report.json` has all paths."""
+    longest: dict[str, str] = {}
+    for path in report.latency_ms:
+        end = path.rsplit(",", 1)[-1]
+        if path.startswith("source,") and path.count(",") > longest.get(end, "").count(","):
+            longest[end] = path
+    return longest
+
+
+def latency_section(report: RunReport) -> str:
+    """Return the latency distribution from the source to each leaf operator."""
+    paths = _longest_paths(report)
+    if not paths:
+        return ""
+    styles = ("main", "base", "second", "third")
+    shares = [k / 100 for k in range(101)]
+    lines = tuple(
+        Line(end, values, shares, styles[k % len(styles)])
+        for k, (end, path) in enumerate(paths.items())
+        if len(values := report.latency_quantiles_ms.get(path, [])) == len(shares)
+    )
+    chart = Chart(
+        title="Latency distribution",
+        description="Share of frames that arrived within a time, from leaving the source to the end of each path.",
+        x_label="latency, ms (logarithmic)",
+        y_label="share of frames",
+        lines=lines,
+        x_unit=" ms",
+        y_range=(0.0, 1.0),
+        x_log=True,
+        width=NARROW,
+    )
+    rows = "".join(
+        f'<tr><th scope="row">{escape(end)}</th><td class="n">{v.p50:,.1f}</td><td class="n">{v.p95:,.1f}</td><td class="n">{v.p99:,.1f}</td><td class="n">{v.max:,.1f}</td></tr>'
+        for end, v in ((end, report.latency_ms[path]) for end, path in paths.items())
+    )
+    return (
+        f"<section><h2>Latency</h2>{chart.figure() if lines else ''}"
+        '<table><thead><tr><th scope="col">To</th><th scope="col" class="n">p50 ms</th><th scope="col" class="n">p95</th>'
+        f'<th scope="col" class="n">p99</th><th scope="col" class="n">max</th></tr></thead><tbody>{rows}</tbody></table></section>'
+    )
+
+
+def operators_section(report: RunReport) -> str:
+    """Return the table of operator run times."""
+    if not report.operators:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td class="n">{t.calls:,}</td><td class="n">{t.p50_ms:,.2f}</td><td class="n">{t.p99_ms:,.2f}</td></tr>'
+        for name, t in report.operators.items()
+    )
+    return (
+        '<section><h2>Operators</h2><table><thead><tr><th scope="col">Name</th><th scope="col" class="n">calls</th>'
+        f'<th scope="col" class="n">p50 ms</th><th scope="col" class="n">p99 ms</th></tr></thead><tbody>{rows}</tbody></table></section>'
+    )
+
+
+def facts_section(report: RunReport) -> str:
+    """Return the facts about recording, settings, model and machine."""
+    recording, run, model = report.recording, report.run, report.model
+    length = "a stream without an end" if recording.frames is None else f"{recording.frames} frames"
+    facts = {
+        "Recording": f"{length}, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
+        "Device, engine": f"{run.device}, {run.engine}",
+        "Threads": str(run.threads),
+        "Seed": str(run.seed),
+        "Field, renderer": f"{run.field}, {run.renderer}",
+        "Steps per frame": "default" if run.steps_per_frame is None else str(run.steps_per_frame),
+        "Eyes trained on": run.eyes,
+        "Peak memory": "–" if run.peak_memory_bytes is None else f"{run.peak_memory_bytes / 2**30:.2f} GiB",
+        "Ended by": run.stop_reason,
+        **run.machine,
+    }
+    digests = {"Recording": recording.digest, "Model": model.sha256 if model else None, "Frames": report.frames_sha256}
+    rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
+    rows += "".join(
+        f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v
+    )
+    return f'<section><h2>Run</h2><table class="facts"><tbody>{rows}</tbody></table></section>'
+
+
+def notes_section(report: RunReport) -> str:
+    """Return the notes, which state fallbacks."""
+    if not report.notes:
+        return ""
+    items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
+    return f'<section><h2>Notes</h2><ul class="notes">{items}</ul></section>'
+
+
+def hidden_section(report: RunReport, pictures: HiddenPictures | None) -> str:
+    """Return pictures of the last frame, and scores if the recording has ground truth."""
+    truth = report.quality.truth
+    if pictures is None and truth is None:
+        return ""
+    return (
+        "<section><h2>What the camera does not show</h2>"
+        f"{'' if pictures is None else _row(pictures)}{'' if truth is None else _figures(truth)}</section>"
+    )
+
+
+def _row(pictures: HiddenPictures) -> str:
+    names = ("Raw", "Tissue behind the tool", "Depth", "From the side")
+    uris = (pictures.raw, pictures.behind, pictures.depth, pictures.aside)
+    heads = "".join(f'<div class="head">{name}</div>' for name in names)
+    images = "".join(
+        f'<img src="{uri}" alt="frame {pictures.seq}, {name.lower()}">' for name, uri in zip(names, uris, strict=True)
+    )
+    return (
+        f'<p class="lead">Frame {pictures.seq} at {pictures.time_s:.2f} s. Tissue behind tools and outside of the view is shown as it was seen last;'
+        " where the model has nothing it is grey. From the side: the same moment, 16 degrees aside.</p>"
+        f'<div class="frames">{heads}{images}</div>'
+    )
+
+
+def _figures(truth: TruthFacts) -> str:
+    tables = ""
+    if truth.behind_tools_psnr_db is not None:
+        tables += _table(
+            f"Behind tools, PSNR of {truth.frames} frames",
+            ("IntraSplat", _hidden_decibels(truth.behind_tools_psnr_db)),
+            ("Each pixel as it was seen last", _hidden_decibels(truth.last_seen_psnr_db)),
+            ("Filled in from around the tool", _hidden_decibels(truth.inpainted_psnr_db)),
+        )
+    for name, errors in (("Depth that is seen", truth.depth), ("Depth behind tools", truth.depth_behind_tools)):
+        tables += "" if errors is None else _depth(name, errors)
+    return (
+        '<p class="lead">Against the truth of a synthetic recording, which training never sees. The planes know the truth.</p>'
+        f'<div class="three">{tables}</div>'
+    )
+
+
+def _depth(name: str, errors: DepthErrors) -> str:
+    return _table(
+        f"{name}, RMS error of {errors.frames} frames",
+        ("IntraSplat", _percent(errors.reconstruction)),
+        ("Best level plane", _percent(errors.level_plane)),
+        ("Best tilted plane", _percent(errors.best_plane)),
+    )
+
+
+def _table(name: str, own: tuple[str, str], *baselines: tuple[str, str]) -> str:
+    """Return a table of the reconstruction's score and its baselines."""
+    rows = "".join(
+        f'<tr{" class=ours" if row is own else ""}><th scope="row">{row[0]}</th><td class="n">{row[1]}</td></tr>'
+        for row in (own, *baselines)
+    )
+    return f'<table><thead><tr><th scope="col" colspan="2">{name}</th></tr></thead><tbody>{rows}</tbody></table>'
+
+
+def _hidden_decibels(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f} dB"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2f} %"
+
+
+AGE_GROUPS = 12
+"""Points of the quality-over-age curve; each groups equally many frames."""
+
+
+def live_section(report: RunReport) -> str:
+    """Return ages, quality over age, states and counts; empty for runs without a clock."""
+    live = report.live
+    if live is None:
+        return ""
+    charts = "".join(
+        f"<section><h2>{chart.title}</h2>{chart.figure()}</section>"
+        for chart in (_ages_over_time(report), _quality_over_age(report))
+        if chart is not None
+    )
+    return f'{_tiles(live)}<div class="two">{charts}</div>{_counts(live)}'
+
+
+def _tiles(live: LiveFacts) -> str:
+    versus = against(live.settled_psnr_tissue_db, live.previous_frame_db)
+    first = "–" if live.first_picture_ms is None else f"{live.first_picture_ms:,.0f}"
+    tiles = (
+        (
+            "Displayed frame, after the first second",
+            _decibels(live.settled_psnr_tissue_db),
+            "dB",
+            f"training error; {versus}",
+        ),
+        ("Worst frame since then", _decibels(live.worst_psnr_tissue_db), "dB", "training error"),
+        (
+            "Age of what is shown",
+            f"{live.age_p50_ms:,.1f}",
+            "ms",
+            f"p99 {live.age_p99_ms:,.1f}, max {live.age_max_ms:,.1f} ms",
+        ),
+        ("First picture", first, "ms", "after the first frame"),
+    )
+    items = "".join(
+        f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
+        for name, value, unit, more in tiles
+    )
+    return f'<ul class="tiles">{items}</ul>'
+
+
+def _ages_over_time(report: RunReport) -> Chart | None:
+    entries = [entry for entry in report.series if entry.age_ms is not None]
+    if not entries:
+        return None
+    times, interval_ms = [entry.time_s for entry in entries], 1000 / report.recording.fps
+    lines = (
+        Line("Age when shown", times, [entry.age_ms for entry in entries], "main"),
+        Line("Time between two frames", [times[0], times[-1]], [interval_ms, interval_ms], "base"),
+    )
+    return Chart(
+        title="Age over time",
+        description="From a frame's arrival to its picture. Above the broken line a picture comes after the next frame."
+        + _summed_up(report),
+        x_label="time in the recording, s",
+        y_label="age, ms",
+        lines=lines,
+        x_unit=" s",
+        y_unit=" ms",
+        width=NARROW,
+    )
+
+
+def _quality_over_age(report: RunReport) -> Chart | None:
+    entries = [entry for entry in report.series if entry.age_ms is not None and entry.psnr_tissue_db is not None]
+    if len(entries) < 2:
+        return None
+    groups = _by_age(entries)
+    ages = [fmean(entry.age_ms or 0.0 for entry in group) for group in groups]
+    lines = (
+        Line(
+            "On the screen when the next frame came (training error)",
+            ages,
+            [_mean(group, "psnr_tissue_db") for group in groups],
+            "main",
+        ),
+        Line("Previous frame shown instead", ages, [_mean(group, "previous_frame_db") for group in groups], "base"),
+    )
+    return Chart(
+        title="Quality over age",
+        description=f"Tissue PSNR of frames in {len(groups)} groups of like age. Older pictures show less of what is there now.",
+        x_label="age when shown, ms",
+        y_label="tissue PSNR, dB",
+        lines=lines,
+        x_unit=" ms",
+        y_unit=" dB",
+        width=NARROW,
+    )
+
+
+def _by_age(entries: list[FrameEntry]) -> list[list[FrameEntry]]:
+    """Split frames by age into groups of about equal size, youngest first."""
+    ordered = sorted(entries, key=lambda entry: entry.age_ms or 0.0)
+    count = min(AGE_GROUPS, len(ordered))
+    edges = [round(k * len(ordered) / count) for k in range(count + 1)]
+    return [ordered[low:high] for low, high in pairwise(edges)]
+
+
+def _mean(entries: list[FrameEntry], name: str) -> float | None:
+    values = [value for entry in entries if (value := getattr(entry, name)) is not None]
+    return fmean(values) if values else None
+
+
+def _counts(live: LiveFacts) -> str:
+    per_frame = live.steps / live.frames_trained if live.frames_trained else 0.0
+    ages = f"p50 {live.age_p50_ms:,.1f}, p95 {live.age_p95_ms:,.1f}, p99 {live.age_p99_ms:,.1f}, max {live.age_max_ms:,.1f} ms"
+    facts = {
+        "Age when shown": f"{ages}, {live.pictures:,} pictures",
+        "Frames trained on": f"{live.frames_trained:,}, {per_frame:.1f} steps each before they were shown",
+        "Steps on earlier frames": f"{live.rehearsed_steps:,}",
+        "Not on the screen in time": f"{live.not_on_screen:,} frames",
+        "States, entered": _listed(live.states),
+        "Passed over": _listed(live.dropped),
+        "Withheld from training": _listed(live.withheld),
+        "New scenes": _listed(live.scenes),
+        **{f"Found by {stage}": _listed(found) for stage, found in live.analysis.items()},
+        "Too fast to be scored": f"{live.unscored:,} frames",
+    }
+    rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
+    return f'<section><h2>Live</h2><table class="facts"><tbody>{rows}</tbody></table></section>'
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count:,}" for name, count in counts.items()) or "none"
+
+
+def _summed_up(report: RunReport) -> str:
+    per_entry = report.series_frames_per_entry
+    return f" Each point is the first of {per_entry} frames." if per_entry > 1 else ""
+
+
+def video_section(report: RunReport) -> str:
+    """Return a video player; empty if the run wrote no video."""
+    name = report.outputs.get("video")
+    if name is None:
+        return ""
+    return (
+        '<section><h2>Video</h2><p class="lead">Raw beside reconstruction, with frame number and model version.</p>'
+        f'<video controls muted loop playsinline preload="auto"><source src="{escape(quote(name))}" type="video/mp4">'
+        f"This browser plays no video; open <code>{escape(name)}</code>.</video></section>"
+    )
+
 
 # Content security policy: only the video next to the page may be loaded.
 POLICY = "default-src 'none'; img-src data:; media-src 'self'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"

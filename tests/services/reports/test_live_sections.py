@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.reports.html import render_html
-from services.reports.live_sections import AGE_GROUPS, live_section
+from services.reports.html import AGE_GROUPS, live_section, render_html
 from services.reports.schema import FrameEntry, Latency, LiveFacts, RunReport
 
 

@@ -18,7 +18,7 @@ from operators.reconstruct import TrainingCounts
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
 from services.cli.exit_codes import BAD_INPUT, NOTHING_SHOWN, exit_code_of
-from services.reports.nothing_shown import REMEDIES, require_shown
+from services.reports.build import REMEDIES, require_shown
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
 
