@@ -80,13 +80,13 @@ def _close(folder: Path, is_ours: Callable[[], bool]) -> bool:
             return False
         if found.st_uid != os.geteuid():
             raise FolderNotPrivate(
-                f"{folder} belongs to user {found.st_uid} (mode {mode}) and the service runs as user {os.geteuid()}; give it a folder of its own"
+                f"{folder} belongs to user {found.st_uid} (mode {mode}) and the service runs as user {os.geteuid()}; give the service a separate folder"
             )
         if not found.st_mode & OTHERS:
             return False
         if os.listdir(folder) and not is_ours():
             raise FolderNotPrivate(
-                f"{folder} is open to other users (mode {mode}) and has files of something else in it; give the service a folder of its own,"
+                f"{folder} is open to other users (mode {mode}) and contains files of other programs; give the service a separate folder,"
                 f" or run `chmod 700 {folder}`"
             )
         folder.chmod(stat.S_IMODE(found.st_mode) & ~OTHERS)
@@ -95,7 +95,7 @@ def _close(folder: Path, is_ours: Callable[[], bool]) -> bool:
                 f"{folder} keeps the mode {mode} after it was set to 0700; choose a file system that has rights"
             )
     except OSError as error:
-        raise FolderNotPrivate(f"{folder}: {error.strerror}; give the service a folder of its own user") from error
+        raise FolderNotPrivate(f"{folder}: {error.strerror}; give the service a folder that its user owns") from error
     return True
 
 

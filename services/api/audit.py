@@ -25,12 +25,17 @@ the log."""
 
 
 def wanted_of(
-    event: Annotated[Text | None, Query(description="As `model.activate`, or `model` for all of its events.")] = None,
-    actor: Annotated[Text | None, Query(description="Part of the actor: the name or the number of a key.")] = None,
-    subject: Annotated[Text | None, Query(description="Part of the subject.")] = None,
+    event: Annotated[
+        Text | None,
+        Query(description="Event, such as `model.activate`, or a prefix such as `model` for all events of models."),
+    ] = None,
+    actor: Annotated[
+        Text | None, Query(description="Text contained in the actor, which is the name and id of a key.")
+    ] = None,
+    subject: Annotated[Text | None, Query(description="Text contained in the subject.")] = None,
     outcome: Annotated[Outcome | None, Query()] = None,
-    since: Annotated[Moment | None, Query(description="From this moment on, with a time zone.")] = None,
-    until: Annotated[Moment | None, Query(description="Before this moment, with a time zone.")] = None,
+    since: Annotated[Moment | None, Query(description="Start time (inclusive), with a time zone.")] = None,
+    until: Annotated[Moment | None, Query(description="End time (exclusive), with a time zone.")] = None,
 ) -> Wanted:
     """Build the filter from the query parameters."""
     return Wanted(event, actor, subject, outcome, since, until)
@@ -76,7 +81,7 @@ async def export_audit(
     caller: CallerOf,
     wanted: WantedOf,
     format: Annotated[
-        ExportFormat, Query(description="`jsonl`: the lines as they were written, with their digests. `csv`: a table.")
+        ExportFormat, Query(description="`jsonl`: the original lines with their digests. `csv`: a table.")
     ] = "jsonl",
 ) -> Response:
     """Download the log or the filtered entries, oldest first. The download is recorded in the log."""

@@ -162,11 +162,12 @@ router = new_router("display")
 Kind = Annotated[
     PictureKind,
     Query(
-        description="The camera's picture (`raw`), what is shown in its place (`shown`), or of that the depth, the confidence, and the view of the"
-        " stream's virtual camera (`orbit`), which are drawn while somebody watches them."
+        description="Picture to receive: the camera's frame (`raw`), the reconstruction (`shown`), its depth map (`depth`), "
+        "its confidence map (`confidence`), or the view of the stream's virtual camera (`orbit`). The last three "
+        "are rendered only while they have viewers."
     ),
 ]
-Quality = Annotated[int, Query(ge=10, le=95, description="Of the JPEG.")]
+Quality = Annotated[int, Query(ge=10, le=95, description="JPEG quality.")]
 GOING_AWAY = 1001
 CLOSE_S = 1.0
 """Seconds that a viewer may take to receive the close message."""

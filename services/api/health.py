@@ -76,7 +76,11 @@ async def live() -> Alive:
 async def ready(
     request: Request,
     response: Response,
-    verbose: str | None = Query(None, max_length=8, description="Given, with or without a value: each check."),
+    verbose: str | None = Query(
+        None,
+        max_length=8,
+        description="If present, with or without a value, the answer contains the result of each check.",
+    ),
 ) -> Readiness:
     """Report readiness: 503 while the server drains or a required part is unhealthy."""
     found = await readiness(control_of(request), verbose=verbose is not None)

@@ -98,7 +98,7 @@ DESCRIBED = {
     ],
     "requestBody": {
         "required": True,
-        "description": "A model packed by `intrasplat pack`, not longer than limits.model_bytes.",
+        "description": "A model packed by `intrasplat pack`, at most limits.model_bytes long.",
         "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
     },
 }

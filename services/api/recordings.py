@@ -23,7 +23,8 @@ OCTETS = "application/octet-stream"
 BODY = {
     "requestBody": {
         "required": True,
-        "description": "A video (MP4, AVI, Matroska), or a zip archive of a recording's folder; not longer than limits.recording_bytes.",
+        "description": "A video (MP4, AVI, Matroska), or a zip archive of a recording's folder, at most limits.recording_bytes "
+        "long.",
         "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -53,7 +54,7 @@ async def recording(request: Request, name: ResourceName) -> RecordingView:
     "/recordings/{name}",
     status_code=201,
     openapi_extra=BODY,
-    responses={200: {"model": RecordingView, "description": "This very file is there under this name."}},
+    responses={200: {"model": RecordingView, "description": "The same file is already stored under this name."}},
 )
 @requires("operator", takes=OCTETS, most="recording_bytes")
 async def upload_recording(

@@ -43,7 +43,7 @@ def view_of(jobs: Jobs, job_id: str) -> ReplayView:
 @router.post(
     "/replays",
     status_code=202,
-    responses={404: problem_answer("There is no recording of that name.")},
+    responses={404: problem_answer("No recording has this name.")},
 )
 @requires("operator")
 async def start_replays(
@@ -55,7 +55,7 @@ async def start_replays(
         None,
         min_length=1,
         max_length=200,
-        description="A second request with the same key starts nothing, and gets the same answer.",
+        description="Idempotency key. A second request with the same key starts no replay and gets the same answer.",
     ),
 ) -> Submitted:
     """Queue a replay of one recording, or of each recording of a list."""
@@ -74,9 +74,9 @@ async def start_replays(
 async def replays(
     request: Request,
     count: int = Query(100, ge=1, le=500),
-    before: int | None = Query(None, ge=0, le=2**31 - 1, description="Those whose number is smaller."),
-    batch: str | None = Query(None, pattern=r"^[0-9a-f]{16}$", description="Of this batch alone."),
-    state: State | None = Query(None, description="In this state alone."),
+    before: int | None = Query(None, ge=0, le=2**31 - 1, description="List only replays with a smaller number."),
+    batch: str | None = Query(None, pattern=r"^[0-9a-f]{16}$", description="List only replays of this batch."),
+    state: State | None = Query(None, description="List only replays in this state."),
 ) -> list[ReplayView]:
     """List replays, newest first."""
     jobs = jobs_of(request)
@@ -148,7 +148,7 @@ ResultFile = Literal["report.html", "report.json", "frames.jsonl", "reconstructi
     response_class=Response,
     responses={
         200: {"description": "The file.", "content": {kind.partition(";")[0]: {} for kind in FILES.values()}},
-        206: {"description": "The part of it that `Range` asked for."},
+        206: {"description": "The part of the file that the `Range` header selects."},
     },
 )
 @requires("viewer", ticket=True)

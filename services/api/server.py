@@ -217,7 +217,7 @@ class ServiceManager:
                 sender.setblocking(False)  # never block the event loop
                 sender.sendto("\n".join(lines).encode(), self._address)
         except OSError as error:
-            log.warning("systemd was not told %s: %s", lines[0], error)
+            log.warning("systemd was not notified of %s: %s", lines[0], error)
 
     async def feed_watchdog(self) -> None:
         """Send watchdog notifications until cancelled."""

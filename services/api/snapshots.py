@@ -98,18 +98,26 @@ FormatName = Literal["ply", "splat", "glb", "ply-sequence", "mesh-ply", "mesh-gl
 TimeS = Annotated[
     float | None,
     Query(
-        ge=-1e9, le=1e9, description="Which time of the model's window, in seconds; without it the end.", examples=[0.5]
+        ge=-1e9,
+        le=1e9,
+        description="Time within the model's time window, in seconds. Default: the end of the window.",
+        examples=[0.5],
     ),
 ]
 Times = Annotated[
     int | None,
-    Query(ge=1, le=MOST_TIMES, description="Of `ply-sequence`: how many times of the window; without it 30."),
+    Query(
+        ge=1,
+        le=MOST_TIMES,
+        description="Number of times in a `ply-sequence`, spread over the model's time window. Default: 30.",
+    ),
 ]
 PIECE_BYTES = 1 << 18
 BINARY = {"schema": {"type": "string", "format": "binary"}}
 ANSWER: dict[int | str, dict[str, object]] = {
     200: {
-        "description": "The file. `ply`, `splat`, `glb` (KHR_gaussian_splatting), `ply-sequence` (a zip archive), the surface as `mesh-ply`, `mesh-glb` or `points-ply`, or `isplat`, which can be uploaded.",
+        "description": "The file: `ply`, `splat`, `glb` (KHR_gaussian_splatting) or `ply-sequence` (a zip archive); the surface "
+        "as `mesh-ply`, `mesh-glb` or `points-ply`; or `isplat`, a packed model for upload.",
         "content": {media_type: BINARY for media_type in sorted({each.media_type for each in ALL.values()})},
         "headers": {
             name: {"description": description, "schema": {"type": "string"}}
@@ -126,7 +134,7 @@ ANSWER: dict[int | str, dict[str, object]] = {
 @exports_router.get(
     "/models/{name}/versions/{number}/exports/{format}",
     response_class=Response,
-    responses={**ANSWER, 409: problem_answer("The version was not checked yet, or was rejected.")},
+    responses={**ANSWER, 409: problem_answer("The version is not checked yet, or was rejected.")},
 )
 @requires("operator")
 async def export_model(

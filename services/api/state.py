@@ -56,7 +56,8 @@ IdempotencyKey = Annotated[
     Header(
         min_length=1,
         max_length=200,
-        description="A text of the caller's own. A request that is sent again with it is answered as the first time, while the server runs.",
+        description="Text chosen by the caller. A repeated request with the same text gets the first answer again, until the "
+        "server restarts.",
         examples=["9f1c2a6e-take-7"],
     ),
 ]

@@ -262,7 +262,7 @@ class AuditLog:
         entry, stated = closed[-1].last() if last is None else parse_line(last)
         here = Head(entry.seq, stated)
         if kept is None and entry.seq > 0:
-            raise ValueError(f"it ends with entry {entry.seq}, and the head beside it is missing")
+            raise ValueError(f"it ends with entry {entry.seq}, and its head file is missing")
         self._check_chain(kept or Head(), whole_bytes)
         if kept != here:
             write_head(self.path, here)

@@ -33,7 +33,7 @@ class Wanted:
     actor: str | None = None
     """Part of the actor: name or id of a key."""
     subject: str | None = None
-    """Part of the subject."""
+    "Text contained in the subject."
     outcome: Outcome | None = None
     since: datetime | None = None
     until: datetime | None = None

@@ -109,7 +109,7 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
             kept, anchor = read_head(path), read_anchor(path)
             closed = closed_segments(path)
         except ValueError as error:
-            said = f"the head or the anchor beside the log cannot be read: {error}"
+            said = f"the head or anchor file next to the log cannot be read: {error}"
             return Verdict(0, Head(), (Finding(0, said),), False)
         walk = _Walk(anchor or Head())
         try:
@@ -155,7 +155,7 @@ def _misfits_at_the_end(
 ) -> Iterator[str]:
     if kept is None:
         if last.seq > 0:
-            yield "the head beside the log is missing: entries may have been cut off the end"
+            yield "the head file next to the log is missing: entries may have been removed from the end"
         return
     if kept.seq > last.seq:
         cut = ", the last one in the middle" if unfinished else ""

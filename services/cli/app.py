@@ -44,20 +44,20 @@ from services.cli.terminal import sentence
 def render(
     model: ModelArgument,
     out: RenderOutOption,
-    fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
+    fps: Annotated[float, typer.Option(help="Frames rendered per second of model time.")] = 30.0,
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",
     renderer: RendererOption = "alpha",
     view: Annotated[
-        str, typer.Option(help="From where: recorded, orbit, stereo (side by side), or a camera path (a .json file).")
+        str, typer.Option(help="Camera: recorded, orbit, stereo (side by side), or a camera path (.json file).")
     ] = "recorded",
     baseline: Annotated[
         float | None,
         typer.Option(
-            help="Distance between the eyes of stereo, in the model's unit.", show_default="0.06 of the depth"
+            help="Distance between the cameras of stereo, in the model's unit.", show_default="0.06 of the depth"
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing video.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
@@ -71,7 +71,7 @@ def render(
 def pack(
     model: ModelArgument,
     file: PackedFileArgument,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Pack a model into one file for upload to the service."""
@@ -86,17 +86,19 @@ def export(
     format: Annotated[
         str | None,
         typer.Option(
-            help="ply, splat, glb, ply-sequence; of the surface mesh-ply, mesh-glb, points-ply.",
+            help="Gaussians: ply, splat, glb, ply-sequence. Surface: mesh-ply, mesh-glb, points-ply.",
             show_default="by the file's ending",
         ),
     ] = None,
     time: Annotated[
-        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+        float | None,
+        typer.Option(help="Time within the model's time window, in seconds.", show_default="the end of its window"),
     ] = None,
     times: Annotated[
-        int | None, typer.Option(help="Of a sequence: how many times of the window.", show_default="30")
+        int | None,
+        typer.Option(help="Number of times in a sequence, spread over the model's time window.", show_default="30"),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Export a model for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its
@@ -108,12 +110,14 @@ def export(
 
 def measure(
     model: ModelArgument,
-    start: Annotated[str, typer.Option("--from", help="A pixel of the recorded camera's picture, as X,Y.")],
+    start: Annotated[str, typer.Option("--from", help="Pixel of the recorded camera, as X,Y.")],
     end: Annotated[
-        str | None, typer.Option("--to", help="Another one: the distance, and the length along the surface.")
+        str | None,
+        typer.Option("--to", help="Second pixel, to measure the straight distance and the length along the surface."),
     ] = None,
     time: Annotated[
-        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+        float | None,
+        typer.Option(help="Time within the model's time window, in seconds.", show_default="the end of its window"),
     ] = None,
     json: JsonOption = False,
 ) -> int:
@@ -127,17 +131,20 @@ def compare(
     model: ModelArgument,
     mesh: MeshArgument,
     time: Annotated[
-        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+        float | None,
+        typer.Option(help="Time within the model's time window, in seconds.", show_default="the end of its window"),
     ] = None,
     pairs: Annotated[
         str | None,
         typer.Option(
-            help="Points that belong together, model = mesh: x,y,z=x,y,z;... Three or more, where they start."
+            help="Three or more corresponding points, model=mesh, as x,y,z=x,y,z;... They give the initial alignment."
         ),
     ] = None,
     inlier: Annotated[
         float | None,
-        typer.Option(help="Distance of an inlier, in the mesh's unit.", show_default="0.02 of the mesh's extent"),
+        typer.Option(
+            help="Largest distance of an inlier, in the mesh's unit.", show_default="0.02 of the mesh's extent"
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> int:
@@ -148,8 +155,10 @@ def compare(
     return compare_command(model, mesh, time, pairs, inlier, as_json=json)
 
 
-PosesOutOption = Annotated[Path, path_option("--out", "The file: poses.npy, to be put beside the recording's images.")]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")]
+PosesOutOption = Annotated[
+    Path, path_option("--out", "Output file. Put it next to the recording's images as poses.npy.")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 
 
 def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
@@ -162,7 +171,9 @@ def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
 def poses(
     recording: RecordingArgument,
     out: PosesOutOption,
-    max_frames: Annotated[int | None, typer.Option(help="Read only so many frames.", show_default="all")] = None,
+    max_frames: Annotated[
+        int | None, typer.Option(help="Read at most this number of frames.", show_default="all")
+    ] = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> int:
@@ -261,7 +272,7 @@ def batch(
     options: Mapping[str, Any],
     out: BatchOutOption = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=256, help="Replays at one time.", show_default="half of the cores")
+        int | None, typer.Option(min=1, max=256, help="Number of concurrent replays.", show_default="half of the cores")
     ] = None,
     json: JsonOption = False,
 ) -> int:
@@ -280,7 +291,8 @@ def live(
     record: Annotated[
         bool,
         typer.Option(
-            "--record", help="Record what comes in, what is trained and what is shown: into recordings/ in --out."
+            "--record",
+            help="Record incoming frames, training schedule and displayed pictures into recordings/ in --out.",
         ),
     ] = False,
     record_keep: RecordKeepOption = None,

@@ -36,15 +36,19 @@ if TYPE_CHECKING:
 
 
 URL, KEY, KEY_FILE = "INTRASPLAT_URL", "INTRASPLAT_KEY", "INTRASPLAT_KEY_FILE"
-UrlOption = Annotated[str, typer.Option(envvar=URL, help="Where the service is.")]
+UrlOption = Annotated[str, typer.Option(envvar=URL, help="URL of the service.")]
 KeyFileOption = Annotated[
     Path | None,
-    typer.Option(envvar=KEY_FILE, help=f"File with an API key; without one the variable {KEY}.", show_default=False),
+    typer.Option(
+        envvar=KEY_FILE,
+        help=f"File with an API key. Default: the file named by {KEY_FILE}, or the key in {KEY}.",
+        show_default=False,
+    ),
 ]
 CaOption = Annotated[
-    Path | None, typer.Option(help="Certificate of the authority that signed the server's.", show_default=False)
+    Path | None, typer.Option(help="CA certificate that signed the server's certificate (PEM).", show_default=False)
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a file that this program has written.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 MOST_KEY_BYTES = 4096
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -59,7 +63,7 @@ def with_client(url: str, key_file: Path | None, ca: Path | None, act: Callable[
         try:
             return act(client)
         except (ValidationError, KeyError) as error:  # valid JSON, but no answer of the API
-            raise not_from_us(url, "is not what this command asked for") from error
+            raise not_from_us(url, "has unexpected content") from error
 
 
 def _key(file: Path | None) -> str:
@@ -70,10 +74,8 @@ def _key(file: Path | None) -> str:
     try:
         return read_regular(file, MOST_KEY_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        said = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise InvalidSetting(
-            f"{file} cannot be read as a key: {said}; give the file with the one line of a key"
-        ) from error
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise InvalidSetting(f"{file} cannot be read as a key: {reason}; give a file with one line, the key") from error
 
 
 def print_found(
@@ -102,7 +104,7 @@ def check_download(file: Path, overwrite: bool) -> None:
     check_file_path(file, overwrite=overwrite)
 
 
-ctl = typer.Typer(help="Speak to a running service (`intrasplat serve`).", no_args_is_help=True)
+ctl = typer.Typer(help="Control a running service (`intrasplat serve`).", no_args_is_help=True)
 ModelName = Annotated[str, typer.Argument(metavar="MODEL", show_default=False)]
 StreamName = Annotated[str, typer.Argument(metavar="STREAM", show_default=False)]
 STREAM: Columns = {
@@ -143,7 +145,9 @@ def stop(name: StreamName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption
 @ctl.command("create")
 def create(
     name: StreamName,
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Its address.", show_default=False)],
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="Source address (docs/sources.md).", show_default=False)
+    ],
     show: Annotated[str, typer.Option(help="`live`, or `model NAME`.")] = "live",
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "auto",
     option: OptionsOption = None,
@@ -178,7 +182,7 @@ def models(
 @ctl.command("upload")
 def upload(
     name: ModelName,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Made by `intrasplat pack`.", show_default=False)],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File made by `intrasplat pack`.", show_default=False)],
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -229,8 +233,10 @@ FormatOption = Annotated[
         show_default="by the file's ending",
     ),
 ]
-TimeOption = Annotated[float | None, typer.Option(help="Which time, in seconds.", show_default="the end")]
-TimesOption = Annotated[int | None, typer.Option(help="Of a sequence: how many times.", show_default="30")]
+TimeOption = Annotated[
+    float | None, typer.Option(help="Time within the model's time window, in seconds.", show_default="the end")
+]
+TimesOption = Annotated[int | None, typer.Option(help="Number of times in a sequence.", show_default="30")]
 
 
 def _format(file: Path, given: str | None) -> str:
@@ -243,7 +249,8 @@ def _format(file: Path, given: str | None) -> str:
 def snapshot(
     stream: StreamName,
     model: Annotated[
-        str | None, typer.Option(help="Make it the next version of this model.", show_default="keep it as a file")
+        str | None,
+        typer.Option(help="Store the snapshot as the next version of this model.", show_default="keep it as a file"),
     ] = None,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -324,9 +331,9 @@ def fetch(
 @ctl.command("camera")
 def camera(
     stream: StreamName,
-    azimuth: Annotated[float, typer.Option(help="Degrees to the right.")] = 0.0,
-    elevation: Annotated[float, typer.Option(help="Degrees upwards.")] = 0.0,
-    zoom: Annotated[float, typer.Option(help="How many times closer.")] = 1.0,
+    azimuth: Annotated[float, typer.Option(help="Rotation to the right, in degrees.")] = 0.0,
+    elevation: Annotated[float, typer.Option(help="Rotation upwards, in degrees.")] = 0.0,
+    zoom: Annotated[float, typer.Option(help="Magnification.")] = 1.0,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -351,11 +358,11 @@ OptionsOption = Annotated[
     typer.Option(
         "--option",
         metavar="<name=value>",
-        help="An option of the engine, as `intrasplat replay` and `live` have it; more than once for several.",
+        help="Option of the engine, as of `intrasplat replay` and `live`; repeat for several.",
         show_default=False,
     ),
 ]
-ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays` shows it.", show_default=False)]
+ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="Id from `ctl replays`.", show_default=False)]
 
 
 def recordings(
@@ -390,8 +397,8 @@ def add_recording(
 
 
 def replays(
-    batch: Annotated[str | None, typer.Option(help="Of this batch alone.", show_default=False)] = None,
-    count: Annotated[int, typer.Option(min=1, max=500, help="So many, the newest first.")] = 20,
+    batch: Annotated[str | None, typer.Option(help="List only replays of this batch.", show_default=False)] = None,
+    count: Annotated[int, typer.Option(min=1, max=500, help="Number of replays, newest first.")] = 20,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -405,7 +412,7 @@ def replays(
 def replay(
     names: Annotated[list[str], typer.Argument(metavar="RECORDING...", show_default=False)],
     option: OptionsOption = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Wait until it has ended.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until the replay has ended.")] = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -432,8 +439,10 @@ def cancel(job_id: ReplayId, url: UrlOption = DEFAULT_URL, key_file: KeyFileOpti
 
 def result(
     job_id: ReplayId,
-    name: Annotated[str, typer.Argument(metavar="FILE", help="Such as report.html.", show_default=False)],
-    out: Annotated[Path | None, typer.Option(help="Where to put it.", show_default="its name, in this folder")] = None,
+    name: Annotated[
+        str, typer.Argument(metavar="FILE", help="Name of the result file, such as report.html.", show_default=False)
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output file.", show_default="its name, in this folder")] = None,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -472,13 +481,11 @@ def _packed(path: Path) -> Iterator[Path]:
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED, strict_timestamps=False) as opened:
             for file in sorted(each for each in path.rglob("*") if each.is_file()):
                 if not file.resolve().is_relative_to(path.resolve()):
-                    raise InvalidSetting(
-                        f"{file} is a link that leads out of {path}; copy the file in place of linking it"
-                    )
+                    raise InvalidSetting(f"{file} is a link to a file outside {path}; replace the link by a copy")
                 try:
                     opened.write(file, file.relative_to(path))
                 except UnicodeEncodeError as error:
-                    raise InvalidSetting(f"the name of {str(file)!r} is no text; rename it") from error
+                    raise InvalidSetting(f"the name of {str(file)!r} is not valid text; rename it") from error
                 except OSError as error:
                     raise InvalidSetting(f"{file} cannot be read: {error.strerror or error}; check it") from error
         yield archive
@@ -507,7 +514,7 @@ def _assigned(text: str) -> tuple[str, Any]:
         ) from error
 
 
-YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
+YesOption = Annotated[bool, typer.Option("--yes", help="Skip the confirmation.")]
 AUDIT: Columns = {
     "seq": "NUMBER", "at": "WHEN", "event": "ACTION", "actor": "BY", "subject": "ON", "outcome": "OUTCOME", "detail": "DETAILS",
 }  # fmt: skip
@@ -520,7 +527,7 @@ WATCHED: Columns = {
 CLEAR = "\x1b[H\x1b[2J"
 SPAN = re.compile(r"(\d{1,6})([smhd])", re.ASCII)
 UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
-delete = typer.Typer(help="Delete something, after asking.", no_args_is_help=True)
+delete = typer.Typer(help="Delete a resource after confirmation.", no_args_is_help=True)
 keys = typer.Typer(help="API keys of the service.", no_args_is_help=True)
 
 
@@ -533,7 +540,7 @@ def check_sure(what: str, yes: bool) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise InvalidSetting(f"{what} would be gone for good; give --yes where nobody can be asked")
+        raise InvalidSetting(f"deleting {what} needs a confirmation and standard input is not a terminal; add --yes")
     if not typer.confirm(f"Delete {what}? This cannot be undone.", default=False, err=True):
         raise InvalidSetting("nothing was deleted")
 
@@ -607,7 +614,7 @@ def delete_recording(
 
 @delete.command("replay")
 def delete_replay(
-    job_id: Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays` shows it.", show_default=False)],
+    job_id: Annotated[str, typer.Argument(metavar="REPLAY", help="Id from `ctl replays`.", show_default=False)],
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -651,14 +658,21 @@ def keys_list(
 
 @keys.command("add")
 def keys_add(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Who it is for, not a person.", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="Name of the program or place that uses the key. Do not use a person's name.",
+            show_default=False,
+        ),
+    ],
     role: Annotated[str, typer.Option(help="viewer, operator or admin.")] = "viewer",
     expires_days: Annotated[
-        float | None, typer.Option(help="Refused after so many days.", show_default="valid until it is revoked")
+        float | None, typer.Option(help="Days until the key expires.", show_default="valid until it is revoked")
     ] = None,
     stream: Annotated[
         list[str] | None,
-        typer.Option("--stream", metavar="<name>", help="Limit it to this stream; more than once for several."),
+        typer.Option("--stream", metavar="<name>", help="Limit the key to this stream; repeat for several."),
     ] = None,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -677,7 +691,7 @@ def keys_add(
 
 @keys.command("revoke")
 def keys_revoke(
-    key_id: Annotated[str, typer.Argument(metavar="ID", help="As `ctl keys list` shows it.", show_default=False)],
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="Id from `ctl keys list`.", show_default=False)],
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -694,16 +708,24 @@ def keys_revoke(
 
 def audit(
     event: Annotated[
-        str | None, typer.Option(help="As model.activate, or model for all of its events.", show_default=False)
+        str | None,
+        typer.Option(
+            help="Event, such as model.activate, or a prefix such as model for all events of models.",
+            show_default=False,
+        ),
     ] = None,
-    actor: Annotated[str | None, typer.Option(help="Part of who did it.", show_default=False)] = None,
-    subject: Annotated[str | None, typer.Option(help="Part of what it was done to.", show_default=False)] = None,
+    actor: Annotated[str | None, typer.Option(help="Text contained in the actor.", show_default=False)] = None,
+    subject: Annotated[str | None, typer.Option(help="Text contained in the subject.", show_default=False)] = None,
     outcome: Annotated[str | None, typer.Option(help="done, refused or failed.", show_default=False)] = None,
-    since: Annotated[str | None, typer.Option(help="A time, or how long ago: 30m, 2h, 7d.", show_default=False)] = None,
-    until: Annotated[str | None, typer.Option(help="A time, or how long ago.", show_default=False)] = None,
-    count: Annotated[int, typer.Option(min=1, max=500, help="So many of the newest, for a table.")] = 20,
-    follow: Annotated[bool, typer.Option("--follow", help="Go on with what is done from now on.")] = False,
-    format: Annotated[str, typer.Option(help="table, or all that fits as jsonl or csv, the oldest first.")] = "table",
+    since: Annotated[
+        str | None, typer.Option(help="Start: a time, or an age such as 30m, 2h or 7d.", show_default=False)
+    ] = None,
+    until: Annotated[str | None, typer.Option(help="End: a time, or an age.", show_default=False)] = None,
+    count: Annotated[int, typer.Option(min=1, max=500, help="Number of newest entries in the table.")] = 20,
+    follow: Annotated[bool, typer.Option("--follow", help="Continue with new entries as they are written.")] = False,
+    format: Annotated[
+        str, typer.Option(help="table, or all matching entries as jsonl or csv, oldest first.")
+    ] = "table",
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -804,8 +826,10 @@ def whoami(
 
 def watch(
     stream: Annotated[str | None, typer.Argument(metavar="[STREAM]", show_default=False)] = None,
-    every: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds between two looks.")] = 2.0,
-    looks: Annotated[int | None, typer.Option(min=1, help="End after so many.", show_default="go on")] = None,
+    every: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds between two refreshes.")] = 2.0,
+    looks: Annotated[
+        int | None, typer.Option(min=1, help="Number of refreshes, then exit.", show_default="go on")
+    ] = None,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,

@@ -45,7 +45,7 @@ def igtl_command(
     """Send a stream's pictures until interrupted."""
     if kind not in KINDS:
         raise InvalidSetting(f"there is no picture {kind!r:.60}; choose {', '.join(KINDS)}")
-    check_host(host, plaintext, "OpenIGTLink has no keys, and sends pictures in the clear to whoever connects")
+    check_host(host, plaintext, "OpenIGTLink has no keys and sends unencrypted pictures to every client")
     folder = folder_of(runtime or load_settings(config, {}).runtime_dir, stream)
     messages = StreamMessages(name or stream[:13], spacing_mm)
     server = MessageServer(host, port)

@@ -211,7 +211,7 @@ def compare_command(
     loaded = load_model(model)
     if pairs is None and not loaded.metric:
         raise InvalidSetting(
-            "the model's lengths have no known unit, so that its size beside the mesh is not known; give --pairs, three or more"
+            "the model's lengths have no known unit, so its size relative to the mesh is unknown; give three or more --pairs"
         )
     time_s = loaded.time_window_s[1] if time_s is None else time_s
     loaded.check_time(time_s)

@@ -99,12 +99,12 @@ def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
     """Describe how well the pictures determine an uncalibrated focal length."""
     assumed_px = float(camera.K[0, 0])
     if focal is None:
-        return f"too few points could be followed far enough to tell the focal length: the poses are those of the assumed {assumed_px:.4g} px"
+        return f"too few points could be followed far enough to determine the focal length; the poses use the assumed {assumed_px:.4g} px"
     low_px, high_px = focal.range_px
     if not focal.known:
         return (
-            f"the pictures do not tell the focal length: all from {low_px:.4g} to {high_px:.4g} px fit nearly as well, of those that were tried. The poses are those of"
-            f" the assumed {assumed_px:.4g} px, and as far as that is wrong, distances along the view are wrong beside those across it"
+            f"the pictures do not determine the focal length: tried values from {low_px:.4g} to {high_px:.4g} px fit almost equally well. The poses use"
+            f" the assumed {assumed_px:.4g} px. An error of it scales distances along the viewing direction, relative to those across it"
         )
     K = with_focal_length(camera, round(focal.best_px, 1)).K
     stated = {
@@ -116,22 +116,22 @@ def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
         "cy": K[1, 2],
     }
     return (
-        f"the focal length was found in the pictures: {focal.best_px:.4g} px fits best, and all from {low_px:.4g} to {high_px:.4g} px nearly as well. The poses are those of"
-        f' it; the recording is read with {assumed_px:.4g} px until its recording.json has "camera": {json.dumps(stated)}'
+        f"the focal length was found in the pictures: {focal.best_px:.4g} px fits best, and values from {low_px:.4g} to {high_px:.4g} px fit almost equally well. The poses use"
+        f' {focal.best_px:.4g} px; the recording is read with {assumed_px:.4g} px until its recording.json has "camera": {json.dumps(stated)}'
     )
 
 
 def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
     """Describe the detected tissue motion."""
     if found.breathing is not None:
-        told = " and ".join(f"{hz:.2f}" for hz in found.breathing.frequencies_hz)
+        frequencies = " and ".join(f"{hz:.2f}" for hz in found.breathing.frequencies_hz)
         share = found.breathing.uncertain / max(found.path, 1e-9)
         return [
-            f"the tissue moves by itself, {told} times a second, which was told from the scope's trajectory; {share:.1%} of the trajectory may be the tissue's all the same"
+            f"the tissue moves by itself, {frequencies} times a second, and this motion was separated from the scope's trajectory; up to {share:.1%} of the trajectory may still be tissue motion"
         ]
     if found.error_px > OFF * focal_px:
         return [
-            f"points are off by {found.error_px:.2g} px: the tissue moves by itself. What it moves as a whole is in the poses; to tell breathing from the scope's trajectory"
+            f"points are off by {found.error_px:.2g} px: the tissue moves by itself. Its common motion is contained in the poses. To separate breathing from the scope's trajectory,"
             " the recording has to show one and a half breaths, better five, and the scope must not swing nearly as fast itself"
         ]
     return []

@@ -10,8 +10,8 @@ import typer
 from services.cli.ctl import ctl
 from services.cli.options import JsonOption, path_argument, path_option
 
-ConfigOption = Annotated[Path | None, path_option("--config", "Settings file (YAML); without one: the defaults.")]
-DataOption = Annotated[Path | None, path_option("--data", "Folder of what is kept (paths.data).")]
+ConfigOption = Annotated[Path | None, path_option("--config", "Settings file (YAML). Default: built-in settings.")]
+DataOption = Annotated[Path | None, path_option("--data", "Data folder (paths.data).")]
 
 keys = typer.Typer(help="API keys of the service.", no_args_is_help=True)
 audit = typer.Typer(help="The service's audit log.", no_args_is_help=True)
@@ -37,7 +37,7 @@ def serve(
     data: DataOption = None,
     setting: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="<section.key=value>", help="Any setting; more than once for several."),
+        typer.Option("--set", metavar="<section.key=value>", help="Override a setting; repeat for several."),
     ] = None,
 ) -> int:
     """Serve streams, models and their API to browsers and programs, until stopped."""
@@ -54,7 +54,7 @@ def schema() -> int:
 
 
 def backup(
-    target: Annotated[Path, path_argument("TARGET", "A folder that is not there yet.")],
+    target: Annotated[Path, path_argument("TARGET", "New folder for the backup.")],
     config: ConfigOption = None,
     data: DataOption = None,
     json: JsonOption = False,
@@ -66,7 +66,7 @@ def backup(
 
 
 def restore(
-    backup: Annotated[Path, path_argument("BACKUP", "A folder that `intrasplat backup` has made.")],
+    backup: Annotated[Path, path_argument("BACKUP", "Folder made by `intrasplat backup`.")],
     config: ConfigOption = None,
     data: DataOption = None,
     check: Annotated[bool, typer.Option("--check", help="Only check the backup; change nothing.")] = False,
@@ -79,16 +79,20 @@ def restore(
 
 
 def igtl(
-    stream: Annotated[str, typer.Argument(metavar="STREAM", help="One that runs on this machine.", show_default=False)],
+    stream: Annotated[
+        str, typer.Argument(metavar="STREAM", help="Name of a stream that runs on this machine.", show_default=False)
+    ],
     config: ConfigOption = None,
-    runtime: Annotated[Path | None, path_option("--runtime", "Folder of the sockets (paths.runtime).")] = None,
-    kind: Annotated[str, typer.Option(help="raw, shown, depth, confidence or orbit.")] = "shown",
+    runtime: Annotated[
+        Path | None, path_option("--runtime", "Runtime folder with the sockets (paths.runtime).")
+    ] = None,
+    kind: Annotated[str, typer.Option(help="Picture: raw, shown, depth, confidence or orbit.")] = "shown",
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 18944,
-    name: Annotated[str | None, typer.Option(help="Of the device.", show_default="the stream's")] = None,
+    name: Annotated[str | None, typer.Option(help="OpenIGTLink device name.", show_default="the stream's")] = None,
     spacing_mm: Annotated[float, typer.Option(help="Width and height of a pixel in millimetres.")] = 1.0,
     plaintext: Annotated[
-        bool, typer.Option("--plaintext", help="Listen beyond this machine, though nothing is encrypted.")
+        bool, typer.Option("--plaintext", help="Allow addresses beyond this machine, although nothing is encrypted.")
     ] = False,
 ) -> int:
     """Send a stream's pictures and the pose of its camera over OpenIGTLink, for example to 3D
@@ -110,7 +114,7 @@ def view(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
     plaintext: Annotated[
-        bool, typer.Option("--plaintext", help="Listen beyond this machine, though nothing is encrypted.")
+        bool, typer.Option("--plaintext", help="Allow addresses beyond this machine, although nothing is encrypted.")
     ] = False,
 ) -> int:
     """Show a model in browsers, with free viewpoint and playback (extra `viser`)."""
@@ -129,14 +133,21 @@ def keys_list(config: ConfigOption = None, data: DataOption = None, json: JsonOp
 
 @keys.command("add")
 def keys_add(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Who it is for, not a person.", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="Name of the program or place that uses the key. Do not use a person's name.",
+            show_default=False,
+        ),
+    ],
     role: Annotated[str, typer.Option(help="viewer, operator or admin.")] = "viewer",
     expires_days: Annotated[
-        float | None, typer.Option(help="Refused after so many days.", show_default="valid until it is revoked")
+        float | None, typer.Option(help="Days until the key expires.", show_default="valid until it is revoked")
     ] = None,
     stream: Annotated[
         list[str] | None,
-        typer.Option("--stream", metavar="<name>", help="Limit it to this stream; more than once for several."),
+        typer.Option("--stream", metavar="<name>", help="Limit the key to this stream; repeat for several."),
     ] = None,
     config: ConfigOption = None,
     data: DataOption = None,
@@ -150,7 +161,7 @@ def keys_add(
 
 @keys.command("revoke")
 def keys_revoke(
-    key_id: Annotated[str, typer.Argument(metavar="ID", help="As `keys list` shows it.", show_default=False)],
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="Id from `keys list`.", show_default=False)],
     config: ConfigOption = None,
     data: DataOption = None,
 ) -> int:
@@ -163,11 +174,13 @@ def keys_revoke(
 @audit.command("verify")
 def audit_verify(
     file: Annotated[
-        Path | None, typer.Argument(metavar="FILE", help="The log.", show_default="audit.jsonl of the service's folder")
+        Path | None,
+        typer.Argument(metavar="FILE", help="Audit log to verify.", show_default="audit.jsonl of the service's folder"),
     ] = None,
     config: ConfigOption = None,
     head: Annotated[
-        str | None, typer.Option(help="Digest of an entry, noted elsewhere, that must be there.", show_default=False)
+        str | None,
+        typer.Option(help="Digest of an entry, recorded elsewhere, that the log must contain.", show_default=False),
     ] = None,
     json: JsonOption = False,
 ) -> int:

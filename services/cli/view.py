@@ -21,7 +21,7 @@ from services.registry.bundle_file import SUFFIX, unpack
 
 def view_command(model: Path, host: str, port: int, *, plaintext: bool) -> int:
     """Serve a model to browsers until interrupted."""
-    check_host(host, plaintext, "the viewer has no keys, and shows the model to whoever connects")
+    check_host(host, plaintext, "the viewer has no keys and shows the model to every client")
     with bundle_in(model) as folder:
         loaded = load_model(folder)
     with InterruptRequest() as interrupt, ModelView(loaded, host, port) as view:

@@ -65,7 +65,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--kind", required=True, help="archive, or a video's suffix")
-    parser.add_argument("--name", required=True, help="what it is called")
+    parser.add_argument("--name", required=True, help="original file name")
     parser.add_argument("--limits", default="{}", help="RecordingLimits as JSON")
     return parser.parse_args(arguments)
 

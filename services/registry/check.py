@@ -81,12 +81,19 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m services.registry.check", description="Check an unpacked model.")
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--json", action="store_true", help="one line of JSON for each step")
-    parser.add_argument("--device", default="cpu", help="where the warm-up picture is rendered: cpu or cuda")
-    parser.add_argument("--gaussians", type=int, default=2_000_000, help="at most so many")
-    parser.add_argument("--model-bytes", type=int, default=4 << 30, help="at most so much of tensors")
-    parser.add_argument("--pixels", type=int, default=4096 * 4096, help="at most so many in the camera's picture")
-    parser.add_argument("--memory-bytes", type=int, default=12 << 30, help="what this may take beside torch itself")
-    parser.add_argument("--seconds", type=float, default=120.0, help="of processor time beside the start of torch")
+    parser.add_argument("--device", default="cpu", help="device of the warm-up render: cpu or cuda")
+    parser.add_argument("--gaussians", type=int, default=2_000_000, help="largest number of Gaussians")
+    parser.add_argument("--model-bytes", type=int, default=4 << 30, help="largest size of the tensors in bytes")
+    parser.add_argument("--pixels", type=int, default=4096 * 4096, help="largest number of camera pixels")
+    parser.add_argument(
+        "--memory-bytes", type=int, default=12 << 30, help="memory limit in bytes, not counting torch itself"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=120.0,
+        help="limit of processor time in seconds, not counting the start of torch",
+    )
     return parser.parse_args(arguments)
 
 

@@ -97,7 +97,7 @@ def hold_section(report: EvaluationReport) -> str:
         )
     chart = Chart(
         title="Frame-hold curve",
-        description="Tissue PSNR of a raw frame that is shown late, against the frame that is seen by then.",
+        description="Tissue PSNR of a delayed raw frame, compared with the frame that is current when it is displayed.",
         x_label="frames late",
         y_label="tissue PSNR, dB",
         lines=tuple(lines),

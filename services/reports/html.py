@@ -291,7 +291,7 @@ def latency_section(report: RunReport) -> str:
     )
     chart = Chart(
         title="Latency distribution",
-        description="Share of frames that arrived within a time, from leaving the source to the end of each path.",
+        description="Share of frames whose latency, from the source to the end of each path, is below a time.",
         x_label="latency, ms (logarithmic)",
         y_label="share of frames",
         lines=lines,
@@ -564,7 +564,7 @@ def video_section(report: RunReport) -> str:
     if name is None:
         return ""
     return (
-        '<section><h2>Video</h2><p class="lead">Raw beside reconstruction, with frame number and model version.</p>'
+        '<section><h2>Video</h2><p class="lead">Raw frame and reconstruction side by side, with frame number and model version.</p>'
         f'<video controls muted loop playsinline preload="auto"><source src="{escape(quote(name))}" type="video/mp4">'
         f"This browser plays no video; open <code>{escape(name)}</code>.</video></section>"
     )

@@ -36,4 +36,6 @@ class Activation(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
     version: int = Field(ge=1, le=2**31 - 1, examples=[3])
-    expected_current: int | None = Field(ge=1, le=2**31 - 1, examples=[2], description="null: none is active.")
+    expected_current: int | None = Field(
+        ge=1, le=2**31 - 1, examples=[2], description="Version that the caller expects to be active; null: none."
+    )

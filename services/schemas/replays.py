@@ -33,12 +33,12 @@ class RecordingView(BaseModel):
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["case-7"])
-    kind: str = Field(examples=["video"], description="video or archive.")
+    kind: str = Field(examples=["video"], description="`video` or `archive`.")
     state: str = Field(examples=["ready"])
     reason: str | None = None
     digest: str = Field(description="SHA-256 of the uploaded file.")
-    size_bytes: int = Field(description="Of the uploaded file.")
-    kept_bytes: int = Field(description="What it takes on the disk.")
+    size_bytes: int = Field(description="Size of the uploaded file in bytes.")
+    kept_bytes: int = Field(description="Disk space used, in bytes.")
     uploaded_at: datetime | str
     uploaded_by: str
     description: RecordingDescription = RecordingDescription.model_validate({})
@@ -73,7 +73,9 @@ class ReplayWanted(BaseModel):
 class Submitted(BaseModel):
     """Queued replays, one per recording, in order."""
 
-    id: str | None = Field(description="Of the replay, where one recording was named.", examples=["1f0c9a3b5d7e8f20"])
+    id: str | None = Field(
+        description="Id of the replay, if the request named one recording.", examples=["1f0c9a3b5d7e8f20"]
+    )
     batch: str = Field(examples=["8f20c9a35d7e1f0b"])
     ids: list[str] = Field(examples=[["1f0c9a3b5d7e8f20"]])
 
@@ -86,28 +88,32 @@ class ReplayView(BaseModel):
     number: int = Field(examples=[12])
     batch: str = Field(examples=["8f20c9a35d7e1f0b"])
     recording: str = Field(examples=["case-7"])
-    options: dict[str, Any] = Field(examples=[{"steps_per_frame": 20}], description="Those that are not the defaults.")
+    options: dict[str, Any] = Field(
+        examples=[{"steps_per_frame": 20}], description="Options that differ from the defaults."
+    )
     state: str = Field(examples=["running"])
     reason: str | None = None
-    attempts: int = Field(examples=[1], description="How often it was begun: again where its process died.")
+    attempts: int = Field(examples=[1], description="Number of attempts. A job is attempted again if its process dies.")
     frames_done: int = Field(examples=[300])
     frames: int | None = Field(None, examples=[900])
     psnr_db: float | None = Field(
-        None, examples=[36.5], description="Over tissue, of the newest displayed frame: its training error."
+        None, examples=[36.5], description="PSNR over tissue of the newest displayed frame (training error)."
     )
     previous_frame_db: float | None = Field(
-        None, examples=[35.9], description="Over tissue, of the raw frame before it, shown instead."
+        None, examples=[35.9], description="Baseline: PSNR over tissue of the previous raw frame."
     )
     next_frame_db: float | None = Field(
         None,
         examples=[34.8],
-        description="Over tissue, of the newest frame that was predicted before the model was trained on it.",
+        description="PSNR over tissue of the newest frame, predicted before the model was trained on it.",
     )
     created_by: str
     created_at: str
     started_at: str | None = None
     ended_at: str | None = None
-    results: list[str] = Field([], examples=[["report.html", "report.json"]], description="Files to download.")
+    results: list[str] = Field(
+        [], examples=[["report.html", "report.json"]], description="Result files available for download."
+    )
 
 
 class BatchView(BaseModel):

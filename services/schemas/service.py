@@ -84,13 +84,14 @@ class NewKey(BaseModel):
     name: ResourceName
     role: Literal["viewer", "operator", "admin"] = Field(examples=["viewer"])
     expires_at: Moment | None = Field(
-        None, description="Refused from then on, with a time zone; null: never.", examples=["2099-01-01T00:00:00Z"]
+        None, description="Expiry time, with a time zone; null: never.", examples=["2099-01-01T00:00:00Z"]
     )
     streams: list[ResourceName] | None = Field(
         None,
         min_length=1,
         max_length=MOST_STREAMS,
-        description="Streams that the key is limited to: it can use nothing else. null: not limited. Not for an administrator.",
+        description="Streams that the key is limited to; it can use nothing else. null: not limited. Not possible for the role"
+        " admin.",
         examples=[["theatre-1"]],
     )
 
@@ -110,9 +111,12 @@ class KeyView(BaseModel):
     name: str
     role: Role
     created_at: str
-    expires_at: str | None = Field(None, description="Refused from then on; null: never.")
-    streams: list[str] | None = Field(None, description="Streams that it is limited to; null: not limited.")
-    last_used_at: str | None = Field(None, description="null: never, or by a version that did not note it.")
+    expires_at: str | None = Field(None, description="Expiry time; null: never.")
+    streams: list[str] | None = Field(None, description="Streams that the key is limited to; null: not limited.")
+    last_used_at: str | None = Field(
+        None,
+        description="Time of the last use; null: never used, or used only by a server version that did not record it.",
+    )
     expired: bool = False
 
     @field_validator("streams", mode="before")
@@ -134,8 +138,10 @@ class Myself(BaseModel):
     key_id: str
     role: Role
     streams: list[str] | None = Field(description="Streams that the key is limited to; null: not limited.")
-    expires_at: str | None = Field(description="null: never, or a person who has signed in elsewhere.")
-    federated: bool = Field(description="A person of an OpenID Connect issuer.")
+    expires_at: str | None = Field(
+        description="Expiry time of the key; null: never, or the caller signed in by OpenID Connect."
+    )
+    federated: bool = Field(description="True if the caller signed in by OpenID Connect.")
 
 
 class TicketFor(BaseModel):
@@ -144,7 +150,7 @@ class TicketFor(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     path: str = Field(
         pattern=r"^/v1/[A-Za-z0-9/._-]{1,200}$",
-        description="The path that will be asked for, without its query.",
+        description="Path of the later request, without its query.",
         examples=["/v1/streams/endoscope/display"],
     )
 
@@ -161,7 +167,7 @@ class EntryView(BaseModel):
 
     model_config = ConfigDict(from_attributes=True)
     seq: int
-    at: str = Field(description="UTC.", examples=["2026-11-23T20:31:07.123+00:00"])
+    at: str = Field(description="Time of the entry in UTC.", examples=["2026-11-23T20:31:07.123+00:00"])
     event: str = Field(examples=["model.activate"])
     actor: str = Field(examples=["console (1f0c9a3b)"])
     role: str
@@ -179,6 +185,6 @@ class AuditPage(BaseModel):
     head_seq: int
     head_digest: str
     next_before: int | None = Field(
-        description="Give this as `before` for the next page; null on the last one. With a filter a page may have few entries, or none, and"
-        " be followed by another one: each reads a part of the log."
+        description="Value of `before` for the next page; null on the last page. A filtered page may have few or no entries "
+        "although more pages follow, because each request searches a part of the log."
     )

@@ -31,7 +31,7 @@ class StreamWanted(StreamSettings):
 
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
-    start: bool = Field(True, description="Start it at once.")
+    start: bool = Field(True, description="Start the stream immediately.")
     options: dict[str, Any] = Field({}, max_length=MOST_OPTIONS, json_schema_extra=stream_options_schema())
 
     @field_validator("options")
@@ -54,11 +54,14 @@ class StreamView(BaseModel):
     reason: str | None = None
     processes: dict[str, dict[str, Any]] = Field(
         {},
-        description="Capture and engine: `state`, `reason`, `pid`, `restarts`, `rate_hz` (frames captured, pictures shown a second), `heard_s` since the"
-        " last heartbeat, and its `figures`. Those of the engine have the newest `picture` with its `age_ms` and its `psnr_db`: the training error"
-        " of the frame that is displayed, not of one that was held out.",
+        description="State of the capture and engine process: `state`, `reason`, `pid`, `restarts`, `rate_hz` (frames captured"
+        " or pictures displayed per second), `heard_s` (seconds since the last heartbeat) and `figures`. The "
+        "figures of the engine contain the newest `picture` with its `age_ms` and its `psnr_db`, which is a "
+        "training error and not the score of a held-out frame.",
     )
-    viewers: dict[str, int] = Field({}, description="Open displays, by picture.", examples=[{"raw": 1, "shown": 2}])
+    viewers: dict[str, int] = Field(
+        {}, description="Number of open displays per picture.", examples=[{"raw": 1, "shown": 2}]
+    )
 
     @field_validator("source")
     @classmethod
@@ -78,9 +81,9 @@ class VirtualCamera(BaseModel):
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}
     )
-    azimuth_deg: float = Field(0.0, ge=-75, le=75, description="To the right.")
-    elevation_deg: float = Field(0.0, ge=-75, le=75, description="Upwards.")
-    zoom: float = Field(1.0, ge=0.25, le=4, description="How many times closer.")
+    azimuth_deg: float = Field(0.0, ge=-75, le=75, description="Rotation to the right, in degrees.")
+    elevation_deg: float = Field(0.0, ge=-75, le=75, description="Rotation upwards, in degrees.")
+    zoom: float = Field(1.0, ge=0.25, le=4, description="Magnification.")
 
 
 class SnapshotWanted(BaseModel):
@@ -89,7 +92,7 @@ class SnapshotWanted(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     model: ResourceName | None = Field(
         None,
-        description="Make it the next version of this model; without it, it is kept as a file.",
+        description="Model that gets the snapshot as its next version. Default: the snapshot is stored as a file.",
         examples=["liver"],
     )
 
@@ -98,15 +101,21 @@ class SnapshotView(BaseModel):
     """Model of a stream at one frame."""
 
     model_config = ConfigDict(from_attributes=True)
-    id: str | None = Field(None, examples=["1f0c9a3b5d7e8f20"], description="null: it became a version.")
+    id: str | None = Field(
+        None,
+        examples=["1f0c9a3b5d7e8f20"],
+        description="Id of the stored file; null if the snapshot became a model version.",
+    )
     stream: str = Field(examples=["theatre-1"])
     taken_at: datetime | str
     taken_by: str
-    seq: int = Field(description="Number of the frame.")
-    model_version: int = Field(description="As pictures name it.")
+    seq: int = Field(description="Sequence number of the frame.")
+    model_version: int = Field(description="Version of the live model, as in the metadata of pictures.")
     gaussians: int
-    time_window_s: list[float] = Field(description="First and last time that the model has.", examples=[[2.0, 5.0]])
-    pause_ms: float = Field(description="How long training stood still; the frame's picture was on its way before.")
+    time_window_s: list[float] = Field(
+        description="First and last time of the model, in seconds.", examples=[[2.0, 5.0]]
+    )
+    pause_ms: float = Field(description="Pause of training in milliseconds. The frame's picture is not delayed.")
     size_bytes: int
-    digest: str = Field(description="SHA-256 of its manifest, which has that of its tensors.")
-    version: VersionView | None = Field(None, description="The model's version that it became.")
+    digest: str = Field(description="SHA-256 of the manifest, which contains the SHA-256 of the tensors.")
+    version: VersionView | None = Field(None, description="Model version created from the snapshot.")

@@ -98,25 +98,30 @@ Url = Annotated[str, AfterValidator(_url), Field(examples=["https://login.exampl
 class OidcSettings(Section):
     """OpenID Connect issuer whose users are admitted in addition to API keys; needs the extra oidc."""
 
-    issuer: Url = Field(description="As the issuer calls itself, to the letter.")
-    audience: str = Field(
-        min_length=1, description="What tokens for this service have as `aud`.", examples=["intrasplat"]
-    )
+    issuer: Url = Field(description="Issuer URL, exactly as in the issuer's discovery document.")
+    audience: str = Field(min_length=1, description="Expected `aud` claim of tokens.", examples=["intrasplat"])
     roles: dict[str, Literal["viewer", "operator", "admin"]] = Field(
         min_length=1,
-        description="Role of each value of the claim; the highest counts, without one a token is refused.",
+        description="Role for each value of the roles claim. The highest role applies; a token without a known value is "
+        "refused.",
         examples=[{"theatre-staff": "viewer", "research": "operator"}],
     )
     role_claim: str = Field(
-        default="roles", min_length=1, description="Claim with a text or a list, such as groups or realm_access.roles."
+        default="roles",
+        min_length=1,
+        description="Claim with the roles, a text or a list, such as groups or realm_access.roles.",
     )
-    name_claim: str = Field(default="sub", min_length=1, description="Claim by which the audit log names a person.")
-    keys_url: Url | None = Field(default=None, description="JWK set. Default: what the issuer's discovery names.")
+    name_claim: str = Field(
+        default="sub", min_length=1, description="Claim used as the person's name in the audit log."
+    )
+    keys_url: Url | None = Field(
+        default=None, description="URL of the issuer's JWK set. Default: from the issuer's discovery document."
+    )
     algorithms: tuple[
         Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA"], ...
-    ] = Field(default=("RS256", "ES256"), min_length=1, description="Algorithms that may have signed a token.")
-    ca_file: Path | None = Field(default=None, description="Certificate of the issuer's authority (PEM).")
-    leeway_s: float = Field(default=30.0, ge=0, le=300, description="By how much clocks may differ.")
+    ] = Field(default=("RS256", "ES256"), min_length=1, description="Accepted signature algorithms of tokens.")
+    ca_file: Path | None = Field(default=None, description="CA certificate for connections to the issuer (PEM).")
+    leeway_s: float = Field(default=30.0, ge=0, le=300, description="Accepted clock difference in seconds.")
 
 
 NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
@@ -149,29 +154,32 @@ class ServerSettings(Section):
     """Listening address of the API, TLS and proxies."""
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
-    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any that is free.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects a free port.")
     certfile: Path | None = Field(default=None, description="TLS certificate chain (PEM).")
     keyfile: Path | None = Field(default=None, description="TLS private key (PEM).")
     plaintext: bool = Field(
-        default=False, description="Listen beyond this machine without TLS: keys then travel in the clear."
+        default=False, description="Allow addresses beyond this machine without TLS. Keys are then sent unencrypted."
     )
     allowed_hosts: tuple[HostPattern, ...] = Field(
         default=(),
-        description="Names by which this server may be asked, such as room-1.example or *.example. Addresses and localhost always may."
-        " Without a list: no other name, or with TLS those of the certificate.",
+        description="Accepted host names in requests, such as room-1.example or *.example. IP addresses and localhost are "
+        "always accepted. Default: the names in the TLS certificate, or none without TLS.",
     )
     trusted_proxies: tuple[Network, ...] = Field(
-        default=(), description="Whose X-Forwarded-For and X-Forwarded-Proto are believed; nobody's by default."
+        default=(),
+        description="Addresses of proxies whose X-Forwarded-For and X-Forwarded-Proto headers are used. Default: none.",
     )
     probe_host: str = Field(default="127.0.0.1", description="Address of the probe listener.")
     probe_port: int | None = Field(
         default=None,
         ge=0,
         le=65535,
-        description="Port of a second listener for /livez and /readyz alone, without TLS and keys, which answers while the first is full."
-        " Without it they are at the Unix socket probe.sock in paths.runtime, as always.",
+        description="Port of a second listener for /livez and /readyz, without TLS and keys. It answers even when the main "
+        "port has reached its connection limit. The Unix socket probe.sock in paths.runtime answers in any case.",
     )
-    drain_s: float = Field(default=10.0, ge=0, le=600, description="How long requests may take to end after SIGTERM.")
+    drain_s: float = Field(
+        default=10.0, ge=0, le=600, description="Longest time for running requests to finish after SIGTERM, in seconds."
+    )
 
     @model_validator(mode="after")
     def _whole_pair(self) -> ServerSettings:
@@ -183,9 +191,9 @@ class ServerSettings(Section):
 class PathSettings(Section):
     """Folders of the service; created if missing, accessible to their owner only."""
 
-    data: Path | None = Field(default=None, description="What is kept. Default: $XDG_DATA_HOME/intrasplat.")
+    data: Path | None = Field(default=None, description="Data folder. Default: $XDG_DATA_HOME/intrasplat.")
     runtime: Path | None = Field(
-        default=None, description="Sockets of running processes. Default: $XDG_RUNTIME_DIR/intrasplat."
+        default=None, description="Folder for the sockets of running processes. Default: $XDG_RUNTIME_DIR/intrasplat."
     )
 
 
@@ -194,60 +202,77 @@ class AuthSettings(Section):
 
     admin_key_file: Path | None = Field(
         default=None,
-        description="Holds the first administrator's key: read if it is there, else made at the first start. Default: admin.key in paths.data.",
+        description="File with the first administrator's key. It is read if it exists, and created at the first start "
+        "otherwise. The `intrasplat ctl` commands read a key file given by --key-file or INTRASPLAT_KEY_FILE. "
+        "Default: admin.key in paths.data.",
     )
-    ticket_s: float = Field(default=30.0, gt=0, le=300, description="How long a ticket may wait for its one use.")
-    oidc: OidcSettings | None = Field(default=None, description="Persons of an OpenID Connect issuer.")
+    ticket_s: float = Field(default=30.0, gt=0, le=300, description="Lifetime of an unused ticket in seconds.")
+    oidc: OidcSettings | None = Field(
+        default=None, description="OpenID Connect issuer whose tokens are accepted in place of API keys."
+    )
 
 
 class AuditSettings(Section):
     """Size of audit log segments and their retention. By default segments are kept indefinitely."""
 
     segment_bytes: int = Field(
-        default=16 * MIB, ge=64 * 1024, description="A file that is longer is closed, and the next one goes on."
+        default=16 * MIB,
+        ge=64 * 1024,
+        description="Size in bytes at which a segment of the log is closed and the next one is started.",
     )
-    keep_segments: int | None = Field(default=None, ge=1, description="Closed files that are kept; null: all.")
+    keep_segments: int | None = Field(default=None, ge=1, description="Number of closed segments to keep; null: all.")
     keep_days: float | None = Field(
         default=None,
         gt=0,
-        description="A closed file whose last entry is older goes, at the start or when the next is closed.",
+        description="Age in days at which a closed segment is deleted, at start or when the next segment is closed. The age is"
+        " that of its last entry.",
     )
 
 
 class LimitSettings(Section):
     """Resource limits per caller."""
 
-    body_bytes: int = Field(default=MIB, ge=1024, description="Longest body of a request that is not an upload.")
-    model_bytes: int = Field(default=2048 * MIB, ge=MIB, description="Longest uploaded model.")
-    recording_bytes: int = Field(default=16 * GIB, ge=MIB, description="Longest uploaded recording.")
-    uploads: int = Field(default=8, ge=1, le=64, description="Uploads at one time.")
+    body_bytes: int = Field(
+        default=MIB, ge=1024, description="Largest body of a request other than an upload, in bytes."
+    )
+    model_bytes: int = Field(default=2048 * MIB, ge=MIB, description="Largest uploaded model, in bytes.")
+    recording_bytes: int = Field(default=16 * GIB, ge=MIB, description="Largest uploaded recording, in bytes.")
+    uploads: int = Field(default=8, ge=1, le=64, description="Concurrent uploads.")
     uploads_per_key: int = Field(
         default=2,
         ge=1,
         le=64,
-        description="Uploads of one key at one time: slow ones of one caller leave room for others.",
+        description="Concurrent uploads per key, so that slow uploads of one caller do not block other callers.",
     )
-    stall_s: float = Field(default=10.0, gt=0, description="Longest wait for the next part of a body.")
+    stall_s: float = Field(
+        default=10.0, gt=0, description="Longest wait for the next part of a request body, in seconds."
+    )
     slowest_bytes_per_s: int = Field(
-        default=4096, ge=0, description="A body that comes slower than this, after the first seconds, is refused."
+        default=4096,
+        ge=0,
+        description="Minimum transfer rate of a request body in bytes per second, after the first seconds. Slower uploads are "
+        "refused.",
     )
-    head_s: float = Field(default=10.0, gt=0, description="Longest wait for the head of a request.")
-    requests_per_s: float = Field(default=100.0, gt=0, description="Requests of one key, on average.")
-    address_requests_per_s: float = Field(default=300.0, gt=0, description="Requests of one address, on average.")
+    head_s: float = Field(default=10.0, gt=0, description="Longest wait for the head of a request, in seconds.")
+    requests_per_s: float = Field(default=100.0, gt=0, description="Average request rate per key, per second.")
+    address_requests_per_s: float = Field(
+        default=300.0, gt=0, description="Average request rate per client address, per second."
+    )
     burst_s: float = Field(
-        default=2.0, ge=0.1, le=60, description="How many seconds' worth of requests may come at once."
+        default=2.0, ge=0.1, le=60, description="Size of a burst of requests, in seconds of the average rate."
     )
-    connections: int = Field(default=512, ge=8, description="Open connections; more are refused.")
+    connections: int = Field(default=512, ge=8, description="Open connections. Further connections are refused.")
     connections_per_address: int = Field(
         default=128,
         ge=0,
-        description="Open connections of one address, of IPv6 one /64; more are closed at once. server.trusted_proxies are not counted. 0: no"
-        " bound, for a service behind a proxy that has its own.",
+        description="Open connections per client address (IPv6: per /64 network). Further connections are closed immediately. "
+        "Addresses in server.trusted_proxies are not limited. 0: no limit, for a service behind a proxy with its "
+        "own limit.",
     )
-    streams: int = Field(default=16, ge=1, le=1000, description="Streams at one time, stopped ones among them.")
-    viewers: int = Field(default=100, ge=1, description="Open displays.")
+    streams: int = Field(default=16, ge=1, le=1000, description="Number of streams, including stopped ones.")
+    viewers: int = Field(default=100, ge=1, description="Number of open displays.")
     viewer_stall_s: float = Field(
-        default=15.0, gt=0, description="A viewer that takes no picture for so long is dropped."
+        default=15.0, gt=0, description="Time in seconds after which a viewer that receives no picture is disconnected."
     )
 
 
@@ -255,14 +280,16 @@ class SourceRules(Section):
     """Sources that an API caller may use. A stream makes this machine open the address."""
 
     schemes: tuple[str, ...] = Field(
-        default=("synthetic", "rtsp", "rtsps", "v4l2"), description="Schemes of addresses that may be used."
+        default=("synthetic", "rtsp", "rtsps", "v4l2"), description="Allowed schemes of source addresses."
     )
-    networks: tuple[Network, ...] = Field(default=(), description="Networks whose addresses may be connected to.")
+    networks: tuple[Network, ...] = Field(default=(), description="Networks to which sources may connect.")
     hosts: tuple[str, ...] = Field(
-        default=(), description="Names of hosts that may be connected to, whatever they resolve to."
+        default=(), description="Host names to which sources may connect. The resolved address is not checked."
     )
-    folders: tuple[Path, ...] = Field(default=(), description="Folders whose recordings may be read.")
-    devices: tuple[Path, ...] = Field(default=(), description="Video devices that may be opened, such as /dev/video0.")
+    folders: tuple[Path, ...] = Field(default=(), description="Folders from which sources may read recordings.")
+    devices: tuple[Path, ...] = Field(
+        default=(), description="Video devices that sources may open, such as /dev/video0."
+    )
 
 
 class RegistrySettings(Section):
@@ -275,41 +302,54 @@ class RegistrySettings(Section):
         default=None, description="fsspec URL of the models' files. Default: a folder in paths.data."
     )
     blob_options: dict[str, SecretStr] = Field(
-        default={}, description="Options of that file system, credentials among them."
+        default={}, description="Options of the fsspec file system, including credentials."
     )
 
 
 class RecordingSettings(Section):
     """Uploaded recordings and their retention. A recording in use is never deleted."""
 
-    folder: Path | None = Field(default=None, description="Where they lie. Default: recordings in paths.data.")
-    unpacked_bytes: int = Field(default=64 * GIB, ge=MIB, description="Most that an archive may hold.")
-    keep_days: float | None = Field(default=None, gt=0, description="Remove those that are older. Default: never.")
+    folder: Path | None = Field(
+        default=None, description="Folder of the recordings. Default: recordings in paths.data."
+    )
+    unpacked_bytes: int = Field(default=64 * GIB, ge=MIB, description="Largest unpacked size of an archive, in bytes.")
+    keep_days: float | None = Field(
+        default=None, gt=0, description="Age in days at which recordings are deleted. Default: never."
+    )
     keep_bytes: int | None = Field(
-        default=None, ge=MIB, description="Remove the oldest while all of them take more. Default: never."
+        default=None,
+        ge=MIB,
+        description="Total size in bytes above which the oldest recordings are deleted. Default: no limit.",
     )
 
 
 class JobSettings(Section):
     """Replay jobs."""
 
-    folder: Path | None = Field(default=None, description="Where results lie. Default: replays in paths.data.")
-    workers: int = Field(default=1, ge=1, le=256, description="Replays at one time.")
+    folder: Path | None = Field(default=None, description="Folder of the results. Default: replays in paths.data.")
+    workers: int = Field(default=1, ge=1, le=256, description="Number of concurrent replays.")
     threads: int | None = Field(
-        default=None, ge=1, le=256, description="Threads of each. Default: half of this machine's, shared among them."
+        default=None,
+        ge=1,
+        le=256,
+        description="Threads per replay. Default: half of the machine's cores, divided among the replays.",
     )
-    attempts: int = Field(default=5, ge=1, le=100, description="A job whose process died so often has failed.")
+    attempts: int = Field(
+        default=5, ge=1, le=100, description="Number of attempts. A job fails if its process dies in each of them."
+    )
     lease_s: float = Field(
         default=15.0,
         ge=2,
         le=3600,
-        description="What a pool that died had claimed is taken by another one after so long.",
+        description="Lease time of a claim in seconds. When it ends without renewal, another pool takes the job.",
     )
     keep_days: float | None = Field(
-        default=None, gt=0, description="Remove replays that ended longer ago, with their results. Default: never."
+        default=None,
+        gt=0,
+        description="Age in days at which ended replays are deleted with their results. Default: never.",
     )
     keep_results: int | None = Field(
-        default=None, ge=1, description="Remove the oldest that have ended beyond this number. Default: never."
+        default=None, ge=1, description="Number of ended replays to keep. The oldest are deleted. Default: no limit."
     )
     ray: str | None = Field(
         default=None, max_length=300, description="Address of a Ray cluster (extra `ray`). Default: this machine."
@@ -321,7 +361,7 @@ class LogSettings(Section):
 
     level: Literal["debug", "info", "warning", "error"] = "info"
     format: Literal["auto", "json", "text"] = Field(
-        default="auto", description="`auto` writes text to a terminal and JSON to anything else."
+        default="auto", description="Log format. `auto` writes text to a terminal and JSON otherwise."
     )
 
 
@@ -336,11 +376,13 @@ class StreamSettings(Section):
     show: str = Field(
         default="live",
         pattern=r"^(live|model [a-z0-9][a-z0-9-]{0,39})$",
-        description="`live`, or `model NAME` of the registry.",
+        description="Displayed content: `live`, or `model NAME` from the registry.",
     )
-    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="auto, cpu, cuda or cuda:1.")
-    start: bool = Field(default=True, description="Start it with the service.")
-    options: dict[str, Any] = Field(default={}, description="Options of the source and of the reconstruction.")
+    device: str = Field(
+        default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="Device: auto, cpu, cuda or cuda:N."
+    )
+    start: bool = Field(default=True, description="Start the stream with the service.")
+    options: dict[str, Any] = Field(default={}, description="Options of the source and the reconstruction.")
 
     @field_validator("options")
     @classmethod
@@ -356,7 +398,7 @@ class ServiceSettings(BaseSettings):
         env_prefix="INTRASPLAT_", env_nested_delimiter="__", extra="forbid", frozen=True, hide_input_in_errors=True
     )
 
-    version: Literal[1] = Field(default=1, description="Version of this format.")
+    version: Literal[1] = Field(default=1, description="Version of the settings format.")
     server: ServerSettings = ServerSettings()
     paths: PathSettings = PathSettings()
     auth: AuthSettings = AuthSettings()
@@ -369,7 +411,7 @@ class ServiceSettings(BaseSettings):
     log: LogSettings = LogSettings()
     streams: dict[ResourceName, StreamSettings] = Field(
         default={"endoscope": StreamSettings(source="synthetic:?width=320&height=256&frames=24&moving=1")},
-        description="Streams that are there from the start.",
+        description="Streams created when the service starts.",
     )
 
     @model_validator(mode="after")

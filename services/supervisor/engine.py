@@ -340,7 +340,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keep_files_private()
     parser = argparse.ArgumentParser(description="Engine process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")
-    parser.add_argument("--again", action="store_true", help="an engine of this stream ran before: show a picture soon")
+    parser.add_argument(
+        "--again", action="store_true", help="restart of an engine: display a picture as soon as possible"
+    )
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:

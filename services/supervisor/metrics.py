@@ -151,7 +151,9 @@ class StreamMeasures(Collector):
         dropped = CounterMetricFamily(
             "intrasplat_pictures_dropped", "Pictures that viewers missed.", labels=["stream", "picture", "reason"]
         )
-        viewers = GaugeMetricFamily("intrasplat_stream_viewers", "Open displays.", labels=["stream", "picture"])
+        viewers = GaugeMetricFamily(
+            "intrasplat_stream_viewers", "Number of open displays.", labels=["stream", "picture"]
+        )
         ages = HistogramMetricFamily(
             "intrasplat_display_latency_seconds",
             "From a frame's arrival to when its picture was encoded for viewers.",

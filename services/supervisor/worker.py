@@ -193,7 +193,7 @@ class Worker:
         self.request_stop(f"it got {signal.Signals(number).name}")
 
     def _told_to_stop(self, arguments: Mapping[str, Any]) -> None:
-        self.request_stop(str(arguments.get("reason", "it was told to stop"))[:200])
+        self.request_stop(str(arguments.get("reason", "a stop was requested"))[:200])
 
     def _report(self) -> Mapping[str, Any]:
         with self._saying:

@@ -109,7 +109,7 @@ def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["a file", "in a file"])
 def test_what_is_no_folder_is_refused(tmp_path, kind):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(FolderNotPrivate, match="folder of its own user"):
+    with pytest.raises(FolderNotPrivate, match="folder that its user owns"):
         make_state_private(tmp_path / "file" if kind == "a file" else tmp_path / "file" / "data")
 
 

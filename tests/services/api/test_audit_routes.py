@@ -92,8 +92,8 @@ def test_the_download_of_everything_can_be_verified(kept, tmp_path):
     verdict = verify(file)
     assert verdict.entries == kept.control.audit.head.seq + 1
     assert verdict.head == kept.control.audit.head
-    (finding,) = verdict.findings  # the chain is intact, but the copy has no head file next to it
-    assert "the head beside the log is missing" in finding.what
+    (finding,) = verdict.findings  # of the chain nothing is wrong; a copy has no head beside it
+    assert "the head file next to the log is missing" in finding.what
     assert json.loads(answer.content.splitlines()[-1])["event"] == "audit.export"
 
 

@@ -60,7 +60,7 @@ def test_a_socket_in_the_abstract_name_space_is_found():
 
 def test_a_manager_that_is_gone_changes_nothing(caplog):
     ServiceManager({"NOTIFY_SOCKET": "/nowhere/notify"}).tell("READY=1")
-    assert "systemd was not told READY=1" in caplog.text
+    assert "systemd was not notified of READY=1" in caplog.text
 
 
 def test_the_loop_feeds_the_watchdog_and_a_loop_that_stands_still_does_not(manager):

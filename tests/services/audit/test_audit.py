@@ -142,7 +142,7 @@ def test_a_crash_between_the_line_and_its_head(path):
 
 def test_a_lost_head_is_found(path):
     head_path(path).unlink()
-    assert "head beside the log is missing" in verify(path).findings[0].what
+    assert "head file next to the log is missing" in verify(path).findings[0].what
     head_path(path).write_text("[]")
     assert "cannot be read" in verify(path).findings[0].what
 

@@ -69,7 +69,7 @@ def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
     write(Mesh(2 * mesh.vertices, mesh.normals, mesh.colours, mesh.triangles), tmp_path / "ct.stl")
     arguments = ["compare", str(tmp_path / "model"), str(tmp_path / "ct.stl")]
     assert run(arguments) == BAD_INPUT
-    assert "give --pairs" in capsys.readouterr().err
+    assert "give three or more --pairs" in capsys.readouterr().err
     chosen = mesh.vertices[[5, 40, 900, 1500]].tolist()
     pairs = ";".join(f"{x},{y},{z}={2 * x},{2 * y},{2 * z}" for x, y, z in chosen)
     assert run([*arguments, "--pairs", pairs, "--json"]) == OK

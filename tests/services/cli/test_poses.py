@@ -85,7 +85,10 @@ def test_only_so_many_frames_are_read(clip, capsys):
 def test_a_camera_that_is_not_known_is_said(clip, capsys):
     said = said_of(capsys, clip(calibrated=False))
     assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in said["notes"])
-    assert any("the pictures do not tell the focal length: all from 96 to 256 px" in note for note in said["notes"])
+    assert any(
+        "the pictures do not determine the focal length: tried values from 96 to 256 px" in note
+        for note in said["notes"]
+    )
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (144, "assumed", [96, 256])
 
 
@@ -96,7 +99,7 @@ def test_a_focal_length_that_pictures_tell_is_used_and_said(clip, capsys, monkey
     said = said_of(capsys, folder)
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "pictures", [130, 150])
     (note,) = (note for note in said["notes"] if "the focal length was found" in note)
-    assert "140 px fits best, and all from 130 to 150 px nearly as well" in note
+    assert "140 px fits best, and values from 130 to 150 px fit almost equally well" in note
     stated = json.loads(note.partition('"camera": ')[2])
     described = {"format": "intrasplat-recording", "version": 1, "fps": 30, "camera": stated}
     (folder / "recording.json").write_text(json.dumps(described))
