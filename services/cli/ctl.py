@@ -459,7 +459,7 @@ def result(
 
 def keep(
     job_id: ReplayId,
-    model: Annotated[str, typer.Argument(metavar="MODEL", show_default=False)],
+    model: ModelName,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
@@ -514,6 +514,22 @@ def _assigned(text: str) -> tuple[str, Any]:
         ) from error
 
 
+KeyName = Annotated[
+    str,
+    typer.Argument(
+        metavar="NAME",
+        help="Name of the program or place that uses the key. Do not use a person's name.",
+        show_default=False,
+    ),
+]
+RoleOption = Annotated[str, typer.Option(help="viewer, operator or admin.")]
+ExpiresOption = Annotated[
+    float | None, typer.Option(help="Days until the key expires.", show_default="valid until it is revoked")
+]
+KeyStreamOption = Annotated[
+    list[str] | None,
+    typer.Option("--stream", metavar="<name>", help="Limit the key to this stream; repeat for several."),
+]
 YesOption = Annotated[bool, typer.Option("--yes", help="Skip the confirmation.")]
 AUDIT: Columns = {
     "seq": "NUMBER", "at": "WHEN", "event": "ACTION", "actor": "BY", "subject": "ON", "outcome": "OUTCOME", "detail": "DETAILS",
@@ -569,7 +585,7 @@ def _deleted(
 
 @delete.command("stream")
 def delete_stream(
-    name: Annotated[str, typer.Argument(metavar="STREAM", show_default=False)],
+    name: StreamName,
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -583,7 +599,7 @@ def delete_stream(
 
 @delete.command("version")
 def delete_version(
-    model: Annotated[str, typer.Argument(metavar="MODEL", show_default=False)],
+    model: ModelName,
     version: Annotated[int, typer.Argument(min=1, show_default=False)],
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
@@ -599,7 +615,7 @@ def delete_version(
 
 @delete.command("recording")
 def delete_recording(
-    name: Annotated[str, typer.Argument(metavar="RECORDING", show_default=False)],
+    name: RecordingName,
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -614,7 +630,7 @@ def delete_recording(
 
 @delete.command("replay")
 def delete_replay(
-    job_id: Annotated[str, typer.Argument(metavar="REPLAY", help="Id from `ctl replays`.", show_default=False)],
+    job_id: ReplayId,
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
@@ -629,7 +645,7 @@ def delete_replay(
 
 @delete.command("snapshot")
 def delete_snapshot(
-    stream: Annotated[str, typer.Argument(metavar="STREAM", show_default=False)],
+    stream: StreamName,
     snapshot_id: Annotated[str, typer.Argument(metavar="SNAPSHOT", show_default=False)],
     yes: YesOption = False,
     url: UrlOption = DEFAULT_URL,
@@ -658,22 +674,10 @@ def keys_list(
 
 @keys.command("add")
 def keys_add(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME",
-            help="Name of the program or place that uses the key. Do not use a person's name.",
-            show_default=False,
-        ),
-    ],
-    role: Annotated[str, typer.Option(help="viewer, operator or admin.")] = "viewer",
-    expires_days: Annotated[
-        float | None, typer.Option(help="Days until the key expires.", show_default="valid until it is revoked")
-    ] = None,
-    stream: Annotated[
-        list[str] | None,
-        typer.Option("--stream", metavar="<name>", help="Limit the key to this stream; repeat for several."),
-    ] = None,
+    name: KeyName,
+    role: RoleOption = "viewer",
+    expires_days: ExpiresOption = None,
+    stream: KeyStreamOption = None,
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,

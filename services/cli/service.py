@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.cli.ctl import ctl
+from services.cli.ctl import ExpiresOption, KeyName, KeyStreamOption, RoleOption, ctl
 from services.cli.options import JsonOption, path_argument, path_option
 
 ConfigOption = Annotated[Path | None, path_option("--config", "Settings file (YAML). Default: built-in settings.")]
@@ -133,22 +133,10 @@ def keys_list(config: ConfigOption = None, data: DataOption = None, json: JsonOp
 
 @keys.command("add")
 def keys_add(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME",
-            help="Name of the program or place that uses the key. Do not use a person's name.",
-            show_default=False,
-        ),
-    ],
-    role: Annotated[str, typer.Option(help="viewer, operator or admin.")] = "viewer",
-    expires_days: Annotated[
-        float | None, typer.Option(help="Days until the key expires.", show_default="valid until it is revoked")
-    ] = None,
-    stream: Annotated[
-        list[str] | None,
-        typer.Option("--stream", metavar="<name>", help="Limit the key to this stream; repeat for several."),
-    ] = None,
+    name: KeyName,
+    role: RoleOption = "viewer",
+    expires_days: ExpiresOption = None,
+    stream: KeyStreamOption = None,
     config: ConfigOption = None,
     data: DataOption = None,
 ) -> int:
