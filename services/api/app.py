@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
@@ -22,12 +23,15 @@ from services.api.observability import Measures
 from services.api.pages import ABOUT, describe
 from services.api.parts import Parts
 from services.api.problems import answer_with_problems
-from services.api.state import ControlState, Persons, Storage, ViewerCount, folders_of
+from services.api.state import ControlState, Storage, ViewerCount, folders_of
 from services.audit import AuditLog, AuditUnwritable, Keeping
 from services.auth.keys import KeyStore, changed_outside, first_admin_key, keys_read_again
 from services.auth.roles import Tickets
 from services.settings import ServiceSettings, SettingsInvalid
 from services.version import product_version
+
+if TYPE_CHECKING:
+    from services.auth.oidc import OpenIdPersons
 
 log = logging.getLogger(__name__)
 ROUTERS: tuple[APIRouter, ...] = (
@@ -114,7 +118,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
     )
 
 
-def _persons(settings: ServiceSettings) -> Persons | None:
+def _persons(settings: ServiceSettings) -> OpenIdPersons | None:
     if settings.auth.oidc is None:
         return None
     try:

@@ -19,10 +19,11 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from services.api.guard import CallerOf, new_router, requires, still_valid
-from services.api.parts import BOUNDARY, EncodedPicture, PictureKind
+from services.api.parts import PictureKind
 from services.api.problems import Missing, Unavailable, problem_answer
 from services.api.state import ControlState, control_of, part
 from services.auth.roles import Caller
+from services.display.hub import BOUNDARY, EncodedPicture
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)

@@ -7,23 +7,26 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Path, Response
 from starlette.requests import Request
 
 from services.api.guard import CallerOf, new_router, recorded, requires
-from services.api.parts import Models, VersionRecord
 from services.api.state import ControlState, control_of, is_missing, known_problem, part
 from services.api.uploads import incoming_file, stated_sha256
 from services.schemas.models import Activation, ModelView, VersionView
 from services.settings import ResourceName
 
+if TYPE_CHECKING:
+    from services.registry.models import ModelRegistry
+    from services.registry.records import VersionRecord
+
 router = new_router("models")
 Number = Annotated[int, Path(ge=1, le=2**31 - 1)]
 
 
-def registry_of(request: Request) -> Models:
+def registry_of(request: Request) -> ModelRegistry:
     """Return the model registry of this server."""
     return part(request, lambda parts: parts.models, "a registry of models")
 
@@ -128,14 +131,14 @@ async def upload_model(
     return VersionView.model_validate(record)
 
 
-def check_soon(control: ControlState, registry: Models, record: VersionRecord) -> None:
+def check_soon(control: ControlState, registry: ModelRegistry, record: VersionRecord) -> None:
     """Start the check of a new version in the background."""
     checking = asyncio.create_task(_check(control, registry, record.name, record.version))
     control.tasks.add(checking)
     checking.add_done_callback(control.tasks.discard)
 
 
-async def _check(control: ControlState, registry: Models, name: str, version: int) -> None:
+async def _check(control: ControlState, registry: ModelRegistry, name: str, version: int) -> None:
     """Check a version and store the result. If the check cannot run, the state is unchanged until
     the next start."""
     events = control.parts.events

@@ -6,16 +6,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from typing import TYPE_CHECKING
 
 from fastapi import Header, Response
 from starlette.requests import Request
 
 from services.api.guard import CallerOf, new_router, recorded, requires
-from services.api.parts import Recordings
 from services.api.state import ControlState, control_of, is_missing, known_problem, part
 from services.api.uploads import incoming_file, stated_sha256
 from services.schemas.replays import RecordingView
 from services.settings import ResourceName
+
+if TYPE_CHECKING:
+    from services.recordings.store import RecordingStore
 
 log = logging.getLogger(__name__)
 router = new_router("recordings")
@@ -30,7 +33,7 @@ BODY = {
 }
 
 
-def recordings_of(request: Request) -> Recordings:
+def recordings_of(request: Request) -> RecordingStore:
     """Return the recording store of this server."""
     return part(request, lambda parts: parts.recordings, "recordings")
 
@@ -95,7 +98,7 @@ async def delete_recording(request: Request, caller: CallerOf, name: ResourceNam
         await asyncio.to_thread(kept.delete, name)
 
 
-async def _check(control: ControlState, kept: Recordings, name: str) -> None:
+async def _check(control: ControlState, kept: RecordingStore, name: str) -> None:
     """Check a recording and store the result. If the check cannot run, the state is unchanged until
     the next start."""
     try:

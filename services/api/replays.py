@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import anyio
 from fastapi import Header, Path, Query, Response
@@ -16,12 +16,14 @@ from starlette.websockets import WebSocket, WebSocketState
 from services.api.display import REFUSED, REFUSED_WHY, ViewerStalled, in_time, until_ended
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.models import check_soon, registry_of
-from services.api.parts import Jobs
 from services.api.problems import Conflicting, Missing, Unavailable, problem_answer
 from services.api.state import control_of, part
 from services.jobs.results import FILES
 from services.schemas.models import VersionView
 from services.schemas.replays import BatchView, Kept, ReplayView, ReplayWanted, Submitted
+
+if TYPE_CHECKING:
+    from services.jobs.replays import Replays
 
 router = new_router("replays")
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5d7e8f20"])]
@@ -29,12 +31,12 @@ BatchId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["8f20c9a35d7e
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
-def jobs_of(connection: HTTPConnection) -> Jobs:
+def jobs_of(connection: HTTPConnection) -> Replays:
     """Return the job store of this server."""
     return part(connection, lambda parts: parts.jobs, "replays")
 
 
-def view_of(jobs: Jobs, job_id: str) -> ReplayView:
+def view_of(jobs: Replays, job_id: str) -> ReplayView:
     """Return a replay with its available results."""
     job = jobs.get(job_id)
     return ReplayView.model_validate(job).model_copy(update={"results": list(jobs.files(job))})

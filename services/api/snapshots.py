@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 from collections.abc import Callable, Iterator
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from fastapi import Path, Query
 from starlette.requests import Request
@@ -15,7 +15,6 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import MOST_TIMES, ExportWish
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.models import Number, check_soon, registry_of
-from services.api.parts import ExportedFile, Exports, Snapshots
 from services.api.problems import Forbidden, Unprocessable, problem_answer
 from services.api.state import IdempotencyKey, control_of, part
 from services.api.streams import streams_of
@@ -24,11 +23,15 @@ from services.schemas.models import VersionView
 from services.schemas.streams import SnapshotView, SnapshotWanted
 from services.settings import ResourceName
 
+if TYPE_CHECKING:
+    from services.exports.cache import Exported
+    from services.exports.snapshots import ModelExports, StreamSnapshots
+
 router = new_router("snapshots")
 SnapshotId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5d7e8f20"])]
 
 
-def snapshots_of(request: Request) -> Snapshots:
+def snapshots_of(request: Request) -> StreamSnapshots:
     """Return the snapshot store of this server."""
     return part(request, lambda parts: parts.snapshots, "snapshots")
 
@@ -172,7 +175,7 @@ async def export_snapshot(
     )
 
 
-def exports_of(request: Request) -> Exports:
+def exports_of(request: Request) -> ModelExports:
     """Return the exporter of this server."""
     return part(request, lambda parts: parts.exports, "exports")
 
@@ -187,7 +190,7 @@ def _wish(name: FormatName, time_s: float | None, times: int | None) -> ExportWi
 
 
 async def _answer(
-    request: Request, caller: CallerOf, event: str, subject: str, wish: ExportWish, make: Callable[[], ExportedFile]
+    request: Request, caller: CallerOf, event: str, subject: str, wish: ExportWish, make: Callable[[], Exported]
 ) -> Response:
     async with recorded(request, caller, event, subject, {"format": wish.format.name}) as said:
         made = await asyncio.to_thread(make)
@@ -202,7 +205,7 @@ async def _answer(
     return StreamingResponse(_pieces(made), media_type=wish.format.media_type, headers=headers)
 
 
-def _pieces(made: ExportedFile) -> Iterator[bytes]:
+def _pieces(made: Exported) -> Iterator[bytes]:
     with made.file as file:
         while piece := file.read(PIECE_BYTES):
             yield piece

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from fastapi import Header
 from prometheus_client import Metric
@@ -25,8 +25,11 @@ from services.api.parts import CheckResult, Parts
 from services.api.problems import Missing, NotBuiltIn, Problem, Unprocessable
 from services.audit import AuditError, AuditLog
 from services.auth.keys import KeyStore
-from services.auth.roles import Caller, Tickets
+from services.auth.roles import Tickets
 from services.settings import ServiceSettings
+
+if TYPE_CHECKING:
+    from services.auth.oidc import OpenIdPersons
 
 
 class ViewerCount:
@@ -179,19 +182,6 @@ def _existing(folder: Path) -> Path:
 Part = TypeVar("Part")
 
 
-class Persons(Protocol):
-    """Identity provider for users who sign in elsewhere (OpenID Connect)."""
-
-    async def caller_of(self, token: str) -> Caller:
-        """Return the caller that a token identifies.
-
-        Raises:
-            Unauthenticated: if the token is not valid.
-            Forbidden: if the user has no role here.
-            Unavailable: if the issuer's keys cannot be fetched.
-        """
-
-
 @dataclass(frozen=True)
 class ControlState:
     """Parts, stores and limits of one application; obtained by `control_of`."""
@@ -207,7 +197,7 @@ class ControlState:
     uploads: asyncio.Semaphore
     viewers: ViewerCount
     storage: Storage
-    persons: Persons | None = None
+    persons: OpenIdPersons | None = None
     """OpenID Connect provider, if the settings configure one."""
     uploads_of: Counter[str] = field(default_factory=Counter)
     """Running uploads per key."""

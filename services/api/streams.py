@@ -8,16 +8,20 @@ from __future__ import annotations
 import ipaddress
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from starlette.requests import Request
 
 from services.api.guard import CallerOf, new_router, recorded, requires
-from services.api.parts import NewStream, Streams, StreamState
+from services.api.parts import NewStream
 from services.api.problems import Forbidden, Unprocessable
 from services.api.state import control_of, part
 from services.schemas.streams import StreamOptions, StreamView, StreamWanted, VirtualCamera
 from services.settings import ResourceName, SourceRules
+
+if TYPE_CHECKING:
+    from services.supervisor.stream import StreamFacts, SupervisedStreams
 
 OF_NETWORKS = frozenset(
     {"rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https", "zmq+tcp"}
@@ -110,7 +114,7 @@ def _check_path(path: str, allowed: tuple[Path, ...], setting: str) -> None:
 router = new_router("streams")
 
 
-def streams_of(request: Request) -> Streams:
+def streams_of(request: Request) -> SupervisedStreams:
     """Return the stream manager of this server."""
     return part(request, lambda parts: parts.streams, "streams")
 
@@ -184,7 +188,7 @@ async def delete_stream(request: Request, caller: CallerOf, name: ResourceName) 
         await found.delete(name)
 
 
-def _view(state: StreamState) -> StreamView:
+def _view(state: StreamFacts) -> StreamView:
     return StreamView.model_validate(state)
 
 

@@ -32,7 +32,7 @@ from services.errors import BadMessage
 
 LEAST_QUALITY, MOST_QUALITY = 10, 95
 BOUNDARY = "picture"
-"""Boundary between the parts of a multipart answer, as announced by `services.api.parts`."""
+"""Boundary between the pictures of a multipart answer."""
 DIMMED_TO = 0.5
 """Brightness factor for pictures that must not be mistaken for live ones."""
 

@@ -150,13 +150,22 @@ CHECKED = (State.READY, State.ACTIVE, State.RETIRED)
 
 
 class StreamSnapshots:
-    """Implementation of `services.api.parts.Snapshots`."""
+    """Snapshots of live streams."""
 
     def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, store: SnapshotStore) -> None:
         self._streams, self._registry, self._store = streams, registry, store
 
     async def take(self, stream: str, model: str | None, by: str) -> tuple[Snapshot, VersionRecord | None]:
-        """See `Snapshots`.
+        """Write the current live model of a stream.
+
+        Args:
+            stream: name of the stream.
+            model: if given, the snapshot becomes the next version of this model, still to be
+                checked. Otherwise it is stored as a file.
+            by: the caller, for the record.
+
+        Returns:
+            The snapshot's record, and the version record or None.
 
         Raises:
             Missing: if the stream does not exist.
@@ -181,15 +190,15 @@ class StreamSnapshots:
             return taken, await asyncio.to_thread(self._registry.upload, model, packed, None, by)
 
     def all(self, stream: str) -> Sequence[Snapshot]:
-        """See `Snapshots`."""
+        """Return the stored snapshots of a stream, newest first."""
         return self._store.all(stream)
 
     def get(self, stream: str, number: str) -> Snapshot:
-        """See `Snapshots`. Raises NoSnapshot."""
+        """Return one snapshot. Raises NoSnapshot."""
         return self._store.get(stream, number)
 
     def delete(self, stream: str, number: str) -> None:
-        """See `Snapshots`. Raises NoSnapshot."""
+        """Delete a snapshot. Raises NoSnapshot."""
         self._store.delete(stream, number)
 
 
@@ -207,7 +216,7 @@ def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
 
 
 class ModelExports:
-    """Implementation of `services.api.parts.Exports`."""
+    """Exports of models and snapshots to files. Synchronous and thread-safe."""
 
     def __init__(self, registry: ModelRegistry, store: SnapshotStore, cache: ExportCache) -> None:
         self._registry, self._store, self._cache = registry, store, cache
@@ -221,7 +230,7 @@ class ModelExports:
             await asyncio.to_thread(self._cache.close)
 
     def of_version(self, name: str, number: int, wish: ExportWish) -> Exported:
-        """See `Exports`.
+        """Export a checked model version.
 
         Raises:
             RegistryError: if the version does not exist.
@@ -235,7 +244,7 @@ class ModelExports:
         return self._cache.get(version.digest, lambda: self._registry.folder_of(name, number), wish)
 
     def of_snapshot(self, stream: str, number: str, wish: ExportWish) -> Exported:
-        """See `Exports`. Raises NoSnapshot, ExportsError."""
+        """Export a snapshot. Raises NoSnapshot, ExportsError."""
         snapshot = self._store.get(stream, number)
         refuse_outside(wish, snapshot.time_window_s)
         return self._cache.get(snapshot.digest, lambda: self._store.folder_of(stream, number), wish)

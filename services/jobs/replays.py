@@ -12,7 +12,6 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from services.api import parts
 from services.audit.system_events import SystemEvents
 from services.errors import CheckFailed, NotFound, StoreUnavailable
 from services.jobs.records import JobRecord, JobState, NewJob, Submission
@@ -22,7 +21,7 @@ from services.recordings.store import Expired, RecordingStore
 
 
 class Replays:
-    """Implementation of `services.api.parts.Jobs`."""
+    """Replay jobs with their result files. Synchronous and thread-safe."""
 
     def __init__(self, store: JobStore, results: Results) -> None:
         self._store, self._results = store, results
@@ -30,27 +29,27 @@ class Replays:
     def submit(
         self, recordings: Sequence[str], options: Mapping[str, Any], by: str, idempotency_key: str | None
     ) -> Submission:
-        """See `Jobs`."""
+        """Queue one job per recording."""
         return self._store.submit([NewJob(name) for name in recordings], options, by, idempotency_key)
 
     def newest(self, count: int, *, before: int | None, batch: str | None, state: str | None) -> list[JobRecord]:
-        """See `Jobs`."""
+        """Return replays, newest first."""
         return self._store.newest(count, before=before, batch=batch, state=state)
 
     def get(self, job_id: str) -> JobRecord:
-        """See `Jobs`."""
+        """Return one replay."""
         return self._store.get(job_id)
 
     def counts(self, batch: str | None = None) -> dict[str, int]:
-        """See `Jobs`."""
+        """Count replays in each state."""
         return self._store.counts(batch)
 
     def cancel(self, job_id: str, by: str) -> JobRecord:
-        """See `Jobs`."""
+        """Cancel a queued or running replay."""
         return self._store.cancel(job_id, by)
 
     def delete(self, job_id: str) -> JobRecord:
-        """See `Jobs`."""
+        """Delete a finished replay and its results."""
         record = self._store.forget(job_id)
         self._results.remove(record.folder)
         return record
@@ -72,12 +71,12 @@ class Replays:
                 gone.append(Expired(job_id, why))
         return gone
 
-    def files(self, job: parts.JobRecord) -> list[str]:
-        """See `Jobs`."""
+    def files(self, job: JobRecord) -> list[str]:
+        """Return the names of the result files."""
         return self._results.files(job.folder) if job.state == JobState.DONE else []
 
     def file(self, job_id: str, name: str) -> Path:
-        """See `Jobs`.
+        """Return the path of a result file.
 
         Raises:
             NotFound: if there is no such result file.

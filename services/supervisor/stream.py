@@ -128,7 +128,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """Implementation of `services.api.parts.StreamState`."""
+    """Configuration and current state of a stream.
+
+    `state`: stopped, starting, live, stale, frozen, source lost or failed. `processes`: state, pid,
+    restarts and figures of the capture and engine process.
+    """
 
     name: str
     source: str
@@ -199,7 +203,7 @@ def _withheld(engine: ProcessState) -> str | None:
 
 
 class SupervisedStreams:
-    """Implementation of `services.api.parts.Streams`; `running` is entered with the server."""
+    """Streams and their processes. `running` is entered with the server."""
 
     def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None], most: int = 16) -> None:
         """Create the manager without streams.
@@ -253,11 +257,11 @@ class SupervisedStreams:
         return [stream for stream in self._streams.values() if stream.supervisor is not None]
 
     async def all(self) -> Sequence[StreamFacts]:
-        """See `Streams`."""
+        """Return every stream."""
         return self.now()
 
     async def get(self, name: str) -> StreamFacts:
-        """See `Streams`.
+        """Return one stream.
 
         Raises:
             Missing: if the stream does not exist.
@@ -265,7 +269,7 @@ class SupervisedStreams:
         return self._stream(name).facts()
 
     async def create(self, stream: NewStream) -> StreamFacts:
-        """See `Streams`.
+        """Create a stream. It is stopped.
 
         Raises:
             Conflicting: if the name is taken or the limit is reached.
@@ -279,7 +283,7 @@ class SupervisedStreams:
         return made.facts()
 
     async def start(self, name: str) -> StreamFacts:
-        """See `Streams`.
+        """Start a stream. No effect on a running stream.
 
         Raises:
             Missing: if the stream does not exist.
@@ -294,7 +298,7 @@ class SupervisedStreams:
         return stream.facts()
 
     async def stop(self, name: str) -> StreamFacts:
-        """See `Streams`.
+        """Stop a stream, including its raw picture.
 
         Raises:
             Missing: if the stream does not exist.
@@ -304,7 +308,7 @@ class SupervisedStreams:
         return stream.facts()
 
     async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamFacts:
-        """See `Streams`. A running stream is restarted with the new options.
+        """Change options; unnamed options keep their values. A running stream is restarted with the new options.
 
         Raises:
             Missing: if the stream does not exist.
@@ -319,7 +323,7 @@ class SupervisedStreams:
         return await self.start(name) if runs else stream.facts()
 
     async def delete(self, name: str) -> None:
-        """See `Streams`.
+        """Stop and delete a stream.
 
         Raises:
             Missing: if the stream does not exist.
@@ -328,7 +332,7 @@ class SupervisedStreams:
         self._streams.pop(name, None)
 
     async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
-        """See `Streams`.
+        """Set the stream's virtual camera and return its resulting position.
 
         Raises:
             Missing: if the stream does not exist.
@@ -388,7 +392,7 @@ class SupervisedStreams:
 
 
 class StreamDisplays:
-    """Implementation of `services.api.parts.Display`."""
+    """Pictures of streams for viewers. Slow viewers skip pictures and get the newest."""
 
     def __init__(self, streams: SupervisedStreams) -> None:
         self._streams = streams
@@ -397,7 +401,12 @@ class StreamDisplays:
     async def subscribe(
         self, stream: str, kind: PictureKind, quality: int
     ) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
-        """See `Display`.
+        """Subscribe to the pictures of a stream. The iterator ends when the stream is deleted.
+
+        Args:
+            stream: name of the stream.
+            kind: picture to receive.
+            quality: JPEG quality.
 
         Raises:
             Conflicting: if the stream does not run.
