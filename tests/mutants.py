@@ -34,7 +34,15 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("operators", "services", "gsplat_core/training", "gsplat_core/geometry", "gsplat_core/endoscope")
+FOLDERS = (
+    "operators",
+    "services",
+    "gsplat_core/training",
+    "gsplat_core/geometry",
+    "gsplat_core/depth",
+    "gsplat_core/poses",
+    "gsplat_core/endoscope",
+)
 PACKAGES = ("gsplat_core", "operators", "services")
 MOST_TEST_FILES = 24
 """Maximum number of test files in addition to those that import the module itself."""
