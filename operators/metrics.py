@@ -83,7 +83,9 @@ class NextFrameScores:
         self._predicted, self._previous = ScoredMean(), ScoredMean()
 
     def add(self, predicted_db: float, previous_db: float) -> None:
-        """Add the PSNR values of one frame, in dB. Ignored if either is not finite."""
+        """Add the PSNR of one frame's prediction and of the previous frame shown in its place, in dB. Ignored if
+        either is not finite.
+        """
         if math.isfinite(predicted_db) and math.isfinite(previous_db):
             self._predicted.add(predicted_db)
             self._previous.add(previous_db)

@@ -397,7 +397,9 @@ class LiveReconstructOp(Operator):
         self.newest = None
 
     def _take_depth(self) -> None:
-        """Pass depth estimated in the meantime to the model, for a frame trained on earlier."""
+        """Pass depth maps that the background thread has finished to the model. They belong to frames that were
+        trained on without depth.
+        """
         assert self._reconstructor is not None
         taken = self._late_depths.give(self._reconstructor, self.clock.now_ns)
         if taken is not None:

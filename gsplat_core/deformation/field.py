@@ -594,7 +594,7 @@ Field = TypeVar("Field", bound=DeformationField)
 
 @dataclass(frozen=True)
 class NewField:
-    """Request of the reconstruction for a new field."""
+    """Size and time window of the deformation field that the reconstructor creates."""
 
     gaussians: Gaussians
     """Canonical Gaussians on the training device."""

@@ -48,8 +48,7 @@ class Affine(NamedTuple):
     factor: float
     summand: float
     alike: float
-    """Weighted correlation of the two aligned sides, -1 to 1; negative exactly when the factor is
-    negative.
+    """Weighted correlation of network output and reference depth, -1 to 1. It has the sign of the fitted scale.
     """
 
     def of(self, values: Plane) -> Plane:

@@ -134,7 +134,7 @@ RATE_HZ = 12.5
 KEY_EVERY_S = 1.2
 SHORTEST_S = 1.0
 LEAST_CYCLES = 1.0
-"""Fewest breathing cycles in a window; with less, the motion may be the scope's."""
+"""Minimum number of breathing cycles in a window. With fewer, the motion may be the scope's."""
 FEWEST_POINTS = 100
 MOST_ERROR = 0.04
 """Relative error of a distance at which its confidence is one half."""

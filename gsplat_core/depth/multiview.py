@@ -388,8 +388,8 @@ SMALLEST_PATCH = 0.0014
 matches.
 """
 MOST_OWN_MOTION = 0.06
-"""Tissue motion relative to parallax at which the confidence is 0; it decreases from half this
-value.
+"""Tissue motion as a share of the parallax from which on depth has confidence 0. The confidence is 1 up to half
+this share and decreases linearly between the two.
 """
 DEFORMS = "the tissue moves too much relative to the scope for depth by parallax"
 """Reason given if no pixel has confident depth."""

@@ -159,7 +159,8 @@ def appearance(places: Places, coefficients: Array, slopes: float = 1.0) -> Appe
     towards = 1 + x * u_x + y * u_y
     squared = u_x**2 + u_y**2 + towards**2
     cosine = np.exp(axis) / np.sqrt(squared)
-    # Derivative of log cos θ.
+    # Derivative of log cos θ with respect to the relief's coefficients; θ is the angle between surface normal and
+    # light.
     turned = ((u_x + towards * x) / squared)[:, None] * places.by_x + ((u_y + towards * y) / squared)[
         :, None
     ] * places.by_y

@@ -120,7 +120,7 @@ class FieldOfView:
         return self.mask
 
     def _shows_more(self, grey: NDArray[np.uint8]) -> bool:
-        """Return True if a reduced picture [H, W] is lit outside the accepted field."""
+        """Return True if a downscaled grey picture [H, W] is lit outside the field of view found so far."""
         outside = grey[~self._reduced]
         lit = outside > self.settings.darkest_level + self.settings.surround_range
         return bool(lit.size and lit.mean() > self.settings.lit_outside)

@@ -20,7 +20,7 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 LONG_SIDE_PX = 800
 """Longest side in pixels above which pictures are subsampled."""
 SMALLEST_PX = 64
-"""Shortest side of a picture that is examined, in pixels."""
+"""Minimum height and width in pixels; smaller pictures are not examined."""
 
 
 @dataclass(frozen=True)

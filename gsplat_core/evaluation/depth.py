@@ -260,7 +260,7 @@ class NormalErrors:
     mean_deg: float
     median_deg: float
     plane_mean_deg: float
-    """Error of the normal of each frame's best-fit plane (`best_plane`), which is fitted to the truth."""
+    """Baseline: mean angular error of a flat plane that is fitted to the true depth of each frame (`best_plane`)."""
     level_mean_deg: float
     """Error of the normal of a level plane: along the optical axis, towards the camera."""
     frames: int

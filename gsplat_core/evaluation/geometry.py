@@ -144,7 +144,9 @@ class Geometry:
     views: tuple[NovelView, ...]
     """Scores rendered at the model's own scale, without scale alignment."""
     scaled_views: tuple[NovelView, ...]
-    """Scores after scaling the model by the sequence's depth factor."""
+    """Scores after multiplying the model's lengths by one factor for the sequence, the median of true over
+    rendered depth.
+    """
     tracking: Tracking | None
     flow: FlowErrors | None
     trajectory: TrajectoryErrors | None

@@ -11,7 +11,6 @@ from gsplat_core.argument_checks import require_shape
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.scene.model import Model
 
 
 def share_of(gaussians: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
@@ -30,21 +29,3 @@ def share_of(gaussians: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
     with torch.no_grad():
         seen = render(replace(gaussians, sh=colours[:, None, None].expand(-1, 1, 3).contiguous()), camera, depth=False)
     return torch.where(seen.alpha > 0, seen.image[..., 0] / seen.alpha.clamp(min=1e-6), 0).clamp(0, 1)
-
-
-def remembered_share(model: Model, camera: Camera, time_s: float) -> Tensor:
-    """Return each pixel's share of Gaussians that the scope did not see at the last visibility
-    update.
-
-    Args:
-        model: model with `unseen_s`.
-        camera: any camera.
-        time_s: time in seconds.
-
-    Returns:
-        [H, W] in 0..1; 0 everywhere if the model has no visibility data.
-    """
-    gaussians = model.at(time_s)
-    if model.unseen_s is None:
-        return gaussians.means.new_zeros(camera.height_px, camera.width_px)
-    return share_of(gaussians, model.unseen_s > 0, camera)

@@ -55,7 +55,7 @@ class SharesSettings:
     pull: float
     """Strength with which a cell's shares are pulled to those of the whole picture."""
     ridge: float
-    """Strength with which shares of the whole picture are pulled to the initial ones."""
+    """Ridge weight that pulls each forecast's share of the whole picture to its initial share."""
 
 
 class LocalShares:

@@ -93,7 +93,7 @@ class FitSettings:
     """
 
     final_rate: float = 0.02
-    """Final learning rates as a share of the initial ones; they decay along half a cosine."""
+    """Ratio of the final to the initial learning rates, which decay by a half-cosine."""
     smoothing: float = 1.5
     """Strength of temporal smoothing: share of the way to the mean of the temporal neighbours per
     pass over all frames, scaled by the learning rates' factor. It suppresses noise of single frames

@@ -200,8 +200,8 @@ class PreparedPicture(NamedTuple):
 
 
 class BothEyes:
-    """Observations of one stream: the left eye's picture and, if requested and calibrated, the
-    right one's.
+    """Converter of a stream's frames to training observations: one of the left eye and, if requested and
+    calibrated, one of the right eye.
     """
 
     def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:

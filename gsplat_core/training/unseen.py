@@ -113,7 +113,7 @@ class Archive:
         return 0 if self._kept is None else self._kept.count
 
     def put(self, gaussians: Gaussians) -> None:
-        """Copy Gaussians to the archive."""
+        """Copy Gaussians to the archive, from which they return when the camera sees their tissue again."""
         added = gaussians.map(lambda tensor: tensor.detach().to("cpu"))
         kept = added if self._kept is None else self._kept.append(added)
         self.forgotten += max(0, kept.count - self._capacity)

@@ -299,7 +299,7 @@ class SessionRecorder:
         self._changed.notify_all()
 
     def _run(self, writer: SessionWriter) -> None:
-        """Main function of the thread."""
+        """Write queued frames until the recorder is closed; runs in the background thread."""
         step_back()
         try:
             with storage_errors(self.folder):

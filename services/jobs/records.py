@@ -30,7 +30,7 @@ OPEN = (JobState.QUEUED, JobState.RUNNING)
 
 @dataclass(frozen=True)
 class JobRecord:
-    """Replay job."""
+    """Record of a job that replays an uploaded recording with chosen options."""
 
     id: str
     number: int

@@ -89,7 +89,7 @@ class AgeFacts(Part):
 class OnScreenFacts(Part):
     score: ScoreFacts
     settled: ScoreFacts
-    """Scores without the first second."""
+    """Scores without the first second of the run, in which the model is still being initialised."""
     age_when_shown: AgeFacts | None
     age_on_screen: AgeFacts | None
     in_time: Count
@@ -139,8 +139,7 @@ class NormalFacts(Part):
 
 
 class ViewFacts(Part):
-    """View from a position without training, over tissue pixels that training saw from its own
-    camera."""
+    """Scores of a camera that training did not use, over the tissue pixels that the training camera saw."""
 
     name: str
     model: ScoreFacts

@@ -81,7 +81,7 @@ class Submitted(BaseModel):
 
 
 class ReplayView(BaseModel):
-    """Replay job. `state`: queued, running, done, failed or cancelled; `reason` explains it."""
+    """Record of a job that replays an uploaded recording with chosen options. `state`: queued, running, done, failed or cancelled; `reason` explains it."""
 
     model_config = ConfigDict(from_attributes=True)
     id: str = Field(examples=["1f0c9a3b5d7e8f20"])

@@ -34,7 +34,9 @@ class TrainingState(NamedTuple):
     skipped.
     """
     lines: Tensor
-    """Time planes interpolated at the time, [U, C] each, concatenated."""
+    """Features of the time planes at the step's timestamp, interpolated along time: lines [U, C] with U samples in
+    space and C channels, concatenated.
+    """
     features: Tensor
     """[N, levels * C]."""
     hidden: Tensor

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry.photometric_pose import refine_pose
 from gsplat_core.poses import bundle, moving_bundle
 from gsplat_core.poses.breathing import _bundle, is_told, refined, waves
 from gsplat_core.poses.moving_bundle import SurfaceField, learned_from
-from gsplat_core.rendering.rasterization import render
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import Gaussians
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
 from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
 from tests.gsplat_core.geometry.test_bundle import disturbed, first_only, known_scene
@@ -93,22 +89,3 @@ def test_the_trajectory_before_breathing_tissue(breathing, monkeypatch):
         return end.poses, end.rest, end.amplitudes, numbers, np.array(hz), prior.precision
 
     check(found)
-
-
-def test_a_pose_that_is_refined_by_a_picture():
-    camera = Camera.from_focal(180.0, 256, 192)
-    random = torch.Generator().manual_seed(2)
-    count = 150
-    means = torch.rand(count, 3, generator=random) * torch.tensor([80.0, 60.0, 6.0]) + torch.tensor([-40.0, -30, 57])
-    scene = Gaussians(
-        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 3), 1.3),
-        torch.full((count,), 3.0), torch.randn(count, 1, 3, generator=random),
-    )  # fmt: skip
-    picture = (render(scene, camera).image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    moved = camera.with_pose(np.array([[1, 0, 0, 0.4], [0, 1, 0, -0.3], [0, 0, 1, 0.2], [0, 0, 0, 1.0]]))
-
-    def refined_pose():
-        found = refine_pose(scene, moved, picture, rounds=2)
-        return found.camera.world_to_camera, found.before, found.after
-
-    check(refined_pose)

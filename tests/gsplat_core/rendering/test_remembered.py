@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference
-from gsplat_core.rendering.remembered import remembered_share, share_of
+from gsplat_core.rendering.remembered import share_of
 from gsplat_core.scene.model import Model
 
 CAMERA = Camera.from_focal(40.0, 37, 29)
@@ -66,10 +66,8 @@ def test_remembered_tissue_counts_where_it_is_shown_and_not_behind_what_is_seen(
     scene = near.append(far)
     unseen_s = torch.cat([torch.zeros(near.count), torch.full((far.count,), 3.0)]).double()
     model = Model(1, scene, None, CAMERA, (0.0, 1.0), unseen_s=unseen_s)
-    share = remembered_share(model, CAMERA, 0.0)
+    share = share_of(model.at(0.0), model.unseen_s > 0, CAMERA)
     assert share[:, :12].max() < 0.1 and share[:, -12:].min() > 0.99
-    unknown = remembered_share(dataclasses.replace(model, unseen_s=None), CAMERA, 0.0)
-    assert unknown.shape == share.shape and not unknown.any()
 
 
 def test_a_model_says_how_long_as_many_gaussians_were_not_seen_as_it_has():

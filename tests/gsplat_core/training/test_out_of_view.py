@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.rendering.remembered import remembered_share
+from gsplat_core.rendering.remembered import share_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
@@ -169,7 +169,8 @@ def test_a_published_model_knows_what_was_not_seen(device):
 
     def share(frame):
         model = made.publish().as_model()
-        return remembered_share(model, CAMERA.with_pose(frame.pose), model.time_window_s[1])
+        gaussians = model.at(model.time_window_s[1])
+        return share_of(gaussians, model.unseen_s > 0, CAMERA.with_pose(frame.pose))
 
     watch(made, [frame_at(k, 0) for k in range(9)])
     first = made.publish().as_model()
