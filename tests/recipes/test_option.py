@@ -19,11 +19,14 @@ DECLARATION = (
     '    example: Annotated[int, Option("Example of an option", unit="frames", ge=0, le=9)] = 0\n',
 )
 USE = ("gsplat_core/training/config.py", "    gaussians: int = 30_000\n", "    example: int = 0\n")
+# An editable installation finds its packages before the path does; here the path comes first.
 PROGRAM = """
 import json, sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 
-import services.cli.runs
+sys.meta_path.sort(key=lambda finder: finder is not PathFinder)
+
 import services.cli.runs
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
 from services.cli.app import run
