@@ -7,7 +7,7 @@
 A mutant is a module with one changed expression: a comparison reversed or shifted at its boundary,
 an arithmetic operator or number replaced, `and` swapped with `or`, `min` with `max`, a condition
 negated, or a call removed. Tests run with the mutant in place of the module, in all processes that
-they start. No file of the checkout is changed. Test files named after the module run first, then
+they start. Each run is a fork of one process that has imported the large libraries. No file of the checkout is changed. Test files named after the module run first, then
 those that import it, then those that import it indirectly. A run ends at the first failure. A test
 that also fails without the mutant is flaky: it is listed and excluded, and the remaining tests
 decide. A mutant survives if all of them pass. Mutants are drawn at random with a seed, in equal
@@ -19,19 +19,25 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import importlib
 import json
+import multiprocessing
 import os
 import random
-import subprocess
+import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = (
@@ -69,11 +75,20 @@ EXCHANGED = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": 
 UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_progress"}
 """Calls with no effect except a log line, which are not mutated."""
 
+LIBRARIES = ("torch", "numpy", "cv2", "pydantic", "fastapi", "uvicorn", "zmq", "httpx", "typer", "onnx")
+"""Libraries that take long to import. None of them imports the project or is a plugin of pytest,
+which must be imported by pytest itself.
+"""
+SINGLE = ("PYTHONDONTWRITEBYTECODE", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""Environment variables that are 1 for all tests: no bytecode of a mutant is kept, and two runs share two cores."""
+NO_RESULT = 70
+"""Exit code of a fork in which pytest itself raised an exception."""
+
 HOOK = """
-import importlib.abc, importlib.util, os, sys
+import importlib.abc, importlib.machinery, importlib.util, os, sys
 
 class Mutant(importlib.abc.MetaPathFinder):
-    name, path, origin = os.environ["INTRASPLAT_MUTANT"].split("|")
+    name, path, origin = {replaced}
 
     def find_spec(self, fullname, path, target=None):
         if fullname != self.name:
@@ -240,41 +255,84 @@ def failed_test(output: str) -> str | None:
     return None
 
 
+def import_libraries() -> None:
+    """Import the large libraries once. Every run of pytest is a fork of this process and does not import them again."""
+    for name in LIBRARIES:
+        with suppress(ImportError):
+            importlib.import_module(name)
+    loaded = [name for name in sys.modules if name.split(".")[0] in PACKAGES]
+    if loaded:
+        sys.exit(f"the libraries imported {loaded[0]}: a mutant of it would not be loaded")
+
+
+def run_pytest(arguments: list[str], folder: Path, hooked: bool) -> tuple[int | None, str]:
+    """Run pytest in a fork of this process.
+
+    Args:
+        arguments: options and test files.
+        folder: folder with `sitecustomize.py` and the changed module; receives the output.
+        hooked: whether the mutant replaces its module, here and in the processes that tests start.
+
+    Returns:
+        The exit code, negative where a signal ended pytest, None after `LIMIT_S`; and the output.
+    """
+    output = folder / "output.txt"
+    child = os.fork()
+    if child == 0:
+        code = NO_RESULT
+        try:
+            os.setsid()
+            file = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            os.dup2(file, 1)
+            os.dup2(file, 2)
+            if hooked:
+                os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+                exec(compile((folder / "sitecustomize.py").read_text(encoding="utf-8"), "sitecustomize.py", "exec"), {})
+            code = int(pytest.main(arguments))
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            os._exit(code)
+    deadline = time.monotonic() + LIMIT_S
+    status = None
+    while status is None and time.monotonic() < deadline:
+        ended, waited = os.waitpid(child, os.WNOHANG)
+        status = waited if ended else None
+        if status is None:
+            time.sleep(0.02)
+    with suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)  # processes that its tests started and left running
+    if status is None:
+        os.waitpid(child, 0)
+    text = output.read_text(encoding="utf-8", errors="replace") if output.exists() else ""
+    return None if status is None else os.waitstatus_to_exitcode(status), text
+
+
 def outcome_of(mutant: Mutant, folder: Path) -> Outcome:
     """Run the tests of a mutant, nearest files first, up to the first failure that the mutant causes."""
     files = tests_for(mutant.path)
-    (folder / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
     source = folder / "mutant.py"
     source.write_text(mutant.source, encoding="utf-8")
-    env = os.environ | {
-        "INTRASPLAT_MUTANT": f"{module_name(mutant.path)}|{source}|{ROOT / mutant.path}",
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")])),
-        "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
-    }  # fmt: skip
-    pytest = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
+    replaced = (module_name(mutant.path), str(source), str(ROOT / mutant.path))
+    (folder / "sitecustomize.py").write_text(HOOK.format(replaced=replaced), encoding="utf-8")
+    options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
     flaky: list[str] = []
     for group in filter(None, (files[:PRECHECK_FILES], files[PRECHECK_FILES:])):
         while True:
-            command = [*pytest, *(f"--deselect={each}" for each in flaky), *group]
-            try:
-                done = subprocess.run(
-                    command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False
-                )
-            except subprocess.TimeoutExpired:
+            arguments = [*options, *(f"--deselect={each}" for each in flaky), *group]
+            code, output = run_pytest(arguments, folder, hooked=True)
+            if code is None:
                 return Outcome("time", tuple(flaky))
-            if done.returncode in (0, NO_TESTS):
+            if code in (0, NO_TESTS):
                 break
-            test = failed_test(done.stdout)
-            if (
-                test is None
-                and subprocess.run([*command, "--collect-only"], cwd=ROOT, capture_output=True).returncode == 0
-            ):
+            test = failed_test(output)
+            if test is None and run_pytest([*arguments, "--collect-only"], folder, hooked=False)[0] == 0:
                 return Outcome("pytest itself", tuple(flaky))
             if test is None or test in flaky:
-                text = f"{done.stdout[-2000:]}{done.stderr[-2000:]}"
-                sys.exit(f"pytest ended with {done.returncode} and names no new failed test:\n{text}")
-            alone = subprocess.run([*pytest, test], cwd=ROOT, capture_output=True, check=False)
-            if alone.returncode == 0:
+                sys.exit(f"pytest ended with {code} and names no new failed test:\n{output[-4000:]}")
+            if run_pytest([*options, test], folder, hooked=False)[0] == 0:
                 return Outcome(test, tuple(flaky))
             flaky.append(test)
     return Outcome(None, tuple(flaky))
@@ -303,6 +361,14 @@ def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant
     return chosen
 
 
+def timed_outcome(run: tuple[Mutant, Path]) -> tuple[Mutant, Outcome, float]:
+    """Return a mutant with its outcome and the seconds that took; the folder is created."""
+    mutant, folder = run
+    folder.mkdir()
+    start = time.perf_counter()
+    return mutant, outcome_of(mutant, folder), time.perf_counter() - start
+
+
 def survivors_of(log: Path) -> list[Mutant]:
     """Return the survivors of an earlier run whose expressions still exist."""
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
@@ -325,6 +391,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.jsonl")
     parser.add_argument("--least", type=float, default=0.85, help="exit code 1 where a smaller share is killed")
     options = parser.parse_args()
+    os.environ.update({name: "1" for name in SINGLE})
+    sys.dont_write_bytecode = True
     chosen = (
         survivors_of(options.survivors)
         if options.survivors
@@ -333,16 +401,10 @@ def main() -> int:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     killed, flaky = 0, set[str]()
     with tempfile.TemporaryDirectory() as folder, options.out.open("w", encoding="utf-8") as log:
-
-        def run(numbered: tuple[int, Mutant]) -> tuple[Mutant, Outcome, float]:
-            number, mutant = numbered
-            place = Path(folder) / str(number)
-            place.mkdir()
-            start = time.perf_counter()
-            return mutant, outcome_of(mutant, place), time.perf_counter() - start
-
-        with ThreadPoolExecutor(options.jobs) as pool:
-            for mutant, outcome, seconds in pool.map(run, enumerate(chosen)):
+        import_libraries()
+        runs = [(mutant, Path(folder) / str(number)) for number, mutant in enumerate(chosen)]
+        with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork")) as pool:
+            for mutant, outcome, seconds in pool.map(timed_outcome, runs):
                 by = outcome.killed_by
                 killed += by is not None
                 flaky.update(outcome.flaky)
