@@ -76,9 +76,7 @@ UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_
 """Calls with no effect except a log line, which are not mutated."""
 
 LIBRARIES = ("torch", "numpy", "cv2", "pydantic", "fastapi", "uvicorn", "zmq", "httpx", "typer", "onnx")
-"""Libraries that take long to import. None of them imports the project or is a plugin of pytest,
-which must be imported by pytest itself.
-"""
+"""Libraries that take long to import. None of them imports the project."""
 SINGLE = ("PYTHONDONTWRITEBYTECODE", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Environment variables that are 1 for all tests: no bytecode of a mutant is kept, and two runs share two cores."""
 NO_RESULT = 70
@@ -290,9 +288,9 @@ def run_pytest(arguments: list[str], folder: Path, hooked: bool) -> tuple[int | 
                 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
                 exec(compile((folder / "sitecustomize.py").read_text(encoding="utf-8"), "sitecustomize.py", "exec"), {})
             code = int(pytest.main(arguments))
-        except BaseException:
-            traceback.print_exc()
         finally:
+            if sys.exc_info()[0] is not None:
+                traceback.print_exc()
             sys.stdout.flush()
             os._exit(code)
     deadline = time.monotonic() + LIMIT_S
@@ -318,6 +316,7 @@ def outcome_of(mutant: Mutant, folder: Path) -> Outcome:
     replaced = (module_name(mutant.path), str(source), str(ROOT / mutant.path))
     (folder / "sitecustomize.py").write_text(HOOK.format(replaced=replaced), encoding="utf-8")
     options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # plugins that the libraries imported before pytest
     flaky: list[str] = []
     for group in filter(None, (files[:PRECHECK_FILES], files[PRECHECK_FILES:])):
         while True:
