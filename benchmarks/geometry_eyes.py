@@ -43,12 +43,12 @@ from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
 from operators.applications.warm_reconstructor import warm_reconstructor
 
-Asked = argparse.Namespace
+Arguments = argparse.Namespace
 PLANE_MM = 60.0
 SHOW_AFTER, SHOW_AFTER_S = 0.6, 0.017
 
 
-def frames_of(asked: Asked) -> tuple[list[Frame], Camera]:
+def frames_of(asked: Arguments) -> tuple[list[Frame], Camera]:
     """Return all frames with both eyes and with the requested depth."""
     recording = open_recording(asked.recording, scale=asked.scale)
     camera = recording.camera
@@ -120,7 +120,7 @@ class Scores:
         }
 
 
-def live(asked: Asked, eyes: str, camera: Camera) -> LiveReconstructor:
+def live(asked: Arguments, eyes: str, camera: Camera) -> LiveReconstructor:
     """Return a reconstructor configured as in the live application."""
     settings = LiveSettings(source="", out=Path(), device=asked.device, eyes=eyes)  # type: ignore[arg-type]
     config = replace(settings.reconstructor_config(camera.width_px * camera.height_px), **asked.set)
@@ -152,7 +152,7 @@ def by_clock(learning: LiveReconstructor, frame: Frame, fps: float, first: bool,
         learning.rehearse(3)
 
 
-def online(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps: int | None) -> dict[str, Any]:
+def online(asked: Arguments, eyes: str, frames: list[Frame], camera: Camera, steps: int | None) -> dict[str, Any]:
     """Train and score one run frame by frame."""
     learning, scores, made = live(asked, eyes, camera), Scores(camera, asked.left_out), list[int]()
     for frame in frames:
@@ -168,7 +168,7 @@ def online(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps: 
     return line | ({"steps": steps} if steps is not None else {"steps_mean": round(float(np.mean(made)), 1)})
 
 
-def offline(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps: int) -> dict[str, Any]:
+def offline(asked: Arguments, eyes: str, frames: list[Frame], camera: Camera, steps: int) -> dict[str, Any]:
     """Train and score one run on all frames."""
     settings = ReplaySettings(recording="", out=Path(), device=asked.device, eyes=eyes)  # type: ignore[arg-type]
     config = replace(settings.reconstructor_config(camera.width_px * camera.height_px, offline=True), **asked.set)
@@ -180,7 +180,7 @@ def offline(asked: Asked, eyes: str, frames: list[Frame], camera: Camera, steps:
     return {"eyes": eyes, "fit_steps": steps, "gaussians": learning.gaussians, **scores.line(frames)}
 
 
-def arguments() -> Asked:
+def arguments() -> Arguments:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)

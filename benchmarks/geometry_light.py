@@ -23,7 +23,7 @@ from gsplat_core.depth.light import LightDepth, frames_with_light
 from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path)
     asked = parser.parse_args()
     for seed in range(SEEDS):
-        made = render_recording(Asked(frames=12, fps=3, seed=seed))
+        made = render_recording(RenderSettings(frames=12, fps=3, seed=seed))
         print(json.dumps(measure(f"synthetic_{seed}", list(made), made.camera, asked.pictures)), flush=True)
     for name in ("colon", "cutting", "sinus", "heart/left.mp4"):
         recording = open_recording(asked.recordings / name)

@@ -23,10 +23,10 @@ from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.depth.moving_tissue import MovingTissue
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 
 
-def measured(asked: Asked) -> dict[str, Any]:
+def measured(asked: RenderSettings) -> dict[str, Any]:
     """Return the figures of one recording."""
     recording = render_recording(asked)
     frames = [frame.with_fields(depth=None, depth_origin=None) for frame in recording]
@@ -106,7 +106,7 @@ def main() -> None:
     add_breathing_options(parser)
     asked = parser.parse_args()
     for seed in asked.seeds:
-        wanted = Asked(
+        wanted = RenderSettings(
             asked.frames, asked.width, asked.height, fps=asked.fps, seed=seed, camera="moving",
             extras=asked_breathing(asked),
         )  # fmt: skip

@@ -30,7 +30,7 @@ from run_facts import run_facts
 from gsplat_core.depth.moving_tissue import MovingTissue
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses.focal_length import trajectory_without_calibration, with_focal_length
@@ -137,7 +137,7 @@ def depth_of(frames: Sequence[Frame], camera: Camera, found: Trajectory) -> dict
     }
 
 
-def synthetic(asked: Asked, rigid: bool, way: str = "sway") -> Any:
+def synthetic(asked: RenderSettings, rigid: bool, way: str = "sway") -> Any:
     """A rendered recording with a moving scope."""
     moving, still, swaying = Tissue.points, Tug((0.0, 0.0), (0.0,) * 3), SyntheticScene._left_at
     if rigid:
@@ -182,7 +182,9 @@ def main() -> None:
         show(recording.name, list(recording), recording.camera, arguments)
     for seed in arguments.seeds if arguments.synthetic else []:
         extras = asked_breathing(arguments)
-        asked = Asked(arguments.synthetic, 320, 256, fps=arguments.fps, seed=seed, camera="moving", extras=extras)
+        asked = RenderSettings(
+            arguments.synthetic, 320, 256, fps=arguments.fps, seed=seed, camera="moving", extras=extras
+        )
         rendered = synthetic(asked, arguments.rigid, arguments.way)
         name = f"synthetic {seed}, {arguments.way}{', rigid' * arguments.rigid}"
         show(name, list(rendered), rendered.camera, arguments, breathing_facts(extras))

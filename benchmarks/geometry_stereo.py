@@ -23,7 +23,7 @@ import torch
 from gsplat_core.depth.maps import BELIEVED, DepthMap
 from gsplat_core.depth.stereo import StereoDepth, grey
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
@@ -128,7 +128,7 @@ def psnr_of_line(shown: np.ndarray, true: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / np.mean(errors)))
 
 
-def synthetic(asked: Asked) -> dict[str, Any]:
+def synthetic(asked: RenderSettings) -> dict[str, Any]:
     """Root mean square error of believed depth on tissue, as a share of the median depth, over all frames."""
     recording = render_recording(asked)
     squares, shares, costs, everywhere = [], [], [], []
@@ -169,9 +169,9 @@ def main() -> None:
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     given = arguments.recordings
-    small = Asked(frames=6, stereo=True)
-    usual = Asked(frames=4, width_px=640, height_px=512, stereo=True, camera="moving", seed=1)
-    large = Asked(frames=3, width_px=1280, height_px=1024, stereo=True, seed=2)
+    small = RenderSettings(frames=6, stereo=True)
+    usual = RenderSettings(frames=4, width_px=640, height_px=512, stereo=True, camera="moving", seed=1)
+    large = RenderSettings(frames=3, width_px=1280, height_px=1024, stereo=True, seed=2)
     runs: dict[str, list[tuple[str, Any]]] = {
         "scared_pair": [("scared_pair", lambda: scared_pair(given / "scared_pair"))],
         "scared_raw": [("scared_raw", lambda: rectified(given / "scared_raw"))],

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gsplat_core import Model, Reconstructor, ReconstructorConfig
 from gsplat_core.geometry.surface import normals_of
-from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.frames import Frame
 
 
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--weights", type=float, nargs="+", default=[0.0003, 0.02, 0.1, 0.2])
     arguments = parser.parse_args()
     width, camera = arguments.width, "moving" if arguments.moving else "fixed"
-    asked = Asked(frames=arguments.frames, width_px=width, height_px=width * 4 // 5, camera=camera)  # type: ignore[arg-type]
+    asked = RenderSettings(frames=arguments.frames, width_px=width, height_px=width * 4 // 5, camera=camera)  # type: ignore[arg-type]
     recording = render_recording(asked)
     for weight in arguments.weights:
         print(json.dumps({"camera": camera, "depth_weight": weight, **replayed(recording, weight)}), flush=True)

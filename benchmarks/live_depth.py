@@ -27,7 +27,7 @@ from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.applications.live_settings import LiveSettings
 
-Asked = argparse.Namespace
+Arguments = argparse.Namespace
 
 
 class DepthErrors:
@@ -57,7 +57,7 @@ class DepthErrors:
         return dict(zip(("error_pct", "error_last_third_pct"), (round(100 * value, 2) for value in pair), strict=False))
 
 
-def run(asked: Asked, recording: FileRecording, points: SparsePoints | None, late: int | None) -> dict[str, Any]:
+def run(asked: Arguments, recording: FileRecording, points: SparsePoints | None, late: int | None) -> dict[str, Any]:
     """Measure one run. `late`: delay of the depth in frames, or None for no depth."""
     settings = LiveSettings(source="", out=Path())
     config = settings.reconstructor_config(recording.width_px * recording.height_px)

@@ -151,16 +151,16 @@ class SparseDepthSums:
         known = np.isfinite(rendered) & (rendered > 0)
         if not known.any():
             return None
-        found, told = rendered[known], true[known]
-        scale = float(np.median(told / found))
-        relative = np.abs(scale * found - told) / told
-        plane, level = np.abs(np.concatenate(self._flat, axis=1)[:, known] - told) / told
+        found, expected = rendered[known], true[known]
+        scale = float(np.median(expected / found))
+        relative = np.abs(scale * found - expected) / expected
+        plane, level = np.abs(np.concatenate(self._flat, axis=1)[:, known] - expected) / expected
         has_plane = np.isfinite(plane)
         median = lambda errors: float(np.median(errors[has_plane])) if has_plane.any() else math.nan
         return SparseDepthErrors(
             median=float(np.median(relative)),
             percentile_90=float(np.percentile(relative, 90)),
-            rank_correlation=_rank_correlation(found, told),
+            rank_correlation=_rank_correlation(found, expected),
             scale=scale,
             plane_median=median(plane),
             level_median=median(level),

@@ -12,7 +12,7 @@ torch_index=${TORCH_INDEX_URL-$(sed -n 's/^ARG TORCH_INDEX_URL=//p' "$repository
 
 step() { echo "== $*" >&2; }
 inside() { chroot "$root" /usr/bin/env -i PATH=/opt/intrasplat/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root PIP_NO_CACHE_DIR=1 "${settings[@]}" "$@"; }
-# How this machine reaches package registries, where it needs to be told.
+# Settings with which this machine reaches package registries, if it needs any.
 settings=()
 for name in http_proxy https_proxy no_proxy PIP_CERT PIP_DEFAULT_TIMEOUT; do [ -z "${!name:-}" ] || settings+=("$name=${!name}"); done
 

@@ -35,7 +35,7 @@ class Registry(Generic[Kind]):
             InvalidInput: if the name is taken.
         """
         if name in self._entries:
-            raise InvalidInput(f"there is a {self.what} {name!r} already; choose another name")
+            raise InvalidInput(f"a {self.what} named {name!r} already exists; choose another name")
         self._entries[name] = kind
 
     def remove(self, name: str) -> None:

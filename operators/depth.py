@@ -1,6 +1,6 @@
 """Depth maps of frames: recorded with the stream, estimated from the frames, or absent.
 
-During a live stream, `DepthBesideOp` estimates depth in a background thread, and the stream never waits for it. Late estimates are passed to the model after
+During a live stream, `BackgroundDepthOp` estimates depth in a background thread, and the stream never waits for it. Late estimates are passed to the model after
 training on their frames.
 """
 
@@ -197,7 +197,7 @@ KEEPS = ("auto", "recorded")
 """Values of the setting `depth` with which a frame keeps its recorded depth."""
 
 
-class DepthBeside:
+class BackgroundDepth:
     """Estimates depth in a background thread of lower priority. `offer` and `take` never block.
 
     The queue holds one pending frame. A newer frame replaces the pending one, which is counted in
@@ -324,7 +324,7 @@ def share_of(cores: int) -> float:
     return SHARE_OF_FEW if cores <= FEW_CORES else 1.0
 
 
-class DepthBesideOp(Operator):
+class BackgroundDepthOp(Operator):
     """Passes frames on with or without their recorded depth, and owns the depth estimation thread.
 
     Frames are passed on immediately. `LiveReconstructOp` offers the frames that it trains on to the
@@ -340,7 +340,7 @@ class DepthBesideOp(Operator):
         beside: the background depth estimator; started and stopped with this operator.
     """
 
-    def __init__(self, fragment: Any, *args: Any, beside: DepthBeside, **kwargs: Any) -> None:
+    def __init__(self, fragment: Any, *args: Any, beside: BackgroundDepth, **kwargs: Any) -> None:
         self.beside = beside
         self._given = DepthCounts()
         super().__init__(fragment, *args, **kwargs)

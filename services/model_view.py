@@ -126,7 +126,7 @@ def _private(library: Any) -> Any:
 
     class PrivateServer(library.ViserServer):
         def request_share_url(self, verbose: bool = True) -> None:
-            log.warning("a browser asked for a public address of the model; there is none")
+            log.warning("a browser requested a public address of the model, which has none")
 
     return PrivateServer
 

@@ -195,7 +195,7 @@ below it poses may get worse.
 
 
 @one_thread()
-def is_told(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
+def separability(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
     """Compare the motion attributed to the tissue with its expected error.
 
     Args:
@@ -335,7 +335,7 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
     if not frequencies_hz or start is None:
         return None
     found, frequencies_hz, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
-    separable, mistaken = is_told(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
+    separable, mistaken = separability(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
     if not separable:
         return None
     poses = _all_placed(sightings, frames, found, start[1], frequencies_hz)

@@ -25,13 +25,13 @@ def check_device(device: str) -> None:
         raise DeviceMissing(f"device {device!r} is not known; use --device {' or '.join(DEVICES)}")
     if not torch.cuda.is_available():
         raise DeviceMissing(
-            f"device cuda was asked for, and torch {torch.__version__} sees no GPU; use --device cpu, "
+            f"device cuda is not available: torch {torch.__version__} finds no GPU; use --device cpu, "
             "or let `intrasplat doctor` say what is missing"
         )
     from gsplat_core.ops.native import CUDA_MISSING
 
     if CUDA_MISSING is not None:
-        raise DeviceMissing(f"device cuda was asked for, and the CUDA kernels are {CUDA_MISSING}; use --device cpu")
+        raise DeviceMissing(f"device cuda is not available: the CUDA kernels are {CUDA_MISSING}; use --device cpu")
 
 
 def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThreadScheduler:

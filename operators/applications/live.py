@@ -54,7 +54,7 @@ from operators.checks import (
     new_stages,
 )
 from operators.choices import Policy
-from operators.depth import DepthBeside, DepthBesideOp
+from operators.depth import BackgroundDepth, BackgroundDepthOp
 from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
@@ -235,11 +235,11 @@ class LiveApplication(Application):
             self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=settings.seconds
         )
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
-        beside = DepthBeside(settings.depth, self.frame_source.description.camera, device=settings.device)
+        beside = BackgroundDepth(settings.depth, self.frame_source.description.camera, device=settings.device)
         camera = self.frame_source.description.camera
         depth = (
             *pose_operators(self, settings.poses, camera, settings.depth),
-            DepthBesideOp(self, name="depth", beside=beside),
+            BackgroundDepthOp(self, name="depth", beside=beside),
         )
         analysis = analysis_operator(
             self, settings.tool_mask, settings.out_of_body, depth, recording.behind_gate(), recording.behind_analysis()

@@ -38,7 +38,7 @@ class Address:
         options = dict(pairs)
         if len(options) < len(pairs):
             twice = next(name for name, _ in pairs if sum(name == other for other, _ in pairs) > 1)
-            raise InvalidSetting(f"{scheme}: the option {twice!r:.60} is there twice; give it once")
+            raise InvalidSetting(f"{scheme}: the option {twice!r:.60} occurs twice; give it once")
         return cls(scheme, place, options)
 
     def text(self, name: str, default: str | None = None) -> str | None:

@@ -122,7 +122,7 @@ class ChildProcess:
         except (EOFError, OSError) as error:
             raise ChildLost(self._how_it_ended()) from error
         except BadHeader as error:
-            raise ChildLost(f"it says what makes no sense: {error}") from error
+            raise ChildLost(f"it sent an invalid message: {error}") from error
         self.heard_s = time.monotonic()
         return received
 
@@ -242,7 +242,7 @@ class ProcessSource(LiveSource):
         if reported is not None and state is reported[0] and reported[1]:
             return reported[1]
         if state is SourceState.STALLED:
-            return f"the process that reads {self.description.name} says nothing"
+            return f"the process that reads {self.description.name} does not respond"
         return super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
@@ -307,7 +307,7 @@ class ProcessSource(LiveSource):
             message = child.hear(LOOK_S)
             if message is None:
                 if time.monotonic() - child.heard_s > self._hung_after_s:
-                    raise ChildLost(f"it has said nothing for {self._hung_after_s:g} s")
+                    raise ChildLost(f"it has sent nothing for {self._hung_after_s:g} s")
                 continue
             if message["kind"] == "frame":
                 last_s = child.heard_s

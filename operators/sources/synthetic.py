@@ -6,7 +6,7 @@ import logging
 from dataclasses import replace
 
 from gsplat_core.io.recordings.synthetic.kept import kept_recording
-from gsplat_core.io.recordings.synthetic.rendered import Asked
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings
 from operators.sources.address_options import SyntheticAddress
 from operators.sources.options import SourceOptions
 from operators.sources.recording import RealtimeSource
@@ -28,7 +28,7 @@ def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
     width, height = (max(32, round(side * options.scale)) for side in (address.width_px, address.height_px))
     per_frame = width * height * (8 if address.eyes == 1 else 11)
     fits = max(1, MOST_BYTES // per_frame)
-    asked = Asked(
+    settings = RenderSettings(
         frames=min(address.frames or DEFAULT_FRAMES, fits),
         width_px=width,
         height_px=height,
@@ -37,7 +37,7 @@ def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
         camera="moving" if address.moving else "fixed",
         stereo=address.eyes == 2,
     )
-    recording = kept_recording(asked, progress=_say)
+    recording = kept_recording(settings, progress=_say)
     return RealtimeSource(recording, replace(options, loop=True, bounce=recording.frame_count > 2, fps=None))
 
 

@@ -168,7 +168,9 @@ def assembled(settings: ServiceSettings) -> Parts:
     """
     measures = StreamMeasures()
     events = SystemEvents()
-    streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), told(measures, events), settings.limits.streams)
+    streams = SupervisedStreams(
+        RuntimeFolder(settings.runtime_dir), event_receiver(measures, events), settings.limits.streams
+    )
     measures.streams = streams
     models = registry_of(settings)
     snapshots = SnapshotStore(settings.data_dir / "snapshots")
@@ -230,7 +232,7 @@ def assembled(settings: ServiceSettings) -> Parts:
     )
 
 
-def told(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEvent], None]:
+def event_receiver(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEvent], None]:
     """Return the receiver of process events, for metrics and audit log.
 
     The audit log records a reason only if the supervisor worded it. Other texts could contain a

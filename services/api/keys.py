@@ -14,17 +14,17 @@ from services.api.problems import Conflicting, Missing
 from services.api.state import ControlState, control_of
 from services.auth.keys import ApiKey, KeyConflict, limits_of
 from services.auth.roles import Role
-from services.schemas.service import KeyView, MadeKey, Myself, NewKey, Ticket, TicketFor
+from services.schemas.service import CallerView, KeyView, MadeKey, NewKey, Ticket, TicketFor
 
 router = new_router("keys")
 
 
 @router.get("/me")
 @requires("viewer", scope="any")
-async def who_am_i(request: Request, caller: CallerOf) -> Myself:
+async def who_am_i(request: Request, caller: CallerOf) -> CallerView:
     """Return name, role and limits of the calling key."""
     key = next((key for key in control_of(request).keys.all() if key.id == caller.key_id), None)
-    return Myself(
+    return CallerView(
         name=caller.name, key_id=caller.key_id, role=caller.role, federated=caller.federated,
         streams=None if caller.streams is None else sorted(caller.streams),
         expires_at=None if key is None else key.expires_at,

@@ -20,7 +20,7 @@ from services.api.problems import Conflicting, Missing, Unavailable, problem_ans
 from services.api.state import control_of, part
 from services.jobs.results import FILES
 from services.schemas.models import VersionView
-from services.schemas.replays import BatchView, Kept, ReplayView, ReplayWanted, Submitted
+from services.schemas.replays import BatchView, ModelTarget, ReplayRequest, ReplayView, Submitted
 
 if TYPE_CHECKING:
     from services.jobs.replays import Replays
@@ -52,7 +52,7 @@ async def start_replays(
     request: Request,
     response: Response,
     caller: CallerOf,
-    wanted: ReplayWanted,
+    wanted: ReplayRequest,
     idempotency_key: str | None = Header(
         None,
         min_length=1,
@@ -168,7 +168,7 @@ async def replay_result(request: Request, caller: CallerOf, job_id: JobId, file:
 @router.post("/replays/{job_id}/keep", status_code=201)
 @requires("operator")
 async def keep_model(
-    request: Request, response: Response, caller: CallerOf, job_id: JobId, wanted: Kept
+    request: Request, response: Response, caller: CallerOf, job_id: JobId, wanted: ModelTarget
 ) -> VersionView:
     """Store a replay's model in the registry as the next version of a model. It is checked like an
     upload."""

@@ -20,7 +20,7 @@ from services.api.state import IdempotencyKey, control_of, part
 from services.api.streams import streams_of
 from services.exports.cache import ALL
 from services.schemas.models import VersionView
-from services.schemas.streams import SnapshotView, SnapshotWanted
+from services.schemas.streams import SnapshotRequest, SnapshotView
 from services.settings import ResourceName
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ async def take_snapshot(
     response: Response,
     caller: CallerOf,
     name: ResourceName,
-    wanted: SnapshotWanted,
+    wanted: SnapshotRequest,
     idempotency_key: IdempotencyKey = None,
 ) -> SnapshotView:
     """Write the live model after the next frame, without delaying pictures. 409 if the stream is

@@ -17,7 +17,7 @@ from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.parts import NewStream
 from services.api.problems import Forbidden, Unprocessable
 from services.api.state import control_of, part
-from services.schemas.streams import StreamOptions, StreamView, StreamWanted, VirtualCamera
+from services.schemas.streams import StreamOptions, StreamRequest, StreamView, VirtualCamera
 from services.settings import ResourceName, SourceRules
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ async def streams(request: Request, caller: CallerOf) -> list[StreamView]:
 
 @router.post("/streams", status_code=201)
 @requires("operator", scope="any")
-async def create_stream(request: Request, caller: CallerOf, wanted: StreamWanted) -> StreamView:
+async def create_stream(request: Request, caller: CallerOf, wanted: StreamRequest) -> StreamView:
     """Create a stream. The settings must allow its source (`sources`)."""
     found = streams_of(request)
     if not caller.may_use(wanted.name):

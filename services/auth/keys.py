@@ -212,7 +212,7 @@ class KeyStore:
             if any(key.role is not role for key in live):
                 raise KeyConflict(f"{name} has a key with the role {live[0].role}; take another name for another role")
             if key_id in keys:
-                raise KeyConflict("there is a key with this number already; make another one")
+                raise KeyConflict("a key with this number already exists; make another one")
             keys[key_id] = ApiKey(
                 key_id, name, role, _digest(secret), _now(),
                 None if expires_at is None else expires_at.astimezone(UTC).isoformat(timespec="seconds"),

@@ -203,17 +203,17 @@ class Durations:
         self._counts[bisect_left(BOUNDS_S, duration_s)] += 1
         self._sum_s += duration_s
 
-    def told(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Return the JSON form: the count of each bucket, the last without an upper bound, and the
         sum."""
         return {"counts": list(self._counts), "sum_s": round(self._sum_s, 6)}
 
 
-def cumulative(told: Any) -> tuple[list[tuple[str, float]], float] | None:
+def cumulative(durations: Any) -> tuple[list[tuple[str, float]], float] | None:
     """Convert the durations of a heartbeat to Prometheus buckets and their sum; None for malformed
     values."""
-    counts = told.get("counts") if isinstance(told, Mapping) else None
-    sum_s = told.get("sum_s") if isinstance(told, Mapping) else None
+    counts = durations.get("counts") if isinstance(durations, Mapping) else None
+    sum_s = durations.get("sum_s") if isinstance(durations, Mapping) else None
     whole = (
         isinstance(counts, list) and len(counts) == len(BOUNDS_S) + 1 and all(type(count) is int for count in counts)
     )

@@ -14,7 +14,7 @@ from services.client.requests import Picture, Requests, pictures, refused_by, wa
 from services.errors import ClientError
 from services.schemas.models import ModelView, VersionView
 from services.schemas.replays import BatchView, RecordingView, ReplayView, Submitted
-from services.schemas.service import AuditPage, KeyView, MadeKey, Myself, Readiness
+from services.schemas.service import AuditPage, CallerView, KeyView, MadeKey, Readiness
 from services.schemas.streams import SnapshotView, StreamView
 
 OPEN = ("queued", "running")
@@ -319,9 +319,9 @@ class Client(ReplayMethods, SnapshotMethods):
         }
         return MadeKey.model_validate(self._ask("POST", "/v1/keys", json=wanted))
 
-    def myself(self) -> Myself:
+    def myself(self) -> CallerView:
         """Return name, role and limits of this client's key."""
-        return Myself.model_validate(self._ask("GET", "/v1/me"))
+        return CallerView.model_validate(self._ask("GET", "/v1/me"))
 
     def ready(self) -> Readiness:
         """Return the checks of /readyz, also if the server is not ready."""

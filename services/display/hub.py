@@ -196,7 +196,7 @@ class DisplayHub:
     def ages(self, kind: Pictures) -> Mapping[str, Any]:
         """Return the distribution of picture ages at encoding, since frame arrival."""
         channel = self._channels.get(kind)
-        return {} if channel is None else channel.ages.told()
+        return {} if channel is None else channel.ages.as_json()
 
     async def close(self) -> None:
         """Disconnect all viewers."""

@@ -119,7 +119,7 @@ class Batch:
             for job in page:
                 if dict(job.options) != self._options:
                     raise InvalidSetting(
-                        f"{self._results.folder} was begun with {_said(job.options)}, and now {_said(self._options)} is asked for;"
+                        f"{self._results.folder} was begun with {_said(job.options)}, and this run has {_said(self._options)};"
                         " give another --out"
                     )
                 if job.state == JobState.DONE and not self._has_result(job.folder):

@@ -47,7 +47,7 @@ class RecordingView(BaseModel):
 MOST_RECORDINGS = 2000
 
 
-class ReplayWanted(BaseModel):
+class ReplayRequest(BaseModel):
     """One recording or a batch of recordings, with replay options."""
 
     model_config = ConfigDict(
@@ -59,7 +59,7 @@ class ReplayWanted(BaseModel):
     options: CallerJobOptions = CallerJobOptions()
 
     @model_validator(mode="after")
-    def _one_or_many(self) -> ReplayWanted:
+    def _one_or_many(self) -> ReplayRequest:
         if (self.recording is None) == (not self.recordings):
             raise ValueError("give `recording` or `recordings`, one of them")
         return self
@@ -123,7 +123,7 @@ class BatchView(BaseModel):
     states: dict[str, int] = Field(examples=[{"queued": 3, "running": 1, "done": 196, "failed": 0, "cancelled": 0}])
 
 
-class Kept(BaseModel):
+class ModelTarget(BaseModel):
     """Target model for a replay's model."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"model": "liver"}]})

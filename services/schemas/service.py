@@ -131,7 +131,7 @@ class MadeKey(KeyView):
     key: str = Field(examples=["intrasplat_1f0c9a3b_…"])
 
 
-class Myself(BaseModel):
+class CallerView(BaseModel):
     """Identity of the caller."""
 
     name: str = Field(examples=["console"])

@@ -26,7 +26,7 @@ class StreamOptions(BaseModel):
     )
 
 
-class StreamWanted(StreamSettings):
+class StreamRequest(StreamSettings):
     """New stream."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -86,7 +86,7 @@ class VirtualCamera(BaseModel):
     zoom: float = Field(1.0, ge=0.25, le=4, description="Magnification.")
 
 
-class SnapshotWanted(BaseModel):
+class SnapshotRequest(BaseModel):
     """Use of a snapshot."""
 
     model_config = ConfigDict(extra="forbid", strict=True)

@@ -141,7 +141,7 @@ def _check_name(key: yaml.Node, seen: dict[str, int]) -> None:
     if "\0" in key.value:
         raise ValueError(f"line {line}: {key.value!r:.60} holds a zero byte")
     if key.value in seen:
-        raise ValueError(f"line {line}: {key.value[:60]!r} is there twice, first in line {seen[key.value]}")
+        raise ValueError(f"line {line}: {key.value[:60]!r} occurs twice, first in line {seen[key.value]}")
     seen[key.value] = line
 
 

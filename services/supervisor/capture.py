@@ -112,7 +112,7 @@ class CapturedSource(LiveSource):
                 if status in found:
                     self._note(status.recv())
                 elif time.monotonic() - self._heard_s > SILENT_S:
-                    self.lost("the capture process says nothing; it is being started again")
+                    self.lost("the capture process does not respond; it is being restarted")
                 if pictures not in found:
                     continue
                 received = self._frame(pictures.recv_multipart(copy=False))

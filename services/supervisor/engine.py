@@ -292,7 +292,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
     check_renderer(spec.renderer, spec.device)
     models = ModelShow(worker, spec, screen, layers)
     worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures(), **layers.figures()})
-    worker.tell_measures("screen", lambda: {"ages": screen.ages.told()})
+    worker.tell_measures("screen", lambda: {"ages": screen.ages.as_json()})
     snapshots = LiveSnapshots()
     worker.take({"camera": layers.camera, "snapshot": snapshots.take})
     layers.open()

@@ -81,7 +81,7 @@ class StreamSupervisor:
         self._capture.open()
         self._engine.open()
 
-    async def stop(self, reason: str = "it was asked for") -> None:
+    async def stop(self, reason: str = "it was requested") -> None:
         """End both processes and remove the stream's runtime folder."""
         await self._engine.close(stop=True, reason=reason)
         await self._capture.close(stop=True, reason=reason)
@@ -92,7 +92,7 @@ class StreamSupervisor:
         """Stop supervising; the processes continue."""
         await asyncio.gather(*(each.close(stop=False, reason=reason) for each in (self._engine, self._capture)))
 
-    async def restart(self, role: Role, reason: str = "it was asked for") -> None:
+    async def restart(self, role: Role, reason: str = "it was requested") -> None:
         """Restart one process."""
         await self._process(role).restart(reason)
 
@@ -276,7 +276,7 @@ class SupervisedStreams:
             Unprocessable: if the configuration is not valid.
         """
         if stream.name in self._streams:
-            raise Conflicting(f"there is a stream {stream.name}; delete it first, or choose another name")
+            raise Conflicting(f"a stream named {stream.name} already exists; delete it first, or choose another name")
         if len(self._streams) >= self._most:
             raise Conflicting(f"there are {self._most} streams, which is limits.streams; delete one, or raise it")
         made = self._streams[stream.name] = Stream(stream, self._spec(stream))
@@ -304,7 +304,7 @@ class SupervisedStreams:
             Missing: if the stream does not exist.
         """
         stream = self._stream(name)
-        await self._stop(stream, "it was asked for")
+        await self._stop(stream, "it was requested")
         return stream.facts()
 
     async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamFacts:
@@ -430,7 +430,7 @@ GivenUp = tuple[tuple[str, int, str], ...]
 
 
 @dataclass(frozen=True)
-class Asked:
+class ModelRequest:
     """Last request to an engine, and the models it had rolled back by then."""
 
     name: str
@@ -447,7 +447,7 @@ class ShownModels:
         self._events = events or SystemEvents()
         self._refused: dict[tuple[str, str, int], float] = {}
         """Time of an engine's refusal, by stream, model and version."""
-        self._asked: dict[str, Asked] = {}
+        self._requests: dict[str, ModelRequest] = {}
         """Last request to each stream's engine."""
 
     @asynccontextmanager
@@ -466,7 +466,7 @@ class ShownModels:
                 try:
                     await self.look_at(stream)
                 except (BusError, RegistryError) as error:
-                    log.warning("%s does not show what it is to: %s", stream.wanted.name, error)
+                    log.warning("%s does not show its model: %s", stream.wanted.name, error)
             await asyncio.sleep(LOOK_S)
 
     async def look_at(self, stream: Stream) -> None:
@@ -498,18 +498,18 @@ class ShownModels:
         except BusError:
             self._refused[which] = now_s
             raise
-        self._asked[stream.wanted.name] = Asked(name, active.version, _given_up(engine.figures))
+        self._requests[stream.wanted.name] = ModelRequest(name, active.version, _given_up(engine.figures))
         log.info("%s shows %s/%d", stream.wanted.name, name, active.version)
 
     async def _roll_back_if_given_up(self, stream: str, figures: Mapping[str, Any]) -> None:
         """Roll back the active version if the engine reports that it cannot be displayed."""
-        asked, given_up = self._asked.get(stream), _given_up(figures)
-        if asked is None or given_up == asked.given_up_before:
+        request, given_up = self._requests.get(stream), _given_up(figures)
+        if request is None or given_up == request.given_up_before:
             return
         name, version, reason = given_up[-1]
-        if (name, version) != (asked.name, asked.version):
+        if (name, version) != (request.name, request.version):
             return
-        del self._asked[stream]
+        del self._requests[stream]
         change = await asyncio.to_thread(
             self._registry.rollback, name, "engine", expected_current=version, reason=reason
         )

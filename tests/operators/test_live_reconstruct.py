@@ -72,13 +72,15 @@ class FakeDepth:
 @pytest.fixture
 def live(model, camera, fake_time):
     """Return the operator, its fake reconstructor and the events received by its listener."""
-    fake, told = FakeReconstructor(model, camera), []
+    fake, events = FakeReconstructor(model, camera), []
     clock = FrameClock(ClockSettings(), 30.0, fake_time)
     clock.wait_until_shown = lambda: None
     depth = FakeDepth()
-    operator = LiveReconstructOp(None, make_reconstructor=lambda: fake, clock=clock, listener=told.append, depth=depth)
+    operator = LiveReconstructOp(
+        None, make_reconstructor=lambda: fake, clock=clock, listener=events.append, depth=depth
+    )
     operator.start()
-    return SimpleNamespace(operator=operator, fake=fake, told=told, time=fake_time, depth=depth)
+    return SimpleNamespace(operator=operator, fake=fake, events=events, time=fake_time, depth=depth)
 
 
 def arrived(frame, live, seq, **fields):
@@ -144,10 +146,10 @@ def test_the_scene_grows_now_and_then_though_no_time_is_ever_left(live, frame, c
 
 def test_the_listener_is_told_every_call_in_order(live, one_by_one):
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
-    kinds = [event.kind for event in live.told]
+    kinds = [event.kind for event in live.events]
     made = [call[0] for call in live.fake.calls]
     assert [kind for kind in kinds if kind != "rehearse"] == [kind for kind in made if kind != "rehearse"]
-    steps = sum(event.steps for event in live.told if event.kind == "rehearse")
+    steps = sum(event.steps for event in live.events if event.kind == "rehearse")
     assert steps == sum(live.fake.seqs("rehearse")) == live.operator.counts.rehearsed > 0
 
 
@@ -203,7 +205,7 @@ def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, 
     one_by_one((2, {}))
     kinds = [call[0] for call in live.fake.calls if call[0] != "rehearse"]
     assert kinds[-3:] == ["observe", "take_depth", "grow"] and ("take_depth", 0, "ready") in live.fake.calls
-    assert [event.frame for event in live.told if event.kind == "take_depth"] == [found]
+    assert [event.frame for event in live.events if event.kind == "take_depth"] == [found]
     outcome = OutcomeBuilder()
     live.operator.contribute(outcome)
     taken = outcome.find(TakenDepth)
@@ -216,7 +218,7 @@ def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
     live.depth.found = arrived(frame, live, 0), "ready"
     one_by_one((2, {"scene": 1}))
-    assert live.fake.seqs("take_depth") == [0] and not [event for event in live.told if event.kind == "take_depth"]
+    assert live.fake.seqs("take_depth") == [0] and not [event for event in live.events if event.kind == "take_depth"]
     outcome = OutcomeBuilder()
     live.operator.contribute(outcome)
     assert outcome.find(TakenDepth) == TakenDepth(0, 0.0, 1) and outcome.notes == ()

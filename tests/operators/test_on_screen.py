@@ -199,7 +199,7 @@ def test_the_log_says_what_was_on_the_screen_and_when(stream, rendered, compute_
         [ShownPicture(picture, picture.image, PictureState.STALE, 15 * MS, 15 * MS, True)],
     )
     first, second = read_frames(operator.log.path)
-    told = {
+    published = {
         "seq": 0,
         "shown_seq": 0,
         "shown_ns": 15 * MS,
@@ -208,7 +208,7 @@ def test_the_log_says_what_was_on_the_screen_and_when(stream, rendered, compute_
         "taken_ms": 3.0,
         "published_ms": 9.0,
     }
-    assert first.items() >= (told | {"steps": 7, "model_version": 5, "withheld": None}).items()
+    assert first.items() >= (published | {"steps": 7, "model_version": 5, "withheld": None}).items()
     assert (second["seq"], second["shown_seq"]) == (1, 0)
 
 

@@ -187,5 +187,5 @@ def test_a_bundle_with_a_field_that_is_not_registered_is_refused(registered, rec
 
 def test_a_name_can_be_taken_once_only(registered):
     registered(DRIFT)
-    with pytest.raises(InvalidInput, match="there is a deformation field 'drift' already"):
+    with pytest.raises(InvalidInput, match="a deformation field named 'drift' already exists"):
         registered(DRIFT)

@@ -31,15 +31,15 @@ import services.cli.runs
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
 from services.cli.app import run
 from services.api.parts import NewStream
-from services.api.replays import ReplayWanted
-from services.api.streams import StreamWanted
+from services.api.replays import ReplayRequest
+from services.api.streams import StreamRequest
 from services.server.stream_specs import spec_of
 from services.settings import load_settings
 from services.supervisor.engine import live_settings
 from services.supervisor.specs import ProcessSpec
 
 recording, folder = Path(sys.argv[1]), Path(sys.argv[2])
-told = {}
+values = {}
 
 
 def at_the_operator(settings):
@@ -56,12 +56,12 @@ def live_at_the_operator(settings):
 
 
 def replayed(settings, *, as_json):
-    told["replay"] = at_the_operator(settings)
+    values["replay"] = at_the_operator(settings)
     return 0
 
 
 def shown(settings, *, keep, as_json):
-    told["live"] = live_at_the_operator(settings)
+    values["live"] = live_at_the_operator(settings)
     return 0
 
 
@@ -82,15 +82,15 @@ def of_stream(name, source, device, options):
 file = folder / "settings.yaml"
 file.write_text("streams: {a: {source: 'synthetic:', options: {example: 3}}}")
 stream = load_settings(file).streams["a"]
-told["yaml"] = of_stream("a", stream.source, "cpu", stream.options)
-stream = StreamWanted.model_validate({"name": "a", "source": "synthetic:", "options": {"example": 4}})
-told["rest"] = of_stream("a", stream.source, "cpu", stream.options)
-wanted = ReplayWanted.model_validate({"recording": "a", "options": {"example": 5}})
+values["yaml"] = of_stream("a", stream.source, "cpu", stream.options)
+stream = StreamRequest.model_validate({"name": "a", "source": "synthetic:", "options": {"example": 4}})
+values["rest"] = of_stream("a", stream.source, "cpu", stream.options)
+wanted = ReplayRequest.model_validate({"recording": "a", "options": {"example": 5}})
 stored = json.loads(json.dumps(wanted.options.chosen()))
-told["job"] = at_the_operator(ReplaySettings(recording=recording, out=folder / "c", **stored))
-told["form"] = ReplayWanted.model_json_schema()["$defs"]["CallerJobOptions"]["properties"]["example"]
-told["stream form"] = StreamWanted.model_json_schema()["properties"]["options"]["properties"]["example"]
-print(json.dumps(told))
+values["job"] = at_the_operator(ReplaySettings(recording=recording, out=folder / "c", **stored))
+values["form"] = ReplayRequest.model_json_schema()["$defs"]["CallerJobOptions"]["properties"]["example"]
+values["stream form"] = StreamRequest.model_json_schema()["properties"]["options"]["properties"]["example"]
+print(json.dumps(values))
 """
 
 
@@ -125,11 +125,11 @@ def test_an_option_is_a_field_and_its_use(tmp_path):
         capture_output=True, text=True, cwd=place, env={**os.environ, "PYTHONPATH": str(place)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert [told[name] for name in ("replay", "live", "yaml", "rest", "job")] == [1, 2, 3, 4, 5]
+    values = json.loads(done.stdout.splitlines()[-1])
+    assert [values[name] for name in ("replay", "live", "yaml", "rest", "job")] == [1, 2, 3, 4, 5]
     assert "example is 10; it must be from 0 to 9" in done.stderr
-    assert told["form"] == {
+    assert values["form"] == {
         "default": 0, "description": "Example of an option.", "maximum": 9, "minimum": 0, "title": "Example",
         "type": "integer", "x-unit": "frames",
     }  # fmt: skip
-    assert told["stream form"]["description"] == "Example of an option." and told["stream form"]["default"] == 0
+    assert values["stream form"]["description"] == "Example of an option." and values["stream form"]["default"] == 0

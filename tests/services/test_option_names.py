@@ -17,8 +17,8 @@ from operators.sources.registry import SOURCES
 from services.api import streams
 from services.api.parts import NewStream
 from services.cli import app as command_line
-from services.schemas.replays import ReplayWanted
-from services.schemas.streams import StreamWanted
+from services.schemas.replays import ReplayRequest
+from services.schemas.streams import StreamRequest
 from services.server.stream_specs import spec_of
 from services.settings import SettingsInvalid, load_settings
 
@@ -57,9 +57,9 @@ def given(monkeypatch, tmp_path):
         found = {}
 
         def keep(*_, **options):
-            raise Kept(options)
+            raise Reached(options)
 
-        class Kept(Exception):
+        class Reached(Exception):
             def __init__(self, options):
                 found.update(options)
 
@@ -69,7 +69,9 @@ def given(monkeypatch, tmp_path):
             "services.cli.batch.batch_command", lambda folder, out, workers, options, **_: keep(**options)
         )
         where = ["--out", str(tmp_path / "out")] if command in ("replay", "reconstruct") else []
-        monkeypatch.setattr(command_line, "exit_code_of", lambda error, arguments: 7 if isinstance(error, Kept) else 2)
+        monkeypatch.setattr(
+            command_line, "exit_code_of", lambda error, arguments: 7 if isinstance(error, Reached) else 2
+        )
         assert command_line.run([command, "a", *where, *words]) == 7
         return KINDS[command](**{name: found[name] for name in options_for(KINDS[command], command) if name in found})
 
@@ -83,13 +85,13 @@ def test_every_name_is_accepted_everywhere(option, name, given, network, tmp_pat
         if option in options_for(kind, command):
             assert getattr(given(command, f"--{option.replace('_', '-')}", value), option) == value
     if option in options_for(JobOptions, "job"):
-        wanted = ReplayWanted.model_validate({"recording": "a", "options": {option: value}})
+        wanted = ReplayRequest.model_validate({"recording": "a", "options": {option: value}})
         stored = json.loads(json.dumps(wanted.options.chosen()))
         assert getattr(JobOptions(**stored), option) == value
     file = tmp_path / "settings.yaml"
     file.write_text(json.dumps({"streams": {"a": {"source": "synthetic:", "options": {option: value}}}}))
     listed = load_settings(file).streams["a"]
-    asked = StreamWanted.model_validate({"name": "a", "source": "synthetic:", "options": {option: value}})
+    asked = StreamRequest.model_validate({"name": "a", "source": "synthetic:", "options": {option: value}})
     for stream in (listed, asked):
         spec = spec_of(NewStream("a", stream.source, "live", "cpu", stream.options))
         assert getattr(spec.engine, option) == value
@@ -106,7 +108,7 @@ def test_a_name_that_there_is_not_is_refused_everywhere(option, tmp_path, capsys
             assert command_line.run([command, str(tmp_path), *where, flag, "nope"]) == 2
             assert f"{option} is 'nope'; choose " in capsys.readouterr().err
     with pytest.raises(ValidationError):
-        ReplayWanted.model_validate({"recording": "a", "options": {option: "nope"}})
+        ReplayRequest.model_validate({"recording": "a", "options": {option: "nope"}})
     options = {"streams": {"a": {"source": "synthetic:", "options": {option: "nope"}}}}
     (tmp_path / "settings.yaml").write_text(json.dumps(options))
     with pytest.raises(SettingsInvalid, match=r"line 1: .*(is 'nope'; choose|has no option 'device')"):
@@ -139,7 +141,7 @@ def test_every_sink_is_accepted_by_runs_and_jobs(name, given):
     for command in ("replay", "batch", "reconstruct"):
         assert given(command, "--sinks", name).sinks == sinks
     for value in (name, list(sinks)):
-        wanted = ReplayWanted.model_validate({"recording": "a", "options": {"sinks": value}})
+        wanted = ReplayRequest.model_validate({"recording": "a", "options": {"sinks": value}})
         assert JobOptions(**json.loads(json.dumps(wanted.options.chosen()))).sinks == sinks
     with pytest.raises(InvalidSetting, match="sinks is 'film'; choose video or keyframes"):
         JobOptions(sinks="film")

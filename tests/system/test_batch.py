@@ -52,9 +52,9 @@ def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, recordings):
     command = ("batch", recordings, "--workers", "1", *QUICK, "--json")
     first = start(*command)
     out, err = first.communicate(timeout=300)
-    told = json.loads(out)
-    assert (first.returncode, told["done"], told["failed"], told["already"]) == (2, 2, 1, 0), err
-    assert told["failures"][0]["recording"] == "empty" and "no images" in told["failures"][0]["reason"].replace(
+    summary = json.loads(out)
+    assert (first.returncode, summary["done"], summary["failed"], summary["already"]) == (2, 2, 1, 0), err
+    assert summary["failures"][0]["recording"] == "empty" and "no images" in summary["failures"][0]["reason"].replace(
         "PNG or JPEG ", ""
     )
     results = recordings.with_name("recordings-replays")
@@ -62,8 +62,8 @@ def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, recordings):
     shutil.rmtree(recordings / "empty")
     shutil.copytree(recordings / "a", recordings / "empty")
     out, err = start(*command).communicate(timeout=300)
-    told = json.loads(out)
-    assert (told["done"], told["already"], told["failed"]) == (3, 2, 0), err
+    summary = json.loads(out)
+    assert (summary["done"], summary["already"], summary["failed"]) == (3, 2, 0), err
     assert {name: (results / name).stat().st_ino for name in "ab"} == made
     assert (results / "empty" / "report.html").is_file() and (results / "a" / "model" / "manifest.json").is_file()
     out, err = start(*command[:-1], "--seed", "1").communicate(timeout=300)

@@ -97,12 +97,12 @@ def test_the_live_page_fits_the_window(page, window):
 
 
 def test_a_picture_may_tell_what_trivial_predictors_score(page):
-    told = page.evaluate(
+    texts = page.evaluate(
         """async () => { const { quality } = await import("/console/streams.js");
         return [quality({ psnr_db: 35.71 }), quality({ psnr_db: 35.71, previous_frame_db: 38 }),
                 quality({ psnr_db: 35.7, previous_frame_db: 38.02, next_frame_db: 33.3 }), quality({ psnr_db: null }), quality({})]; }"""
     )
-    assert told == ["35.7", "35.7 (previous frame 38.0)", "35.7 (previous frame 38.0, next frame 33.3)", "", ""]
+    assert texts == ["35.7", "35.7 (previous frame 38.0)", "35.7 (previous frame 38.0, next frame 33.3)", "", ""]
 
 
 def test_nothing_is_deleted_at_one_click(page, client):

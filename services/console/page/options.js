@@ -4,7 +4,7 @@ import { call } from "./api.js";
 
 let described = null;
 
-/** Fill `place` with a field for each option of the request `schema`, such as "ReplayWanted". Does nothing if it has them already. */
+/** Fill `place` with a field for each option of the request `schema`, such as "ReplayRequest". Does nothing if it has them already. */
 export async function offerOptions(place, schema) {
   if (place.childElementCount) return;
   described ??= call("GET", "/openapi.json").catch((error) => { described = null; throw error; });

@@ -18,7 +18,7 @@ export function replaysPage(report) {
 
   async function renew() {
     const number = ++asked;
-    await offerOptions(at("replay-options"), "ReplayWanted");
+    await offerOptions(at("replay-options"), "ReplayRequest");
     const [recordings, replays] = await Promise.all([call("GET", "/v1/recordings"), call("GET", "/v1/replays?count=50")]);
     if (number >= current) offer(recordings.filter((each) => each.state === "ready").map((each) => each.name));
     shown = replays;

@@ -14,7 +14,7 @@ export function streamsPage(report, onStreams) {
     const streams = await call("GET", "/v1/streams");
     onStreams(streams);
     replaceRows(at("stream-rows"), streams.map(line));
-    await offerOptions(at("stream-options"), "StreamWanted");
+    await offerOptions(at("stream-options"), "StreamRequest");
   }
 
   function line(stream) {
@@ -69,12 +69,12 @@ export function processFacts(process) {
 }
 
 /** The PSNR that a picture or its header has, and the trivial predictors' next to it where the server tells them. */
-export function quality(told) {
+export function quality(report) {
   const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
-  const own = decibels(told.psnr_db);
+  const own = decibels(report.psnr_db);
   if (!own) return "";
-  const previous = decibels(told.previous_frame_db);
-  const next = decibels(told.next_frame_db);
+  const previous = decibels(report.previous_frame_db);
+  const next = decibels(report.next_frame_db);
   const beside = [previous && `previous frame ${previous}`, next && `next frame ${next}`].filter(Boolean).join(", ");
   return beside ? `${own} (${beside})` : own;
 }

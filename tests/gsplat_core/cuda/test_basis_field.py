@@ -136,7 +136,7 @@ def test_bias_corrections_hold_for_a_bump_that_was_updated_often(gpu):
 
 
 def test_a_captured_step_reads_time_and_rates_anew(gpu):
-    state, told = (training_state(200, 26, lambda t: t.to(gpu)) for _ in range(2))
+    state, fused = (training_state(200, 26, lambda t: t.to(gpu)) for _ in range(2))
     tau, rates = torch.zeros(1, device=gpu), torch.zeros(6, device=gpu)
     gradient = gradient_of(200, columns=16).to(gpu)
 
@@ -156,10 +156,12 @@ def test_a_captured_step_reads_time_and_rates_anew(gpu):
         tau.fill_(time)
         rates.copy_(scale * torch.tensor(RATES))
         graph.replay()
-        deltas = basis_field(*told[0], time, padded=True)
+        deltas = basis_field(*fused[0], time, padded=True)
         assert torch.equal(captured, deltas)
-        basis_field_backward_adam_(gradient, time, *told, [scale * r for r in RATES])
-    for a, b in zip((*state[0], *state[1], *state[2], state[3]), (*told[0], *told[1], *told[2], told[3]), strict=True):
+        basis_field_backward_adam_(gradient, time, *fused, [scale * r for r in RATES])
+    for a, b in zip(
+        (*state[0], *state[1], *state[2], state[3]), (*fused[0], *fused[1], *fused[2], fused[3]), strict=True
+    ):
         assert torch.equal(a, b)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, disagreement
 from gsplat_core.depth.multiview import ParallaxDepth
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.parallax import _confirmed
@@ -94,7 +94,7 @@ def test_a_look_long_ago_confirms_nothing() -> None:
 @pytest.fixture(scope="module")
 def breathing():
     """Tissue that breathes before a moving scope: for a while it looks as if it stood still at another distance."""
-    return render_recording(Asked(18, 160, 128, seed=0, camera="moving"))
+    return render_recording(RenderSettings(18, 160, 128, seed=0, camera="moving"))
 
 
 def test_breathing_tissue_gets_no_depth_by_parallax_in_a_stream(breathing) -> None:

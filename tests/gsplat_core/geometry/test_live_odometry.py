@@ -11,7 +11,7 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.stream_tracks import StreamTracks
-from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry, local_map
 from gsplat_core.poses.live_odometry import LiveOdometry
@@ -28,7 +28,7 @@ def rigid() -> RenderedRecording:
     moving, at_rest = Tissue.points, Tug((0.0, 0.0), (0.0, 0.0, 0.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Tissue, "points", lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, at_rest))
-        return render_recording(Asked(COUNT, 256, 192, fps=10, seed=3, camera="moving", stereo=True))
+        return render_recording(RenderSettings(COUNT, 256, 192, fps=10, seed=3, camera="moving", stereo=True))
 
 
 def blind(frames) -> list[Frame]:

@@ -12,7 +12,7 @@ import torch
 from gsplat_core import Camera, Frame, Gaussians, Model, Reconstructor, ReconstructorConfig
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.measure import ORIGIN_ERROR, Measurement
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import DepthOrigin
 
@@ -107,7 +107,7 @@ def test_two_surfaces_at_one_pixel_make_a_large_error():
 
 def test_error_bars_hold_on_a_trained_model():
     """On a model trained on one frame with depth, most true errors are within two standard errors, and the error bars are not much wider."""
-    recording = render_recording(Asked(frames=1, width_px=96, height_px=80, fps=30, seed=5))
+    recording = render_recording(RenderSettings(frames=1, width_px=96, height_px=80, fps=30, seed=5))
     frame = next(iter(recording))
     learning = Reconstructor(ReconstructorConfig(gaussians=2000, max_gaussians=2500), recording.camera)
     learning.observe(frame, steps=20)

@@ -8,7 +8,7 @@ import pytest
 from gsplat_core import Camera, Model
 from gsplat_core.errors import ExportError
 from gsplat_core.geometry.mesh import mesh_of, mesh_of_depth, vertex_normals
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.training.initialisation import gaussians_from_frame
 
 CAMERA = Camera.from_focal(50.0, 20, 14)
@@ -67,7 +67,7 @@ def test_normals_of_vertices_are_weighted_by_area():
 
 
 def test_the_mesh_of_a_model_lies_on_the_tissue():
-    recording = render_recording(Asked(frames=1, width_px=96, height_px=80, seed=4))
+    recording = render_recording(RenderSettings(frames=1, width_px=96, height_px=80, seed=4))
     frame = next(iter(recording))
     frame = frame.with_fields(mask=np.ones_like(frame.mask))
     gaussians = gaussians_from_frame(frame, recording.camera, 4000, sh_degree=0, default_depth_mm=60.0)

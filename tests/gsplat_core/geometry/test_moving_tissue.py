@@ -10,7 +10,7 @@ import pytest
 from gsplat_core.depth import moving_tissue
 from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.depth.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
-from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
@@ -19,7 +19,7 @@ FPS = 10.0
 
 @cache
 def recording() -> RenderedRecording:
-    return render_recording(Asked(56, 192, 144, fps=FPS, seed=1, camera="moving"))
+    return render_recording(RenderSettings(56, 192, 144, fps=FPS, seed=1, camera="moving"))
 
 
 def given(frames: slice = slice(None)) -> tuple[list[Frame], list[Camera]]:

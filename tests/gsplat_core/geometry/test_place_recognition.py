@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_core.geometry.stream_tracks import SmallPicture, SmallPictures, StreamTracks
-from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry
@@ -34,7 +34,7 @@ def there_and_back() -> RenderedRecording:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Tissue, "points", lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, at_rest))
         patch.setattr(SyntheticScene, "_left_at", on_way)
-        return render_recording(Asked(COUNT, 192, 144, fps=10, seed=3, camera="moving"))
+        return render_recording(RenderSettings(COUNT, 192, 144, fps=10, seed=3, camera="moving"))
 
 
 def drift(recording: RenderedRecording) -> tuple[float, LiveOdometry]:

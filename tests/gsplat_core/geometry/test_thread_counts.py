@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_core.poses import bundle, moving_bundle
-from gsplat_core.poses.breathing import _bundle, is_told, refined, waves
+from gsplat_core.poses.breathing import _bundle, refined, separability, waves
 from gsplat_core.poses.moving_bundle import SurfaceField, learned_from
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
 from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
@@ -70,10 +70,10 @@ def test_priors_and_fields(breathing):
     def learned():
         prior = learned_from(start.poses, sightings.times_s, start.waves)
         field = SurfaceField.over(start.rest)
-        told = is_told(start.poses, start.poses, sightings.times_s, (BREATHING_HZ,))
+        separated = separability(start.poses, start.poses, sightings.times_s, (BREATHING_HZ,))
         return (
             prior.precision, prior.uncertain, prior.cost(start.poses), *prior.terms(start.poses), field.nodes,
-            field.stiffness, field.influence(start.rest), told[1],
+            field.stiffness, field.influence(start.rest), separated[1],
         )  # fmt: skip
 
     check(learned)

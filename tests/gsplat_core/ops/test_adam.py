@@ -100,12 +100,12 @@ def test_what_it_cannot_take_is_refused():
 def test_a_step_told_by_tensors_is_the_step_told_by_numbers():
     gradient = torch.randn(50, 3, generator=torch.Generator().manual_seed(5))
     gradient[7, 1] = torch.nan
-    told, at, skipped = state(50, 3), state(50, 3), torch.full((1,), 4)
+    on_host, at, skipped = state(50, 3), state(50, 3), torch.full((1,), 4)
     for step in (1, 2, 100_000):
         rate = torch.tensor([0.125])
-        assert adam_step(told[0], gradient, *told[1:], step, 0.125, row_size=3) == 1
+        assert adam_step(on_host[0], gradient, *on_host[1:], step, 0.125, row_size=3) == 1
         adam_step_at_(at[0], gradient, *at[1:], rate, torch.tensor([step]), skipped, row_size=3)
-    assert all(torch.equal(a, b) for a, b in zip(told, at, strict=True)) and skipped.item() == 7
+    assert all(torch.equal(a, b) for a, b in zip(on_host, at, strict=True)) and skipped.item() == 7
     arguments = (at[0], gradient, *at[1:], rate, torch.tensor([3]), 0.9, 0.999, 1e-8, 3, skipped)
     torch.library.opcheck(torch.ops.gsplat_core.adam_at_, arguments)
     with pytest.raises(InvalidInput, match=r"step must be one torch.int64 .*float32"):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import DepthOrigin, Frame
@@ -22,7 +22,7 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_tracks import SurfaceDepth, SurfaceTracks, between_known, steady_course
 
 FRAMES, FPS = 12, 8.0
-ASKED = Asked(FRAMES, 192, 160, FPS, seed=1)
+ASKED = RenderSettings(FRAMES, 192, 160, FPS, seed=1)
 MOVING = replace(ASKED, camera="moving")
 
 
@@ -40,7 +40,7 @@ def observations(recording) -> list[Observation]:
     return [Observation.of(frame, recording.camera) for frame in recording]
 
 
-def points_of(asked: Asked) -> torch.Tensor:
+def points_of(asked: RenderSettings) -> torch.Tensor:
     """Return the generator's grid of tissue points in each frame [T, P, 3]."""
     moves = asked.camera == "moving"
     scene = SyntheticScene.from_seed(asked.seed, asked.width_px, asked.height_px, asked.frames / asked.fps, moves)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
 from operators.applications.live import LiveApplication, warm_up
@@ -68,7 +68,7 @@ class _Scope(ThreadedSource):
 
 @pytest.mark.slow
 def test_a_session_with_estimated_poses_comes_out_again(tmp_path):
-    recording = render_recording(Asked(FRAMES, 160, 128, fps=20, seed=1, camera="moving"))
+    recording = render_recording(RenderSettings(FRAMES, 160, 128, fps=20, seed=1, camera="moving"))
     settings = LiveSettings(
         source="scope", out=tmp_path / "live", record=tmp_path / "session", depth="none", poses="estimated"
     )

@@ -322,5 +322,5 @@ def test_late_depth_that_finds_no_room_is_lost_in_its_place(tmp_path, gate):
     gate.set()
     recorder.close()
     assert recorder.recorded.lost == {"depth: writing is too slow": 1}
-    told = [(line.event, line.seq) for line in SessionReader(tmp_path / "s").schedule()]
-    assert told == [("observe", 0), ("lost", 0), ("observe", 1), ("take_depth", 0)]
+    events = [(line.event, line.seq) for line in SessionReader(tmp_path / "s").schedule()]
+    assert events == [("observe", 0), ("lost", 0), ("observe", 1), ("take_depth", 0)]

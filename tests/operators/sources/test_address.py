@@ -18,7 +18,7 @@ def test_an_address_has_a_place_and_options():
 
 @pytest.mark.parametrize("query", ["a=1&a=1", "b=3&a=1&a=2", "a=1&b=2&a=3"])
 def test_an_option_that_is_there_twice_is_refused(query):
-    with pytest.raises(InvalidSetting, match="pipe: the option 'a' is there twice"):
+    with pytest.raises(InvalidSetting, match="pipe: the option 'a' occurs twice"):
         Address.parse("pipe", f"-?{query}")
 
 

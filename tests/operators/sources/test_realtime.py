@@ -173,7 +173,7 @@ def test_its_address_says_how_it_is_played(folder):
         ("fps=1e9", "fps is '1e9'"),
         ("loop=perhaps", "loop is 'perhaps'"),
         ("loops=1", "unknown option 'loops'; known are fps, loop, speed"),
-        ("loop=1&loop=0", "'loop' is there twice"),
+        ("loop=1&loop=0", "'loop' occurs twice"),
     ],
 )
 def test_options_that_are_wrong_are_named(folder, query, what):

@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from operators.sources import synthetic
 from operators.sources.options import SourceOptions
 from operators.sources.registry import open_source
@@ -30,7 +30,7 @@ def test_it_goes_forwards_and_backwards_so_that_nothing_jumps():
     frames = [source.read(SOON_S) for _ in range(18)]
     source.close()
     order = [0, 1, 2, 3, 4, 3, 2, 1, 0, 1, 2, 3, 4, 3, 2, 1, 0, 1]
-    rendered = list(render_recording(Asked(frames=5, width_px=48, height_px=40, fps=20, camera="moving")))
+    rendered = list(render_recording(RenderSettings(frames=5, width_px=48, height_px=40, fps=20, camera="moving")))
     for k, (frame, index) in enumerate(zip(frames, order, strict=True)):
         assert (frame.seq, frame.pts_ns) == (k, k * 50_000_000)
         for name in ("image", "mask", "depth", "pose"):
@@ -40,7 +40,7 @@ def test_it_goes_forwards_and_backwards_so_that_nothing_jumps():
 def test_it_is_what_synthesize_writes(tmp_path):
     folder = synthesize(tmp_path / "written", frames=2, width_px=48, height_px=40, camera="moving", seed=3)
     written = list(open_recording(folder))
-    kept = render_recording(Asked(frames=2, width_px=48, height_px=40, camera="moving", seed=3, stereo=True))
+    kept = render_recording(RenderSettings(frames=2, width_px=48, height_px=40, camera="moving", seed=3, stereo=True))
     for a, b in zip(kept, written, strict=True):
         for name in ("image", "right_image", "mask"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))

@@ -129,7 +129,7 @@ class FakeStreams:
 
     async def create(self, stream: NewStream) -> FakeStream:
         if stream.name in self.kept:
-            raise Conflicting(f"there is a stream {stream.name} already")
+            raise Conflicting(f"a stream named {stream.name} already exists")
         self.kept[stream.name] = FakeStream(stream.name, stream.source, stream.show, stream.device, stream.options)
         return self.kept[stream.name]
 

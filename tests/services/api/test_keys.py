@@ -59,17 +59,17 @@ def test_another_process_changes_the_keys(tmp_path):
 def test_only_changes_by_another_process_are_told(tmp_path):
     here, there = KeyStore(tmp_path / "keys.json"), KeyStore(tmp_path / "keys.json")
     there.create("earlier", Role.VIEWER)
-    told = []
-    here.watch(lambda event, key: told.append((event, key.name)))
+    changes = []
+    here.watch(lambda event, key: changes.append((event, key.name)))
     mine, _ = here.create("mine", Role.OPERATOR)
     theirs, _ = there.create("theirs", Role.VIEWER)
     there.revoke(mine.id)
-    assert told == []
+    assert changes == []
     assert len(here.all()) == 2 and here.all()
-    assert told == [("key.create", "theirs"), ("key.revoke", "mine")]
+    assert changes == [("key.create", "theirs"), ("key.revoke", "mine")]
     there.create("again", Role.VIEWER)
     here.revoke(theirs.id)  # sees the other one before it changes anything
-    assert told[2:] == [("key.create", "again")] and len(there.all()) == 2
+    assert changes[2:] == [("key.create", "again")] and len(there.all()) == 2
 
 
 def test_the_last_administrator_stays(tmp_path):

@@ -191,11 +191,11 @@ def test_progress_is_said_until_the_end(plane, worker):
         assert socket.receive_json()["state"] == "queued"
         assert worker.claims.take().id == job_id
         worker.claims.renew({job_id: JobProgress(4, 9, 30.5, 29.5, 28.5)})
-        told = [socket.receive_json()]
-        if told[-1]["frames_done"] == 0:  # it was seen between the two
-            told.append(socket.receive_json())
-        assert (told[-1]["state"], told[-1]["frames_done"], told[-1]["psnr_db"]) == ("running", 4, 30.5)
-        assert (told[-1]["previous_frame_db"], told[-1]["next_frame_db"]) == (29.5, 28.5)
+        views = [socket.receive_json()]
+        if views[-1]["frames_done"] == 0:  # it was seen between the two
+            views.append(socket.receive_json())
+        assert (views[-1]["state"], views[-1]["frames_done"], views[-1]["psnr_db"]) == ("running", 4, 30.5)
+        assert (views[-1]["previous_frame_db"], views[-1]["next_frame_db"]) == (29.5, 28.5)
         worker.claims.end(job_id, JobState.FAILED, "its recording is empty")
         assert socket.receive_json()["reason"] == "its recording is empty"
         with pytest.raises(WebSocketDisconnect) as ended:

@@ -63,7 +63,7 @@ def wire(monkeypatch) -> Tripwire:
     return Tripwire(monkeypatch)
 
 
-def told(log: AuditLog) -> list[str]:
+def subjects(log: AuditLog) -> list[str]:
     """Subjects of the entries that callers have asked for, the oldest first."""
     return [entry.subject for entry in reversed(log.newest(1000)) if entry.event == "model.activate"]
 
@@ -102,7 +102,7 @@ def test_an_error_at_any_step_is_refused_and_leaves_a_log_that_fits(tmp_path, wi
         log.append("model.activate", actor="x", subject="h")
         kept.append("h")
         assert log.failure is None
-        found = told(log)
+        found = subjects(log)
         assert found == kept[-len(found) :] and (keeping is MANY_FILES or found == kept), (step, refused)
         verdict = verify(path)
         assert verdict.intact, (step, verdict.findings)
@@ -184,7 +184,7 @@ def test_a_valid_chain_that_is_ahead_of_its_head_is_taken_over(tmp_path):
         again = reopened(path, keeping)
         said = again.newest(1)[0]
         assert (said.event, said.detail) == ("audit.recovered", {"entries_ahead_of_the_head": 7})
-        assert said.previous == digest_of_entry(newest) and told(again) == list("abcdefgh")
+        assert said.previous == digest_of_entry(newest) and subjects(again) == list("abcdefgh")
         again.close()
         assert verify(path).intact
 

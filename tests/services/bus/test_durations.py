@@ -9,17 +9,17 @@ def test_durations_are_counted_by_bucket():
     durations = Durations()
     for value in (0.0, 0.001, 0.0011, 0.0333, 0.0334, 7.0):
         durations.add(value)
-    told = durations.told()
-    assert sum(told["counts"]) == 6 and told["counts"][0] == 2 and told["counts"][-1] == 1
-    assert told["sum_s"] == pytest.approx(7.0688)
-    buckets, sum_s = cumulative(told)
+    sent = durations.as_json()
+    assert sum(sent["counts"]) == 6 and sent["counts"][0] == 2 and sent["counts"][-1] == 1
+    assert sent["sum_s"] == pytest.approx(7.0688)
+    buckets, sum_s = cumulative(sent)
     found = dict(buckets)
     assert (found["0.001"], found["0.0025"], found["0.0333"], found["0.05"]) == (2, 3, 4, 5)
-    assert (found["5.0"], found["+Inf"], sum_s) == (5, 6, told["sum_s"])
+    assert (found["5.0"], found["+Inf"], sum_s) == (5, 6, sent["sum_s"])
 
 
 @pytest.mark.parametrize(
-    "told",
+    "sent",
     [
         None,
         [],
@@ -31,5 +31,5 @@ def test_durations_are_counted_by_bucket():
     ],
     ids=repr,
 )
-def test_what_tells_of_no_durations(told):
-    assert cumulative(told) is None
+def test_malformed_durations_give_no_buckets(sent):
+    assert cumulative(sent) is None

@@ -90,8 +90,8 @@ def test_the_summary_in_words_and_as_json(capsys):
     assert said.out == "3 of 5 recordings have their result, 2 of them new, in 2.0 s\nout\n"
     assert said.err == "failed: r0: bad\\nname\nfailed: y\\x1b: is no recording\n"
     batch._print(summary, Path("out"), as_json=True)
-    told = json.loads(capsys.readouterr().out)
-    assert told == {
+    summary = json.loads(capsys.readouterr().out)
+    assert summary == {
         **counts(done=3, failed=1), "already": 1, "seconds": 2.0,
         "failures": [{"recording": "r0", "reason": "bad\nname"}, {"recording": "y\x1b", "reason": "is no recording"}],
     }  # fmt: skip

@@ -93,8 +93,8 @@ def test_a_camera_that_is_not_known_is_said(clip, capsys):
 
 
 def test_a_focal_length_that_pictures_tell_is_used_and_said(clip, capsys, monkeypatch):
-    told = FocalLength(144.0, FOCAL, (130.0, 150.0), True)
-    monkeypatch.setattr(focal_length, "focal_length_of", lambda frames, camera, found: told)
+    focal_length_found = FocalLength(144.0, FOCAL, (130.0, 150.0), True)
+    monkeypatch.setattr(focal_length, "focal_length_of", lambda frames, camera, found: focal_length_found)
     folder = clip(calibrated=False)
     said = said_of(capsys, folder)
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "pictures", [130, 150])
@@ -120,11 +120,11 @@ def test_a_scope_that_may_stand_still_is_said(clip, capsys):
 def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch):
     plain = recordings.trajectory_of
 
-    def told(frames, camera):
+    def trajectory(frames, camera):
         found = plain(frames, camera)
         return replace(found, breathing=Breathing((0.294, 1.11), 0.02 * found.path))
 
-    monkeypatch.setattr(recordings, "trajectory_of", told)
+    monkeypatch.setattr(recordings, "trajectory_of", trajectory)
     said = said_of(capsys, clip())
     assert (said["breathing_hz"], said["uncertain"]) == ([0.294, 1.11], 0.02)
     assert any("0.29 and 1.11 times a second" in note and "2.0% of the trajectory" in note for note in said["notes"])

@@ -31,7 +31,7 @@ def durations(*values: float) -> dict:
     counted = Durations()
     for value in values:
         counted.add(value)
-    return counted.told()
+    return counted.as_json()
 
 
 ENGINE = {
@@ -121,11 +121,11 @@ def test_a_graph_tells_what_its_tracker_has_seen():
 
     graph = Small(track=True)
     graph.run()
-    told = graph_measures(graph)
-    assert set(told["operators"]) == {"source", "sink"} and set(told["paths"]) == {"source,sink"}
-    for each in (*told["paths"].values(), told["operators"]["sink"]):
+    measures = graph_measures(graph)
+    assert set(measures["operators"]) == {"source", "sink"} and set(measures["paths"]) == {"source,sink"}
+    for each in (*measures["paths"].values(), measures["operators"]["sink"]):
         assert sum(each["counts"]) == 3 and len(each["counts"]) == len(BOUNDS_S) + 1 and each["sum_s"] > 0
-    assert list(told["queues"].values()) == [{"queued": 0, "dropped": {}}]
+    assert list(measures["queues"].values()) == [{"queued": 0, "dropped": {}}]
 
 
 def test_ends_have_few_causes():
@@ -134,7 +134,7 @@ def test_ends_have_few_causes():
         "it has said nothing for 3.1 s; it was killed": "hung",
         "exit code 1": "exit code 1",
         "exit code 2": "refused",
-        "it was told to stop": "ended",
+        "it was asked to stop": "ended",
     }
     assert {how: cause_of(how) for how in said} == said
 

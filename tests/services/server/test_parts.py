@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-from services.api.assembly import assembled, told
+from services.api.assembly import assembled, event_receiver
 from services.audit.system_events import SystemEvents
 from services.settings import ServiceSettings
 from services.supervisor.metrics import StreamMeasures
@@ -19,7 +19,7 @@ from services.supervisor.stream import StreamFacts, SupervisedStreams
     ("reason", "kept"),
     [
         ("killed by SIGKILL", True), ("exit code 3", True), ("it has said nothing for 3.1 s; it was killed", True),
-        ("for the first time", True), ("it was asked for", True), ("the server ends", True),
+        ("for the first time", True), ("it was requested", True), ("the server ends", True),
         ("cannot open /recordings/Smith_Jane.mp4", False), ("smith", False), ("it cannot be started: /x", False),
         ("rtsp://user:pass@10.0.0.5/x does not answer", False),
     ],
@@ -27,7 +27,7 @@ from services.supervisor.stream import StreamFacts, SupervisedStreams
 def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
     events, heard = SystemEvents(), []
     events.tell = lambda *values, **detail: heard.append((values, detail))  # type: ignore[method-assign]
-    told(StreamMeasures(), events)(StreamEvent("theatre", "engine", "ended", reason, 7))
+    event_receiver(StreamMeasures(), events)(StreamEvent("theatre", "engine", "ended", reason, 7))
     expected = {"pid": 7, "reason": reason if kept else "the log has the reason"}
     assert heard == [(("process.ended", "theatre/engine", "failed"), expected)]
 

@@ -36,10 +36,10 @@ class FakeEvents:
     """Audit log that records its events in memory."""
 
     def __init__(self):
-        self.told = []
+        self.entries = []
 
     def tell(self, event, subject, outcome="done", **detail):
-        self.told.append((event, subject, outcome, detail))
+        self.entries.append((event, subject, outcome, detail))
 
 
 def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
@@ -48,12 +48,12 @@ def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
 
     async def serve():
         async with retention.running():
-            while not (events.told and store.checked):
+            while not (events.entries and store.checked):
                 await asyncio.sleep(0.01)
 
     asyncio.run(asyncio.wait_for(serve(), 20))
     assert store.asked == [(2 * DAY_S, 10**9)] and store.checked == ["waits"] and store.closed
-    assert events.told == [("recording.expire", "case-1", "done", {"why": "it is older than 2 days"})]
+    assert events.entries == [("recording.expire", "case-1", "done", {"why": "it is older than 2 days"})]
 
 
 def test_without_bounds_nothing_goes():
@@ -73,11 +73,11 @@ def test_replays_that_ended_go_with_their_results(tmp_path):
 
     async def serve():
         async with retention.running():
-            while not events.told:
+            while not events.entries:
                 await asyncio.sleep(0.01)
 
     asyncio.run(asyncio.wait_for(serve(), 20))
-    assert [(event, subject) for event, subject, _, _ in events.told] == [("replay.expire", ids[0])]
+    assert [(event, subject) for event, subject, _, _ in events.entries] == [("replay.expire", ids[0])]
     assert [job.id for job in store.newest()] == [ids[2], ids[1]]
     assert not (results.folder / ids[0]).exists() and (results.folder / ids[1]).exists()
     asyncio.run(ReplayRetention(Replays(store, results), None, None, events).enforce())

@@ -26,8 +26,8 @@ def taking(tmp_path, monkeypatch):
     def new():
         yield tmp_path
 
-    async def command(role, name, **told):
-        calls.append((role, name, told))
+    async def command(role, name, **arguments):
+        calls.append((role, name, arguments))
         if refusal:
             raise CommandRefused(refusal[0])
         return "said"
@@ -47,8 +47,8 @@ def test_a_snapshot_is_kept_or_becomes_a_version_of_a_model(taking, tmp_path):
     folder = tmp_path / "model"
     taken = (folder, "a", "nurse", "said")
     assert asyncio.run(taking.snapshots.take("a", None, "nurse")) == (taken, None)
-    role, name, told = taking.calls.pop(0)
-    assert (role, name, told["folder"]) == ("engine", "snapshot", str(folder)) and told["timeout_s"] > 10
+    role, name, arguments = taking.calls.pop(0)
+    assert (role, name, arguments["folder"]) == ("engine", "snapshot", str(folder)) and arguments["timeout_s"] > 10
     assert taking.calls == [("keep", folder, taken)]
     del taking.calls[:]
     assert asyncio.run(taking.snapshots.take("a", "liver", "nurse")) == (taken, "version")

@@ -45,7 +45,7 @@ def test_a_stream_is_stopped_until_it_is_started_and_gone_when_it_is_deleted(str
 def test_what_cannot_be_is_refused_and_changes_nothing(streams):
     async def run():
         await streams.create(stream())
-        with pytest.raises(Conflicting, match="there is a stream theatre-1"):
+        with pytest.raises(Conflicting, match="a stream named theatre-1 already exists"):
             await streams.create(stream())
         with pytest.raises(Unprocessable, match="no option 'x'"):
             await streams.create(stream("theatre-2", x=1))

@@ -36,7 +36,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         (BOMB, "more than 100000 values"),
         ("a: &a [*a]", "contains itself"),
         ("a: &a\n  b: *a", "contains itself"),
-        ("server: {port: 1, port: 2}", "'port' is there twice"),
+        ("server: {port: 1, port: 2}", "'port' occurs twice"),
         ('paths: {data: "a\\0b"}', "zero byte"),
         ("a: 2001-99-99", "not YAML"),
         ("\x00", "not YAML"),

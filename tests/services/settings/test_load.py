@@ -55,7 +55,7 @@ def test_without_anything_it_listens_on_loopback_and_shows_the_synthetic_endosco
         ("\nserver:\n  port: 70000", "service.yaml, line 3: server.port: Input should be less than or equal to 65535"),
         ("streams:\n  a:\n    sorce: x\n    source: y", "line 3: there is no key 'sorce' in streams.a; the nearest is 'source'"),
         ("streams:\n  A b: {source: x}", "line 2: streams.A b.[key]: String should match"),
-        ("server:\n  port: 1\n  port: 2", "line 3: 'port' is there twice, first in line 2"),
+        ("server:\n  port: 1\n  port: 2", "line 3: 'port' occurs twice, first in line 2"),
         ("server: {certfile: a.pem}", "certfile and keyfile belong together"),
         ("server: {trusted_proxies: [everybody]}", "'everybody' is no network"),
         ("version: 2", "version: Input should be 1"),

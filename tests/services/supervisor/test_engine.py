@@ -63,7 +63,7 @@ def shown(monkeypatch):
     world = SimpleNamespace(stopped=False, reconstructed=[], opened=[])
     models = Recorder(figures=lambda: {"m": 1}, show="SHOW", show_live="LIVE", show_previous="PREVIOUS")
     layers = Recorder(figures=lambda: {"l": 2}, camera="CAMERA")
-    screen = Recorder(wanted="live", figures=lambda: {"s": 3}, ages=SimpleNamespace(told=lambda: "AGES"))
+    screen = Recorder(wanted="live", figures=lambda: {"s": 3}, ages=SimpleNamespace(as_json=lambda: "AGES"))
     worker = Recorder(stop_requested=lambda: world.stopped)
     monkeypatch.setattr(engines, "ModelShow", lambda *parts: models)
     monkeypatch.setattr(engines, "check_device", lambda device: world.opened.append(device))
@@ -94,8 +94,8 @@ def test_reconstruction_and_models_alternate_and_everything_is_closed(shown):
     assert shown.worker.names().count("wait") == 2 and "request_stop" not in shown.worker.names()
     taken = {name: call for call in shown.worker.calls if call[0] == "take" for name, call in call[1].items()}
     assert taken.keys() == {"camera", "snapshot", "show_model", "show_live", "show_previous"}
-    told = {call[0]: call[2]() for call in shown.worker.calls if call[0].startswith("tell_")}
-    assert told == {"tell_figures": {"s": 3, "m": 1, "l": 2}, "tell_measures": {"ages": "AGES"}}
+    reported = {call[0]: call[2]() for call in shown.worker.calls if call[0].startswith("tell_")}
+    assert reported == {"tell_figures": {"s": 3, "m": 1, "l": 2}, "tell_measures": {"ages": "AGES"}}
 
 
 def test_a_restarted_engine_says_so_to_its_first_reconstruction(shown):
@@ -118,7 +118,7 @@ def test_a_failure_stops_the_process_and_closes_everything(shown):
 @pytest.fixture
 def reconstructing(monkeypatch):
     """Fakes for `reconstruct`, whose session calls `world.during(graph, stop_requested)`."""
-    world = SimpleNamespace(said=[], told={}, during=lambda graph, stop: None, snapshots_open=[])
+    world = SimpleNamespace(said=[], reported={}, during=lambda graph, stop: None, snapshots_open=[])
     about = SimpleNamespace(name="scope", camera="camera")
 
     class Source:
@@ -158,8 +158,8 @@ def reconstructing(monkeypatch):
     world.worker = SimpleNamespace(
         stop_requested=lambda: world.stopped,
         say=lambda state, reason: world.said.append((state, reason)),
-        tell_figures=lambda part, call: world.told.setdefault("figures", []).append(call()),
-        tell_measures=lambda part, call: world.told.setdefault("measures", []).append(call()),
+        tell_figures=lambda part, call: world.reported.setdefault("figures", []).append(call()),
+        tell_measures=lambda part, call: world.reported.setdefault("measures", []).append(call()),
         folder=SimpleNamespace(engine_size="size file"),
     )
     world.stopped = False
@@ -190,7 +190,7 @@ def test_a_reconstruction_reports_its_state_its_pictures_and_its_figures(reconst
         ("running", "reconstructs"),
     ]
     assert scores == ["score"] and world.offered == [("new", "NEWEST")], "layers are drawn for new pictures only"
-    assert world.told == {"figures": [{"graph": "figures"}, {}], "measures": [{"graph": "measures"}, {}]}
+    assert world.reported == {"figures": [{"graph": "figures"}, {}], "measures": [{"graph": "measures"}, {}]}
     assert world.checked == ("camera", 1.0) and world.measured == ("scope", 0.5) and world.scale == 0.25
     assert world.snapshots_open == [True, False]
 

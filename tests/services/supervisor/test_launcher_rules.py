@@ -67,12 +67,12 @@ def test_a_request_keeps_it_from_being_an_orphan(launcher: Launcher) -> None:
 
 
 def test_it_ends_when_it_is_told_to_is_an_orphan_or_its_socket_is_gone(tmp_path: Path) -> None:
-    told = Launcher(tmp_path / "told", 600.0)
-    assert asked(told, packed_json({"command": "stop"})) == {"ok": True}
+    stopped = Launcher(tmp_path / "stopped", 600.0)
+    assert asked(stopped, packed_json({"command": "stop"})) == {"ok": True}
     orphan = Launcher(tmp_path / "orphan", 0.0)
     gone = Launcher(tmp_path / "gone", 600.0)
     (tmp_path / "gone").unlink()
-    for each in (told, orphan, gone):
+    for each in (stopped, orphan, gone):
         each.serve()  # returns
         assert each._listener.fileno() == -1
     assert list(tmp_path.iterdir()) == []

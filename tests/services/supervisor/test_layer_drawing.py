@@ -108,8 +108,8 @@ def test_a_snapshot_on_any_device_is_drawn_as_its_model_is(layer, device):
     drawing, scene = LayerDrawing(device.type), LayerScene(snapshot, model.camera, 1.0, {"state": "live"})
     drawing.orbit = Orbit(20, -10)
     image, said = drawing.draw(layer, scene)
-    expected, told = drawn(layer, model, Orbit(20, -10))
-    assert said.keys() == told.keys()
+    expected, drawn_layer = drawn(layer, model, Orbit(20, -10))
+    assert said.keys() == drawn_layer.keys()
     away = np.abs(image.astype(int) - expected)
     palette_step = {"depth": 9}.get(layer, 3)
     """Depth is coloured in 256 steps, up to 8 levels of a channel apart: another device's rounding may fall on either side of one."""

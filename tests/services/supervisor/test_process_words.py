@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from services.api.assembly import told
+from services.api.assembly import event_receiver
 from services.audit.system_events import SystemEvents
 from services.supervisor import process as processes
 from services.supervisor.launcher import Direct, last_words
@@ -87,6 +87,6 @@ def test_the_audit_log_has_the_loss_without_the_address(capture):
     events, heard = SystemEvents(), []
     events.tell = lambda *values, **detail: heard.append((values, detail))  # type: ignore[method-assign]
     for event in capture.events:
-        told(StreamMeasures(), events)(event)
+        event_receiver(StreamMeasures(), events)(event)
     reason = {"reason": "the log has the reason"}
     assert heard == [(("source.lost", "theatre", "failed"), reason), (("source.recovered", "theatre", "done"), reason)]

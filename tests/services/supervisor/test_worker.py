@@ -28,11 +28,11 @@ def new_worker(runtime):
 
 def test_a_running_process_answers_holds_its_role_and_leaves_no_trace(new_worker, runtime):
     before = [signal.getsignal(number) for number in SIGNALS]
-    with new_worker({"extra": lambda told: {"twice": 2 * told["value"]}}) as worker:
+    with new_worker({"extra": lambda arguments: {"twice": 2 * arguments["value"]}}) as worker:
         endpoint = worker.folder.commands("capture")
         assert ask(endpoint, "ping")["pid"] == os.getpid()
         assert ask(endpoint, "extra", value=4)["twice"] == 8
-        worker.take({"later": lambda told: {"seen": True}})
+        worker.take({"later": lambda arguments: {"seen": True}})
         assert ask(endpoint, "later")["seen"]
         assert worker.folder.record("capture") is not None
         with pytest.raises(AlreadyRunning):
@@ -101,13 +101,13 @@ def test_figures_are_new_in_every_heartbeat_and_measures_once_per_second(new_wor
     worker.tell_figures("part", lambda: count("figures"))
     worker.tell_measures("part", lambda: count("measures"))
     worker.tell_figures("other", lambda: {"more": 1})
-    told = []
+    reports = []
     for after_s in (0.0, 0.5, MEASURED_EVERY_S - 0.5, MEASURED_EVERY_S - 0.25):
         now.s += after_s
-        told.append(worker._report())
-    assert [each["figures"] for each in told] == [{"figures": k, "more": 1} for k in (1, 2, 3, 4)]
-    assert [each["measures"] for each in told] == [{"measures": k} for k in (1, 1, 2, 2)]
-    assert told[0]["role"] == "capture" and told[0]["state"] == "starting"
+        reports.append(worker._report())
+    assert [each["figures"] for each in reports] == [{"figures": k, "more": 1} for k in (1, 2, 3, 4)]
+    assert [each["measures"] for each in reports] == [{"measures": k} for k in (1, 1, 2, 2)]
+    assert reports[0]["role"] == "capture" and reports[0]["state"] == "starting"
 
 
 class Exited(Exception):
@@ -157,7 +157,7 @@ def test_a_process_that_does_not_finish_in_time_ends_itself(new_worker, watch):
     assert watch(worker, 1.0, 90.0) is None
     socket_file = runtime_file = worker.folder.path / "left"
     runtime_file.touch()
-    stop = lambda now_s: worker.request_stop("told") if now_s >= 100 else None
+    stop = lambda now_s: worker.request_stop("requested") if now_s >= 100 else None
     assert watch(worker, 99.0, 100.0, 103.0, 105.0, then=stop) is None
     cleaned = []
     object.__setattr__(worker, "folder", SimpleNamespace(clean=cleaned.append))

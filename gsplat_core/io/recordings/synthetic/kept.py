@@ -25,7 +25,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from gsplat_core.io.files import PartialFile
-from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.frames import Frame
 
 log = logging.getLogger(__name__)
@@ -41,18 +41,18 @@ def default_folder() -> Path:
 
 
 def kept_recording(
-    asked: Asked,
+    settings: RenderSettings,
     folder: Path | None = None,
     *,
     most_bytes: int = MOST_BYTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> RenderedRecording:
-    """Return `render_recording(asked)`, read from the cache if an earlier call has stored it.
+    """Return `render_recording(settings)`, read from the cache if an earlier call has stored it.
 
     An unusable cache folder is not an error; the recording is rendered instead.
 
     Args:
-        asked: parameters of the recording.
+        settings: parameters of the recording.
         folder: cache folder; None selects `default_folder()`.
         most_bytes: size limit of the cache in bytes.
         progress: callback that receives the numbers of rendered and of all frames.
@@ -61,12 +61,12 @@ def kept_recording(
         InvalidSetting: as raised by `render_recording`.
     """
     folder = folder or default_folder()
-    path = folder / f"{_digest(asked)}{SUFFIX}"
-    if _is_own(folder) and (found := _read(path, asked)) is not None:
+    path = folder / f"{_digest(settings)}{SUFFIX}"
+    if _is_own(folder) and (found := _read(path, settings)) is not None:
         with contextlib.suppress(OSError):
             os.utime(path)  # it was used
         return found
-    recording = render_recording(asked, progress)
+    recording = render_recording(settings, progress)
     try:
         _keep(recording, path, most_bytes)
     except OSError as error:
@@ -83,13 +83,13 @@ def _is_own(folder: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
 
 
-def _read(path: Path, asked: Asked) -> RenderedRecording | None:
+def _read(path: Path, settings: RenderSettings) -> RenderedRecording | None:
     """Read a cached recording; None if it is missing or damaged. Damaged files are removed."""
     try:
         planes = load_file(path)
-        frames = [_frame(planes, index, asked.fps) for index in range(asked.frames)]
-        wanted = (asked.height_px, asked.width_px, 3)
-        if frames[0].image.shape != wanted or (frames[0].right_image is None) == asked.stereo:
+        frames = [_frame(planes, index, settings.fps) for index in range(settings.frames)]
+        wanted = (settings.height_px, settings.width_px, 3)
+        if frames[0].image.shape != wanted or (frames[0].right_image is None) == settings.stereo:
             raise ValueError(f"its pictures are {frames[0].image.shape}")
     except FileNotFoundError:
         return None
@@ -98,7 +98,7 @@ def _read(path: Path, asked: Asked) -> RenderedRecording | None:
         with contextlib.suppress(OSError):
             path.unlink()
         return None
-    return RenderedRecording(frames, asked)
+    return RenderedRecording(frames, settings)
 
 
 def _frame(planes: dict[str, NDArray], index: int, fps: float) -> Frame:
@@ -141,8 +141,8 @@ def _make_room(folder: Path, most_bytes: int) -> None:
         total -= size
 
 
-def _digest(asked: Asked) -> str:
-    said = repr([(field.name, getattr(asked, field.name)) for field in fields(asked)])
+def _digest(settings: RenderSettings) -> str:
+    said = repr([(field.name, getattr(settings, field.name)) for field in fields(settings)])
     return hashlib.sha256(f"{_renderer()} {said}".encode()).hexdigest()[:40]
 
 

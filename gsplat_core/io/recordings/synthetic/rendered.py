@@ -20,7 +20,7 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 
 
 @dataclass(frozen=True)
-class Asked:
+class RenderSettings:
     """Parameters of a synthetic recording; the fields match the arguments of `synthesize`."""
 
     frames: int = 48
@@ -39,20 +39,20 @@ class RenderedRecording:
 
     notes: tuple[str, ...] = ()
 
-    def __init__(self, frames: list[Frame], asked: Asked) -> None:
+    def __init__(self, frames: list[Frame], settings: RenderSettings) -> None:
         self.name = "synthetic"
-        self.width_px, self.height_px = asked.width_px, asked.height_px
+        self.width_px, self.height_px = settings.width_px, settings.height_px
         self.camera = Camera.from_focal(
-            DEFAULT_FOCAL_FACTOR * max(asked.width_px, asked.height_px), asked.width_px, asked.height_px
+            DEFAULT_FOCAL_FACTOR * max(settings.width_px, settings.height_px), settings.width_px, settings.height_px
         )
-        right = self.camera.right_eye(BASELINE_MM) if asked.stereo else None
+        right = self.camera.right_eye(BASELINE_MM) if settings.stereo else None
         self._frames = [frame.with_fields(depth_origin=DepthOrigin.MEASURED, right_camera=right) for frame in frames]
-        self.frame_count, self.fps = len(frames), asked.fps
-        extras = [] if asked.extras == CLEAR else [asked.extras.described()]
-        stated = [*(getattr(asked, each.name) for each in fields(asked) if each.name != "extras"), *extras]
+        self.frame_count, self.fps = len(frames), settings.fps
+        extras = [] if settings.extras == CLEAR else [settings.extras.described()]
+        stated = [*(getattr(settings, each.name) for each in fields(settings) if each.name != "extras"), *extras]
         self.digest = hashlib.sha256(json.dumps(stated).encode()).hexdigest()
-        self.fields = frozenset({"mask", "depth", "pose", *(["right_image"] if asked.stereo else [])})
-        self.stereo_baseline_mm = BASELINE_MM if asked.stereo else None
+        self.fields = frozenset({"mask", "depth", "pose", *(["right_image"] if settings.stereo else [])})
+        self.stereo_baseline_mm = BASELINE_MM if settings.stereo else None
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order."""
@@ -65,17 +65,17 @@ class RenderedRecording:
         return self.camera.with_pose(pose)
 
 
-def render_recording(asked: Asked, progress: Callable[[int, int], None] | None = None) -> RenderedRecording:
+def render_recording(settings: RenderSettings, progress: Callable[[int, int], None] | None = None) -> RenderedRecording:
     """Render the recording that `synthesize` would write.
 
     Raises:
         InvalidSetting: if an argument is out of range.
     """
-    frames, fps = asked.frames, asked.fps
-    check_arguments(frames, asked.width_px, asked.height_px, fps, asked.seed, asked.camera)
-    threads = threads_that_fit(asked.width_px, asked.height_px)
+    frames, fps = settings.frames, settings.fps
+    check_arguments(frames, settings.width_px, settings.height_px, fps, settings.seed, settings.camera)
+    threads = threads_that_fit(settings.width_px, settings.height_px)
     scene = SyntheticScene.from_seed(
-        asked.seed, asked.width_px, asked.height_px, frames / fps, asked.camera == "moving", asked.extras
+        settings.seed, settings.width_px, settings.height_px, frames / fps, settings.camera == "moving", settings.extras
     )
 
     def rendered(index: int) -> Frame:
@@ -85,7 +85,7 @@ def render_recording(asked: Asked, progress: Callable[[int, int], None] | None =
             seq=index,
             pts_ns=round(time_s * 1e9),
             image=left.image,
-            right_image=scene.render(time_s, "right").image if asked.stereo else None,
+            right_image=scene.render(time_s, "right").image if settings.stereo else None,
             depth=left.depth.astype(np.float32),
             mask=np.where(left.tool, 0, 1).astype(np.uint8),
             pose=scene.camera_at(time_s).world_to_camera,
@@ -97,4 +97,4 @@ def render_recording(asked: Asked, progress: Callable[[int, int], None] | None =
             made.append(frame)
             if progress is not None:
                 progress(done, frames)
-    return RenderedRecording(made, asked)
+    return RenderedRecording(made, settings)

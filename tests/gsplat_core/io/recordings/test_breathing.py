@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.io.recordings.synthetic.breathing import PERIOD_S, Breathing
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG
 
@@ -46,12 +46,12 @@ def test_the_rate_wanders_as_far_as_asked_and_keeps_its_mean() -> None:
 
 
 def test_the_tissue_breathes_as_asked() -> None:
-    asked = Asked(frames=3, width_px=48, height_px=40, fps=1, seed=2)
+    asked = RenderSettings(frames=3, width_px=48, height_px=40, fps=1, seed=2)
     usual, other = (
         render_recording(each)
         for each in (
             asked,
-            Asked(frames=3, width_px=48, height_px=40, fps=1, seed=2, extras=Extras(breathing_ratio=2.0)),
+            RenderSettings(frames=3, width_px=48, height_px=40, fps=1, seed=2, extras=Extras(breathing_ratio=2.0)),
         )
     )
     assert usual.digest != other.digest

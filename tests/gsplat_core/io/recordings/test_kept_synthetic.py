@@ -10,9 +10,9 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.synthetic import kept
 from gsplat_core.io.recordings.synthetic.kept import kept_recording
-from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 
-SMALL = Asked(frames=2, width_px=40, height_px=32, camera="moving", stereo=True)
+SMALL = RenderSettings(frames=2, width_px=40, height_px=32, camera="moving", stereo=True)
 ONE = 2 * (40 * 32 * (3 + 3 + 4 + 1) + 128)
 """Bytes of its planes."""
 
@@ -51,7 +51,7 @@ def test_the_second_time_it_comes_from_the_file_and_is_the_same(tmp_path, render
     "other", [{"seed": 1}, {"frames": 3}, {"stereo": False}, {"camera": "fixed"}, {"fps": 25.0}, {"width_px": 48}]
 )
 def test_each_argument_makes_another_file(tmp_path, rendered, other):
-    wanted = Asked(**{**SMALL.__dict__, **other})
+    wanted = RenderSettings(**{**SMALL.__dict__, **other})
     kept_recording(SMALL, tmp_path / "kept")
     assert kept_recording(wanted, tmp_path / "kept").frame_count == wanted.frames
     assert rendered == [SMALL, wanted]
@@ -76,7 +76,7 @@ def test_a_damaged_file_is_rendered_again(tmp_path, rendered, damage):
 
 def test_what_was_not_used_for_longest_is_removed(tmp_path, rendered):
     folder = tmp_path / "kept"
-    others = [Asked(**{**SMALL.__dict__, "seed": seed}) for seed in range(1, 4)]
+    others = [RenderSettings(**{**SMALL.__dict__, "seed": seed}) for seed in range(1, 4)]
     for age, asked in enumerate([SMALL, *others]):
         kept_recording(asked, folder, most_bytes=3 * ONE + ONE // 2)
         for file in folder.iterdir():
@@ -112,4 +112,4 @@ def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, rendered):
 
 def test_wrong_arguments_are_refused(tmp_path):
     with pytest.raises(InvalidSetting, match="frames must be"):
-        kept_recording(Asked(frames=0), tmp_path / "kept")
+        kept_recording(RenderSettings(frames=0), tmp_path / "kept")

@@ -62,8 +62,8 @@ def test_depth_that_came_late_comes_back_in_its_place(tmp_path):
     writer.close("end")
     reader = SessionReader(tmp_path / "s")
     assert len(reader.segments) > 1 and reader.fields >= {"mask", "right_image"} and "depth" not in reader.fields
-    told = [(line.event, line.seq) for line in reader.schedule()]
-    assert told == [("observe", 0), ("observe", 1), ("take_depth", 0), ("observe", 2), ("take_depth", 1)]
+    events = [(line.event, line.seq) for line in reader.schedule()]
+    assert events == [("observe", 0), ("observe", 1), ("take_depth", 0), ("observe", 2), ("take_depth", 1)]
     first, second = reader.late_depths()
     assert first["depth"].tobytes() == bare.depth.tobytes() and first["depth_confidence"] is None
     assert second["depth_confidence"].tobytes() == late.depth_confidence.tobytes()

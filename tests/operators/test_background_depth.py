@@ -16,7 +16,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.placement import LateDepth
-from operators.depth import FEW_CORES, DepthBeside, DepthBesideOp, FoundDepth, share_of
+from operators.depth import FEW_CORES, BackgroundDepth, BackgroundDepthOp, FoundDepth, share_of
 from operators.outcome import OutcomeBuilder
 
 CAMERA = Camera.from_focal(30.0, 24, 16)
@@ -53,7 +53,7 @@ def estimator():
 
 @pytest.fixture
 def beside(estimator):
-    made = DepthBeside("gated", CAMERA, share=1.0)
+    made = BackgroundDepth("gated", CAMERA, share=1.0)
     made.start()
     yield made
     estimator.gate.release(1000)
@@ -131,7 +131,7 @@ def test_an_estimator_learns_of_a_scene_whose_first_frame_was_passed_over(beside
     ("choice", "fields"), [("gated", {"depth": PLANE}), ("none", {}), ("recorded", {}), ("auto", {})]
 )
 def test_where_there_is_nothing_to_look_for_nobody_is_asked(frame, choice, fields, estimator):
-    beside = DepthBeside(choice, CAMERA)
+    beside = BackgroundDepth(choice, CAMERA)
     beside.start()
     for seq in range(3):
         beside.offer(frame(seq, **fields))
@@ -149,8 +149,8 @@ def test_what_is_doubted_is_not_found(beside, estimator, frame):
 
 
 def test_a_failure_is_raised_by_the_operator_and_once(estimator, frame, compute):
-    beside = DepthBeside("gated", CAMERA)
-    operator = DepthBesideOp(None, beside=beside)
+    beside = BackgroundDepth("gated", CAMERA)
+    operator = BackgroundDepthOp(None, beside=beside)
     operator.start()
     estimator.fails = True
     estimator.gate.release()
@@ -162,7 +162,7 @@ def test_a_failure_is_raised_by_the_operator_and_once(estimator, frame, compute)
 
 
 def test_it_can_be_stopped_while_it_rests_and_started_again(estimator, frame):
-    beside = DepthBeside("gated", CAMERA, share=1e-6)  # rests for hours
+    beside = BackgroundDepth("gated", CAMERA, share=1e-6)  # rests for hours
     estimator.gate.release(10)
     for seq in (0, 1):
         beside.start()
@@ -183,7 +183,7 @@ def test_depth_rests_three_times_as_long_as_it_works_where_cores_are_few(
     bound, rested, clock = [], [], iter(range(1000))
     monkeypatch.setattr("operators.depth.usable_cores", lambda: cores)
     monkeypatch.setattr("operators.depth.use_one_thread", lambda: bound.append(True))
-    beside = DepthBeside("gated", CAMERA)
+    beside = BackgroundDepth("gated", CAMERA)
     monkeypatch.setattr(beside, "_rest", rested.append)
     monkeypatch.setattr("operators.depth.time", SimpleNamespace(thread_time=lambda: 0.2 * next(clock)))
     estimator.gate.release(10)
@@ -200,7 +200,7 @@ def test_few_cores_are_left_to_training():
 
 @pytest.mark.parametrize(("choice", "kept"), [("auto", True), ("recorded", True), ("none", False), ("stereo", False)])
 def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, choice, kept):
-    operator = DepthBesideOp(None, beside=DepthBeside(choice, CAMERA))
+    operator = BackgroundDepthOp(None, beside=BackgroundDepth(choice, CAMERA))
     operator.start()
     given = frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED)
     (passed,) = compute(operator, frame=given)
@@ -215,7 +215,7 @@ def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, c
 
 
 def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute):
-    operator = DepthBesideOp(None, beside=DepthBeside("gated", CAMERA))
+    operator = BackgroundDepthOp(None, beside=BackgroundDepth("gated", CAMERA))
     operator.start()
     compute(operator, frame=frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED))
     estimator.gate.release()
@@ -230,4 +230,4 @@ def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute)
 
 def test_another_name_is_refused():
     with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto"):
-        DepthBeside("sonar", CAMERA)
+        BackgroundDepth("sonar", CAMERA)
