@@ -22,10 +22,10 @@ from services.bus.runtime import Role, RuntimeFolder, StreamFolder
 from services.display.hub import KINDS, DisplayHub, EncodedPicture
 from services.errors import BusError, RegistryError
 from services.registry.models import ModelRegistry
-from services.server.stream_specs import gpus, spec_of
 from services.supervisor.launcher import ByLauncher, Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent
 from services.supervisor.specs import StreamSpec, assigned
+from services.supervisor.stream_specs import gpus, spec_of
 from services.supervisor.worker import remove_dead
 
 

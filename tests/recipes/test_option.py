@@ -33,7 +33,7 @@ from services.cli.app import run
 from services.api.parts import NewStream
 from services.api.replays import ReplayRequest
 from services.api.streams import StreamRequest
-from services.server.stream_specs import spec_of
+from services.supervisor.stream_specs import spec_of
 from services.settings import load_settings
 from services.supervisor.engine import live_settings
 from services.supervisor.specs import ProcessSpec

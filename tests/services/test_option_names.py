@@ -19,8 +19,8 @@ from services.api.parts import NewStream
 from services.cli import app as command_line
 from services.schemas.replays import ReplayRequest
 from services.schemas.streams import StreamRequest
-from services.server.stream_specs import spec_of
 from services.settings import SettingsInvalid, load_settings
+from services.supervisor.stream_specs import spec_of
 
 NAMES = [
     *(("field", name) for name in FIELDS),

@@ -11,7 +11,7 @@ from operators.sources.address import PROTOCOLS
 from operators.sources.address_options import PARSERS
 from operators.sources.registry import SOURCES, check_address
 from services.api.parts import NewStream
-from services.server.stream_specs import spec_of
+from services.supervisor.stream_specs import spec_of
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,11 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from services.api.parts import NewStream
-from services.server import stream_specs
-from services.server.stream_specs import spec_of
+from services.supervisor import stream_specs
 from services.supervisor.engine import live_settings
 from services.supervisor.process import ProcessState
 from services.supervisor.stream import overall
+from services.supervisor.stream_specs import spec_of
 
 
 def wanted(device="cpu", **options):

@@ -1,1 +1,0 @@
-"""Conversion of an API stream to the specification of its processes."""
