@@ -97,8 +97,8 @@ class HighlightFinder:
         cv2.threshold(high, settings.brightest_channel - 1, 1, cv2.THRESH_BINARY, dst=other)
         if not cv2.countNonZero(cv2.bitwise_and(found, other, dst=found)):
             return None
-        least = cv2.resize(_surroundings(low, high, settings), found.shape[::-1], dst=other)
-        cv2.bitwise_and(found, cv2.compare(low, least, cv2.CMP_GE, dst=other), dst=found)
+        most = cv2.resize(_surroundings(low, high, settings), found.shape[::-1], dst=other)
+        cv2.bitwise_and(found, cv2.compare(low, most, cv2.CMP_GT, dst=other), dst=found)
         if not 0 < cv2.countNonZero(found) <= settings.most * found.size:
             return None
         grown = cv2.dilate(found, _disc(max(1, round(settings.grown * max(found.shape)))), dst=other)
@@ -112,8 +112,10 @@ def _disc(radius_px: int) -> NDArray[np.uint8]:
 
 
 def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: HighlightSettings) -> NDArray[np.uint8]:
-    """Return the threshold of a highlight's darkest channel, reduced by `SHRINK` (rounded up): the
-    local mean plus an offset. Black pixels are excluded.
+    """Return the largest darkest channel that is not a highlight, reduced by `SHRINK` (rounded up).
+
+    It is one level below the local mean plus an offset. Black pixels are excluded from the mean. Where the sum
+    exceeds 255, the result is 255, so that even a saturated area is not a highlight there.
     """
     width, height = (-(-side // SHRINK) for side in low.shape[::-1])
     small, lit = (
@@ -126,4 +128,4 @@ def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: Hig
         for plane in (cv2.multiply(small, weight), weight)
     )
     least = total / np.maximum(count, 1) + np.float32(settings.above_surroundings)
-    return np.minimum(least, 255).astype(np.uint8)
+    return (least - 1).clip(0, 255).astype(np.uint8)

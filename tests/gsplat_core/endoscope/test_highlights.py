@@ -159,7 +159,19 @@ def test_what_is_black_beyond_the_field_of_view_does_not_make_pale_tissue_a_high
     assert kept is None or kept[inside > 0].all()
 
 
-def test_a_white_area_wider_than_the_surroundings_is_kept_in_its_middle():
-    kept = without_highlights(spotted(250, (180, 90, 90), side=80))
-    assert kept is None or kept[128 + 30 : 128 + 50, 160 + 30 : 160 + 50].all()
-    assert not without_highlights(spotted(250, (180, 90, 90), side=15))[128 : 128 + 15, 160 : 160 + 15].any()
+@pytest.mark.parametrize("level", [250, 254, 255])
+@pytest.mark.parametrize("size", [(256, 320), (1024, 1280)])
+def test_a_white_area_wider_than_the_surroundings_is_kept_in_its_middle(level, size):
+    unit = size[0] // 256
+    kept = without_highlights(spotted(level, (180, 90, 90), size, side=80 * unit))
+    rows, columns = (slice(side // 2 + 30 * unit, side // 2 + 50 * unit) for side in size)
+    assert kept is None or kept[rows, columns].all()
+    kept = without_highlights(spotted(level, (180, 90, 90), size, side=15 * unit))
+    rows, columns = (slice(side // 2, side // 2 + 15 * unit) for side in size)
+    assert not kept[rows, columns].any()
+
+
+@pytest.mark.parametrize("level", [226, 240, 254])
+def test_saturated_spots_on_overexposed_tissue_are_no_highlights(level):
+    """A saturated level exceeds its surroundings by less than the required 30 levels."""
+    assert without_highlights(spotted(255, (level, level, level))) is None
