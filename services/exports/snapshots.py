@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import logging
 import os
 import re
 import secrets
@@ -21,7 +22,7 @@ from typing import Any
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
-from gsplat_core.io.files import sync_folder
+from gsplat_core.io.files import sync_folder, write_durably
 from services.api.problems import Conflicting, Unprocessable
 from services.errors import CommandRefused, ExportFailed, NoSnapshot
 from services.exports.cache import ExportCache, Exported
@@ -30,6 +31,7 @@ from services.registry.models import ModelRegistry
 from services.registry.records import State, VersionRecord
 from services.supervisor.stream import SupervisedStreams
 
+log = logging.getLogger(__name__)
 NUMBER = re.compile(r"[0-9a-f]{16}")
 ABOUT = "snapshot.json"
 MANIFEST = "manifest.json"
@@ -90,13 +92,14 @@ class SnapshotStore:
 
     def keep(self, path: Path, made: Snapshot) -> None:
         """Store the content of a folder from `new`."""
-        (path / ABOUT).write_text(json.dumps(asdict(made)))
+        write_durably(path / ABOUT, [json.dumps(asdict(made)).encode()])
         of_stream = self._folder / made.stream
         of_stream.mkdir(mode=0o700, exist_ok=True)
         os.rename(path, of_stream / made.id)
         sync_folder(of_stream)
         for old in self.all(made.stream)[self._most :]:
-            self.delete(made.stream, old.id)
+            with suppress(NoSnapshot):  # deleted by a concurrent request
+                self.delete(made.stream, old.id)
 
     def all(self, stream: str) -> list[Snapshot]:
         """Return the snapshots of a stream, newest first."""
@@ -111,12 +114,15 @@ class SnapshotStore:
         """Return one snapshot.
 
         Raises:
-            NoSnapshot: if the snapshot does not exist.
+            NoSnapshot: if the snapshot does not exist, or its record is damaged.
         """
         try:
             return Snapshot(**json.loads((self.folder_of(stream, number) / ABOUT).read_text()))
         except FileNotFoundError:
             raise self._absent(stream) from None
+        except (ValueError, TypeError) as error:
+            log.warning("the record of snapshot %s of %s is damaged and ignored: %s", number, stream, error)
+            raise self._absent(stream) from error
 
     def folder_of(self, stream: str, number: str) -> Path:
         """Return the bundle folder of a snapshot.
@@ -137,7 +143,10 @@ class SnapshotStore:
         """
         path = self.folder_of(stream, number)
         gone = self._folder / f".new-{secrets.token_hex(8)}"
-        os.rename(path, gone)
+        try:
+            os.rename(path, gone)
+        except FileNotFoundError:  # deleted by a concurrent request
+            raise self._absent(stream) from None
         shutil.rmtree(gone)
 
     def _absent(self, stream: str) -> NoSnapshot:
@@ -180,7 +189,8 @@ class StreamSnapshots:
             try:
                 said = await supervisor.command("engine", "snapshot", timeout_s=WRITE_S, folder=str(folder))
             except CommandRefused as error:
-                raise Conflicting(str(error)) from error
+                # The engine names its folder, which is a path of the server.
+                raise Conflicting(str(error).replace(str(folder), "the snapshot")) from error
             taken = await asyncio.to_thread(described, folder, stream, by, said)
             if model is None:
                 await asyncio.to_thread(self._store.keep, folder, taken)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 
-from services.errors import NoSnapshot
-from services.exports.snapshots import Snapshot, SnapshotStore, described
+from services.api.problems import Conflicting
+from services.errors import CommandRefused, NoSnapshot
+from services.exports.snapshots import Snapshot, SnapshotStore, StreamSnapshots, described
 
 SAID = {"seq": 7, "model_version": 3, "gaussians": 12, "time_window_s": [1.0, 2.0], "pause_ms": 0.4, "more": 1}
 
@@ -60,4 +65,44 @@ def test_what_fails_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
     (tmp_path / ".new-1").mkdir()
     SnapshotStore(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damaged", ["", '{"id": ', "[]", "null", '{"id": "1"}', "\xff"])
+def test_a_damaged_record_hides_only_its_own_snapshot(tmp_path, damaged):
+    store = SnapshotStore(tmp_path)
+    lost, kept = taken(store), taken(store, number=1)
+    (store.folder_of("a", lost.id) / "snapshot.json").write_bytes(damaged.encode("latin-1"))
+    assert store.all("a") == [kept]
+    with pytest.raises(NoSnapshot):
+        store.get("a", lost.id)
+    assert taken(store, number=2) in store.all("a")
+    store.delete("a", lost.id)
+    assert not (tmp_path / "a" / lost.id).exists()
+
+
+def test_a_snapshot_is_kept_when_another_request_deletes_the_oldest_first(tmp_path, monkeypatch):
+    store = SnapshotStore(tmp_path, most=1)
+    oldest = taken(store)
+    listed = store.all
+
+    def deleted_after_the_list(stream: str) -> list[Snapshot]:
+        found = listed(stream)
+        SnapshotStore.delete(store, stream, oldest.id)
+        return found
+
+    monkeypatch.setattr(store, "all", deleted_after_the_list)
+    newest = taken(store, number=1)
+    assert listed("a") == [newest]
+
+
+def test_a_refused_snapshot_does_not_show_a_path_of_the_server(tmp_path):
+    async def refuse(*_: object, folder: str, **__: object) -> None:
+        raise CommandRefused(f"cannot write the model to {folder}: No space left on device; free space")
+
+    streams = SimpleNamespace(with_engine=lambda stream: SimpleNamespace(command=refuse))
+    snapshots = StreamSnapshots(cast(Any, streams), cast(Any, None), SnapshotStore(tmp_path))
+    with pytest.raises(Conflicting, match="No space left") as caught:
+        asyncio.run(snapshots.take("a", None, "somebody"))
+    assert str(tmp_path) not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
