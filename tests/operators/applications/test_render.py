@@ -47,7 +47,7 @@ def test_a_gpu_renders_the_same_pictures(gpu, bundle, tmp_path):
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_written(bundle, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(DeviceMissing, match="sees no GPU"):
+    with pytest.raises(DeviceMissing, match="finds no GPU"):
         render_model(bundle, tmp_path / "images", device="cuda")
     assert not (tmp_path / "images").exists()
 
