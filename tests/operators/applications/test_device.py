@@ -16,7 +16,9 @@ def test_a_gpu_needs_torch_to_see_it_and_its_kernels(monkeypatch):
     with pytest.raises(DeviceMissing, match="'tpu' is not known; use --device cpu or cuda"):
         check_device("tpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(DeviceMissing, match=f"torch {torch.__version__.split('+')[0]}.* finds no GPU; use --device cpu"):
+    with pytest.raises(
+        DeviceMissing, match=f"torch {torch.__version__.split('+')[0]}.* finds no GPU; use --device cpu"
+    ):
         check_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(native, "CUDA_MISSING", "not built (so is this test's reason)")
