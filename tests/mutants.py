@@ -7,11 +7,11 @@
 A mutant is a module with one changed expression: a comparison reversed or shifted at its boundary,
 an arithmetic operator or number replaced, `and` swapped with `or`, `min` with `max`, a condition
 negated, or a call removed. Tests run with the mutant in place of the module, in all processes that
-they start. Each run is a fork of one process that has imported the large libraries. No file of the checkout is changed. Test files named after the module run first, then
-those that import it, then those that import it indirectly. A run ends at the first failure. A test
-that also fails without the mutant is flaky: it is listed and excluded, and the remaining tests
-decide. A mutant survives if all of them pass. Mutants are drawn at random with a seed, in equal
-parts from each folder.
+they start. Each run is a fork of one process that has imported the large libraries. No file of the
+checkout is changed. Test files named after the module run first, then those that import it, then
+those that import it indirectly. A run ends at the first failure. A test that also fails without the
+mutant is flaky: it is listed and excluded, and the remaining tests decide. A mutant survives if all
+of them pass. Mutants are drawn at random with a seed, in equal parts from each folder.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import time
 import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -338,7 +338,7 @@ def outcome_of(mutant: Mutant, folder: Path) -> Outcome:
 
 
 def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant]:
-    """Draw random mutants, in equal parts from each folder."""
+    """Draw random mutants, in equal parts from each folder, in random order: the first ones are a sample, too."""
     rng = random.Random(seed)
     groups = [[ROOT / each for each in only]] if only else [sorted((ROOT / folder).rglob("*.py")) for folder in FOLDERS]
     chosen: list[Mutant] = []
@@ -357,6 +357,7 @@ def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant
                 seen.add((mutant.path, mutant.change))
                 chosen.append(mutant)
                 share -= 1
+    rng.shuffle(chosen)
     return chosen
 
 
@@ -403,7 +404,8 @@ def main() -> int:
         import_libraries()
         runs = [(mutant, Path(folder) / str(number)) for number, mutant in enumerate(chosen)]
         with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork")) as pool:
-            for mutant, outcome, seconds in pool.map(timed_outcome, runs):
+            for finished in as_completed(pool.submit(timed_outcome, run) for run in runs):
+                mutant, outcome, seconds = finished.result()
                 by = outcome.killed_by
                 killed += by is not None
                 flaky.update(outcome.flaky)
