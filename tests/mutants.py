@@ -116,23 +116,29 @@ class Mutant:
     source: str
 
 
+@cache
+def changeable(path: Path) -> tuple[ast.Module, tuple[tuple[int, int], ...]]:
+    """Return the tree of a module, and the node index and change number of each of its mutants."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    places = ((index, number) for index, node in enumerate(ast.walk(tree)) for number in range(len(_changes(node))))
+    return tree, tuple(places)
+
+
+def mutant_at(path: Path, index: int, number: int) -> Mutant | None:
+    """Return one mutant of a module, or None where the change leaves the text as it is."""
+    tree = copy.deepcopy(changeable(path)[0])
+    node = next(each for place, each in enumerate(ast.walk(tree)) if place == index)
+    before = ast.unparse(node)
+    _changes(node)[number]()
+    after = ast.unparse(node)
+    if after == before:
+        return None
+    return Mutant(str(path.relative_to(ROOT)), getattr(node, "lineno", 0), f"{before}  =>  {after}", ast.unparse(tree))
+
+
 def mutants_of(path: Path) -> Iterator[Mutant]:
     """Return every mutant of a module."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for index, node in enumerate(ast.walk(tree)):
-        for number in range(len(_changes(node))):
-            changed_tree = copy.deepcopy(tree)
-            changed = next(each for place, each in enumerate(ast.walk(changed_tree)) if place == index)
-            before = ast.unparse(changed)
-            _changes(changed)[number]()
-            after = ast.unparse(changed)
-            if after != before:
-                yield Mutant(
-                    str(path.relative_to(ROOT)),
-                    getattr(node, "lineno", 0),
-                    f"{before}  =>  {after}",
-                    ast.unparse(changed_tree),
-                )
+    return filter(None, (mutant_at(path, *place) for place in changeable(path)[1]))
 
 
 def _changes(node: ast.AST) -> list[Callable[[], None]]:
@@ -349,11 +355,10 @@ def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant
         for _ in range(share * 20):
             if share == 0:
                 break
-            possible = [
-                each for each in mutants_of(rng.choices(files, weights)[0]) if (each.path, each.change) not in seen
-            ]
-            if possible:
-                mutant = rng.choice(possible)
+            file = rng.choices(files, weights)[0]
+            places = changeable(file)[1]
+            mutant = mutant_at(file, *rng.choice(places)) if places else None
+            if mutant is not None and (mutant.path, mutant.change) not in seen:
                 seen.add((mutant.path, mutant.change))
                 chosen.append(mutant)
                 share -= 1
