@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {
-        # the better field according to benchmarks/notes/replay.md
+        # the better field according to benchmarks/results/replay.md
         "auto": "gsplat_core.deformation.basis:KIND",
         "basis": "gsplat_core.deformation.basis:KIND",
         "hexplane": "gsplat_core.deformation.hexplane:KIND",

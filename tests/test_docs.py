@@ -262,7 +262,7 @@ def test_the_training_program_in_the_guide_works(tmp_path):
 
 
 def test_guides_state_no_measured_quality():
-    """Measured figures belong into RESULTS.md, which is generated from logs, or into benchmarks/notes with their commit."""
+    """Measured figures belong into RESULTS.md, which is generated from logs, or into benchmarks/results with their commit."""
     found = []
     for document in GUIDES:
         if "docs" in document.relative_to(ROOT).parts and "adr" not in document.parts:

@@ -258,7 +258,7 @@ class FrameRenderer:
         """Create a renderer and capture its graph.
 
         With precision "fp16", SH coefficients, field and blending use half precision. The picture
-        is nearly exact (PSNR in `benchmarks/notes/renderer.md`) and faster. `camera` determines
+        is nearly exact (PSNR in `benchmarks/results/renderer.md`) and faster. `camera` determines
         size and camera model of every frame, and the pose of those rendered without a camera.
 
         Raises:

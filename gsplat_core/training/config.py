@@ -72,7 +72,7 @@ class ReconstructorConfig:
 
     field: str = "auto"
     """Deformation field: a name in `gsplat_core.deformation.FIELDS`. `auto` is the better one in
-    `benchmarks/notes/replay.md`.
+    `benchmarks/results/replay.md`.
     """
     gaussians: int = 30_000
     """Number of Gaussians created from the first frame; frames that uncover new tissue add more."""

@@ -39,7 +39,7 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 AT_FIRST = 0.6
-"""Share before anything was learned. See benchmarks/notes/constants.md."""
+"""Share before anything was learned. See benchmarks/results/constants.md."""
 FOLLOWS = 0.15
 """Weight of the newest frame in the moving average."""
 ONE_FRAME = (-0.5, 1.5)

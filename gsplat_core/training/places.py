@@ -26,7 +26,7 @@ FINE_PX, COARSE_PX = 1.0, 16.0
 illumination.
 """
 SAME_PLACE = 0.75
-"""Correlation from which a picture shows a place. See benchmarks/notes/constants.md."""
+"""Correlation from which a picture shows a place. See benchmarks/results/constants.md."""
 LEAST_SHARE = 0.3
 """Share of the picture that must be both tissue and covered by the place."""
 

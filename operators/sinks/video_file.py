@@ -25,7 +25,7 @@ CODEC = "libvpx-vp9"
 """VP9 by libvpx: playable in an MP4 by browsers, readable by OpenCV, and BSD-licensed."""
 _QUALITY = "24"
 """Constant quality of libvpx, 0 to 63, lower is better. Gives at least 38 dB
-(benchmarks/notes/graph.md).
+(benchmarks/results/graph.md).
 """
 _FRAMES_WAITING = 2
 """Capacity of the encoder's queue in frames; a further frame blocks the caller."""

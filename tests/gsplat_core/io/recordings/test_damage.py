@@ -19,7 +19,7 @@ from tests.gsplat_core.io.recordings import videos
 Refused = Callable[..., str]
 
 FLIPS, HOLES = 24, 12
-# The largest share of damaged files in which a changed picture may pass for whole: what was measured (benchmarks/notes/recordings.md) and some room
+# The largest share of damaged files in which a changed picture may pass for whole: what was measured (benchmarks/results/recordings.md) and some room
 # for other versions of the encoders. H.265 and Motion JPEG carry no redundancy against a single bit.
 UNSEEN_FLIPS = {
     "ffv1": 0.0,
