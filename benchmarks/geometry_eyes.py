@@ -87,9 +87,7 @@ class Scores:
             left = render(now, self._camera.with_pose(pose))
             if eye is not None:
                 eye = eye.with_pose(eye.world_to_camera @ pose)
-                seen = (
-                    model.seen_from(eye, frame.time_s).at(frame.time_s) if now.right_sh is None else now.seen_by_right()
-                )
+                seen = now.seen_by_right()
                 self._views[frame.seq] = render(seen, eye).image.cpu().numpy()
         value = psnr_tissue_db((left.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu(), frame.image, frame.mask)
         self._left.append(value)

@@ -18,7 +18,6 @@ from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.scene.model import Model
-from gsplat_core.scene.scope_path import MOST_TIMES, ScopePath
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 FORMAT_VERSION = 1
@@ -65,7 +64,6 @@ class Manifest:
     depth_source: DepthSource | None = None
     right_eye: bool = False
     """True if the Gaussians have separate colours for the right eye."""
-    scope_path: ScopePath | None = None
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
         """Return Gaussians and field of the described shapes on the meta device, without memory."""
@@ -121,7 +119,6 @@ def parse_manifest(text: bytes, name: str) -> Manifest:
         parameters=root.integer("parameters", PARAMETERS) if "parameters" in root.values else None,
         depth_source=None if root.values.get("depth") is None else _depth_source(root.nested("depth")),
         right_eye=gaussians.boolean("right_eye") if "right_eye" in gaussians.values else False,
-        scope_path=None if root.values.get("scope_path") is None else _scope_path(root.nested("scope_path")),
     )
 
 
@@ -131,17 +128,6 @@ def _depth_source(reader: JsonObject) -> DepthSource:
     if metric and origin in UNITLESS:
         raise BundleCorrupt(f"{reader.name}: depth of origin {origin.value!r} has no unit, and metric is true")
     return DepthSource(origin, metric)
-
-
-def _scope_path(reader: JsonObject) -> ScopePath:
-    times = reader.numbers("times_s", TIME_S, MOST_TIMES)
-    poses = np.array(reader.matrices("world_to_camera", 4, POSE, MOST_TIMES))
-    try:
-        for pose in poses:
-            _check_rigid(pose)
-        return ScopePath(tuple(times), poses)
-    except InvalidInput as error:
-        raise BundleCorrupt(f"{reader.name}: {error}") from error
 
 
 def _camera(reader: JsonObject) -> Camera:

@@ -14,13 +14,11 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField, checked_window, continued_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.rendering.elsewhere import SeenFromElsewhere
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import Surface, certainty, render_surface
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.scope_path import ScopePath
 from gsplat_core.value_ranges import check_seen_at
 
 
@@ -62,12 +60,8 @@ class Model:
     depth_source: DepthSource | None = None
     """Source of the training depth; None without depth or in bundles of earlier versions."""
 
-    scope_path: ScopePath | None = None
-    """Scope trajectory during training; None if unknown, as after training frame by frame."""
-
     _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
     _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
-    _elsewhere: list[SeenFromElsewhere | None] = dataclasses.field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time_window_s", checked_window(self.time_window_s))
@@ -159,22 +153,6 @@ class Model:
             return self
         return dataclasses.replace(self, gaussians=self.gaussians.seen_by_right())
 
-    def seen_from(self, camera: Camera, time_s: float) -> Model:
-        """Return a static model of time `time_s` with the highlights that `camera` would see.
-
-        Highlights are moved to where the scope's light would cause them. If the scope's position is
-        unknown, the highlights of the scope's left eye are kept. The first call takes as long as
-        some dozens of renderings.
-        """
-        if not self._elsewhere:
-            self._elsewhere.append(SeenFromElsewhere.of(self))
-        seen = self._elsewhere[0]
-        if seen is None:
-            return self
-        return dataclasses.replace(
-            self, gaussians=seen.at(camera, self.clamp_time(time_s)), field=None, scope_path=None
-        )
-
     def render(
         self, time_s: float, camera: Camera | None = None, background: Tensor | None = None, depth: bool = True
     ) -> RenderOutput:
@@ -197,7 +175,6 @@ class Model:
         # Omitted if unknown, which preserves the digest of models of earlier versions.
         depth = {} if source is None else {"depth": {"origin": source.origin.value, "metric": source.metric}}
         right = {} if self.gaussians.right_sh is None else {"right_eye": True}
-        scope = {} if self.scope_path is None else {"scope_path": self.scope_path.description()}
         return {
             "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree, **right},
             "field": None if self.field is None else self.field.config(),
@@ -211,7 +188,6 @@ class Model:
             "time_window_s": list(self.time_window_s),
             "training_digest": self.training_digest,
             **depth,
-            **scope,
         }
 
     def sha256(self) -> str:

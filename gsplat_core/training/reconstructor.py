@@ -18,7 +18,6 @@ from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
-from gsplat_core.scene.scope_path import ScopePath
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, ObserveReport, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
@@ -78,7 +77,6 @@ class Reconstructor:
         self._usual_first_loss = math.inf
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
-        self._scope_path: ScopePath | None = None
         self.depth_doubts: Mapping[str, int] = {}
         """Reasons why `fit` found no depth, with numbers of frames of a moving camera."""
 
@@ -242,7 +240,6 @@ class Reconstructor:
             self._grow(frame, observation, number == 0)
             tracks.apply(self._step, number, first_new)
         most, settings = self.config.max_gaussians, settings or FitSettings()
-        self._scope_path = ScopePath.of([one.time_s for one in seen], [one.camera.world_to_camera for one in seen])
         loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
@@ -258,7 +255,7 @@ class Reconstructor:
         self._version += 1
         with continued(self._step, self._prior, self._learned_s):
             gaussians, field = self._step.copy()
-        return Model(gaussians=gaussians, field=field, scope_path=self._scope_path, **self._facts())
+        return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
         """Return the current model for display with the next version number.

@@ -140,14 +140,12 @@ class SeenFromAnywhere:
         self._makers: dict[Camera, PictureMaker] = {}
 
     def __call__(self, model: Model, camera: Camera, frame: Frame) -> Picture:
-        """Render the model from `camera` at the frame's timestamp and exposure, in the colours
-        visible from there.
-        """
+        """Render the model from `camera` at the frame's timestamp and exposure."""
         lens = camera.with_pose(np.eye(4))
         maker = self._makers.get(lens)
         if maker is None:
             maker = self._makers[lens] = PictureMaker(lens, self._device, self._renderer)
-        return maker(model.seen_from(camera, frame.time_s), frame.with_fields(pose=camera.world_to_camera))
+        return maker(model, frame.with_fields(pose=camera.world_to_camera))
 
 
 def measure_geometry(
@@ -408,17 +406,12 @@ class _Work:
 
     def _of_final_model(self, right: bool = False):  # type: ignore[no-untyped-def]
         """Return a function that renders the final model for a frame, in the colours of the left or
-        right eye.
-
-        If the model was not trained on the right eye, its colours are predicted from the left
-        eye's.
+        right eye. A model that was not trained on the right eye has the left eye's colours for both.
         """
         settings, camera = self.settings, self.camera
         self._require_memory_of_picture()
         model = self.model.to(settings.device)
         pictures = PictureMaker(camera, settings.device, settings.renderer)
-        if right and model.gaussians.right_sh is None:
-            return lambda frame, eye: pictures(model.seen_from(eye, frame.time_s), frame, eye)
         shown = model.seen_by_right() if right else model
         return lambda frame, eye=None: pictures(shown, frame, eye)
 

@@ -245,37 +245,26 @@ class _Pictures:
     """Renders a model from a view. Not thread-safe."""
 
     def __init__(self, model: Model, view: View, make_renderer: Callable[[], Renderer]) -> None:
-        self._model, self.view = model, view
-        self._eyes = [(seen, make_renderer()) for seen in _eyes_of(model, view)]
-        for seen, renderer in self._eyes:
-            renderer.prepare(seen or model)
+        self.view = view
+        # The second of two pictures side by side is the right eye's.
+        models = [model, model.seen_by_right()][: view.across]
+        self._eyes = [make_renderer() for _ in models]
+        for seen, renderer in zip(models, self._eyes, strict=True):
+            renderer.prepare(seen)
 
     def at(self, time_s: float) -> NDArray[np.uint8]:
         """Render the view's pictures side by side, uint8 RGB [H, W, 3]."""
         with torch.inference_mode():
             drawn = zip(self._eyes, self.view.cameras(time_s), strict=True)
-            return np.hstack([self._picture(seen, renderer, camera, time_s) for (seen, renderer), camera in drawn])
+            return np.hstack([self._picture(renderer, camera, time_s) for renderer, camera in drawn])
 
-    def _picture(self, seen: Model | None, renderer: Renderer, camera: Camera, time_s: float) -> NDArray[np.uint8]:
-        if seen is None and (there := self._model.seen_from(camera, time_s)) is not self._model:
-            renderer.prepare(there)
+    def _picture(self, renderer: Renderer, camera: Camera, time_s: float) -> NDArray[np.uint8]:
         if not self.view.is_virtual:
             return displayed(renderer.render(camera, time_s, ("image",)).result().image)
         output = renderer.render(camera, time_s, ("image", "alpha")).result()
         image, alpha = np.array(displayed(output.image)), HostCopy(output.alpha).numpy()
         mark_unobserved(image, alpha)
         return image
-
-
-def _eyes_of(model: Model, view: View) -> list[Model | None]:
-    """Return the model variant for each picture side by side; None selects colours by the position
-    of the camera.
-    """
-    if not view.is_virtual:
-        return [model]
-    if view.across == 1:
-        return [None]
-    return [model, None if model.gaussians.right_sh is None else model.seen_by_right()]
 
 
 def _images(

@@ -5,7 +5,6 @@ import json
 import os
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -17,7 +16,6 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.model import Model
-from gsplat_core.scene.scope_path import ScopePath
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
 
@@ -60,38 +58,6 @@ def test_colours_of_the_right_eye_are_kept_and_part_of_the_digest(make_gaussians
         (tmp_path / "manifest.json").write_text(json.dumps(other))
         with pytest.raises(BundleCorrupt, match=said):
             load_bundle(tmp_path)
-
-
-SCOPE = {"times_s": [0.5, 1.0], "world_to_camera": [torch.eye(4).tolist()] * 2}
-
-
-def test_where_the_scope_was_is_kept_and_part_of_the_digest(make_gaussians, tmp_path):
-    model = make_model(make_gaussians(4))
-    there = replace(model, scope_path=ScopePath(tuple(SCOPE["times_s"]), np.array(SCOPE["world_to_camera"])))
-    save_bundle(there, tmp_path)
-    loaded = load_bundle(tmp_path)
-    assert loaded.sha256() == there.sha256() != model.sha256()
-    assert loaded.scope_path.description() == SCOPE
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"times_s": [1.0, 0.5]}, "times that increase"),
-        ({"times_s": [0.1] * 25}, "times_s must be a list of 1 to 24"),
-        ({"times_s": [0.5, True]}, "times_s"),
-        ({"times_s": [0.5, 0.7, 0.9]}, "as many poses"),
-        ({"world_to_camera": []}, "1 to 24 matrices"),
-        ({"world_to_camera": [[[1.0] * 4] * 4]}, "must be a rotation"),
-        ({"world_to_camera": [[[1.0] * 4] * 3]}, "4 rows of 4 numbers"),
-    ],
-)
-def test_a_path_of_the_scope_that_cannot_be_is_refused(change, said, make_gaussians, tmp_path):
-    save_bundle(make_model(make_gaussians(4)), tmp_path)
-    manifest = json.loads((tmp_path / "manifest.json").read_text())
-    (tmp_path / "manifest.json").write_text(json.dumps({**manifest, "scope_path": {**SCOPE, **change}}))
-    with pytest.raises(BundleCorrupt, match=said):
-        load_bundle(tmp_path)
 
 
 @pytest.mark.parametrize("source", [None, *(DepthSource(origin, metric=False) for origin in DepthOrigin)])
