@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, RENDERERS, Eyes
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
-from operators.graph.engines import Engine
+from operators.graph.application import Engine
 from operators.options import Command, Declared, Names, Option, Section, for_callers, options_for, options_of
 
 TRAINING_RUNS: tuple[Command, ...] = ("replay", "batch", "reconstruct", "job")

@@ -19,7 +19,7 @@ from gsplat_core.scene.model import Model
 from operators.applications.device import seeded
 from operators.errors import OperatorsError, RunFailed
 from operators.graph import Application, DurationSummary, run
-from operators.graph.engines import Engine
+from operators.graph.application import Engine
 from operators.ingest import LOOK_S, SourceResult
 from operators.metrics import QualityResult
 from operators.outcome import Contributor, OutcomeBuilder

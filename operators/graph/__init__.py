@@ -4,7 +4,7 @@ Operators written for the SDK run on the schedulers of this package and on the S
 imported only by `run(app, engine="holoscan")`.
 """
 
-from operators.graph.application import Application, Fragment
+from operators.graph.application import Application, Engine, Fragment, run
 from operators.graph.clock import Clock, ManualClock, RealtimeClock
 from operators.graph.conditions import (
     AsynchronousCondition,
@@ -19,12 +19,19 @@ from operators.graph.conditions import (
     PeriodicConditionPolicy,
     SchedulingStatus,
 )
-from operators.graph.contexts import ExecutionContext, InputContext, OutputContext
-from operators.graph.engines import Engine, run
-from operators.graph.faults import DISABLE_BRANCH, STOP_GRAPH, Fault, FaultAction, FaultPolicy
 from operators.graph.graph import RunResult, StopReason
-from operators.graph.metadata import MetadataPolicy
-from operators.graph.operator import Operator
+from operators.graph.operator import (
+    DISABLE_BRANCH,
+    STOP_GRAPH,
+    ExecutionContext,
+    Fault,
+    FaultAction,
+    FaultPolicy,
+    InputContext,
+    MetadataPolicy,
+    Operator,
+    OutputContext,
+)
 from operators.graph.queues import EdgeStats
 from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler
 from operators.graph.spec import REQUIRED, ConditionType, ConnectorType, IOSpec, OperatorSpec, QueuePolicy

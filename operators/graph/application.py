@@ -1,22 +1,21 @@
-"""Fragments and applications, which compose operators and run them."""
+"""Fragments and applications, which compose operators, and the engines that run them."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import Literal
 
 from operators.errors import GraphBusy, GraphInvalid
-from operators.graph.faults import Fault
 from operators.graph.graph import Flow, Graph, RunResult, Scheduler
+from operators.graph.operator import Fault, Operator
 from operators.graph.queues import EdgeStats
 from operators.graph.schedulers import GreedyScheduler
 from operators.graph.spec import QueuePolicy, queue_policy
 from operators.graph.tracking import FlowTracker
 
-if TYPE_CHECKING:
-    from operators.graph.operator import Operator
+Engine = Literal["embedded", "holoscan"]
 
 
 class Fragment:
@@ -207,3 +206,25 @@ class Fragment:
 
 class Application(Fragment):
     """A graph that can be run on its own."""
+
+
+def run(app: Fragment, engine: Engine = "embedded") -> RunResult:
+    """Run an application on the embedded schedulers or on the Holoscan SDK. Results and counts are
+    the same.
+
+    Args:
+        app: the application.
+        engine: `embedded` or `holoscan`.
+
+    Raises:
+        EngineMissing: the SDK is not installed or cannot be loaded.
+        EngineUnsupported: the SDK cannot run the graph faithfully.
+        GraphError: as `Fragment.run` raises it.
+    """
+    if engine == "embedded":
+        return app.run()
+    if engine == "holoscan":
+        from operators.graph.holoscan import HoloscanScheduler
+
+        return app.run_on(HoloscanScheduler(app.scheduler()))
+    raise ValueError(f"unknown engine {engine!r}; choose embedded or holoscan")

@@ -30,12 +30,11 @@ from typing import Any, cast
 from operators.errors import EngineError, EngineUnsupported
 from operators.graph.clock import ManualClock
 from operators.graph.conditions import SchedulingStatus
-from operators.graph.graph import Graph, Scheduler
+from operators.graph.graph import Graph, OperatorTask, Scheduler
 from operators.graph.queues import CarriedEdge
 from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler, interruptible_wait
 from operators.graph.sdk import keep_signals, load_sdk
 from operators.graph.spec import QueuePolicy
-from operators.graph.task import OperatorTask
 
 _sdk = load_sdk()
 _Operator: Any = _sdk.core.Operator

@@ -1,18 +1,117 @@
-"""Base class of streaming operators."""
+"""Base class of streaming operators, their access to inputs, outputs and environment during compute, and their policies
+for metadata and faults.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, ClassVar
 
-from operators.errors import GraphInvalid
+from operators.errors import GraphInvalid, MetadataConflict, OperatorFailed, PortError
+from operators.graph.clock import Clock
 from operators.graph.conditions import Condition, DownstreamMessageAffordableCondition, MessageAvailableCondition
-from operators.graph.faults import STOP_GRAPH, FaultPolicy
-from operators.graph.metadata import MetadataPolicy
+from operators.graph.queues import Edge, Message
 from operators.graph.spec import REQUIRED, ConditionType, IOSpec, OperatorSpec
+from operators.graph.tracking import Trail
 
-if TYPE_CHECKING:
-    from operators.graph.application import Fragment
-    from operators.graph.contexts import ExecutionContext, InputContext, OutputContext
+
+class FaultAction(Enum):
+    """Reaction to one fault."""
+
+    STOP_GRAPH = "stop_graph"
+    RESTART = "restart"
+    DISABLE_BRANCH = "disable_branch"
+
+
+@dataclass(frozen=True)
+class FaultPolicy:
+    """Reaction of an operator to its own exceptions. Messages in work at that time are lost and
+    counted as a fault.
+    """
+
+    action: FaultAction = FaultAction.STOP_GRAPH
+    restarts: int = 0
+    """Maximum number of restarts, each by `stop` and `start`."""
+    afterwards: FaultAction = FaultAction.STOP_GRAPH
+    """Reaction after the last restart."""
+
+    def __post_init__(self) -> None:
+        if self.restarts < 0 or (self.action is FaultAction.RESTART) != (self.restarts > 0):
+            raise ValueError(f"FaultPolicy: {self.action.value} does not go with {self.restarts} restarts")
+        if self.afterwards is FaultAction.RESTART:
+            raise ValueError("FaultPolicy: afterwards must be stop_graph or disable_branch")
+
+    @classmethod
+    def restart(cls, restarts: int, afterwards: FaultAction = FaultAction.STOP_GRAPH) -> FaultPolicy:
+        """Return a policy that restarts the operator up to `restarts` times."""
+        return cls(FaultAction.RESTART, restarts, afterwards)
+
+    def action_after(self, restarts_done: int) -> FaultAction:
+        """Return the reaction to the next fault after `restarts_done` restarts."""
+        if self.action is not FaultAction.RESTART:
+            return self.action
+        return FaultAction.RESTART if restarts_done < self.restarts else self.afterwards
+
+
+STOP_GRAPH = FaultPolicy()
+"""Stop the graph; `run()` raises (default)."""
+DISABLE_BRANCH = FaultPolicy(FaultAction.DISABLE_BRANCH)
+"""Finish the operator and all operators fed only by it. The rest of the graph continues."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """An exception of an operator and the reaction to it."""
+
+    error: OperatorFailed
+    action: FaultAction
+
+    @property
+    def operator(self) -> str:
+        """Name of the operator."""
+        return self.error.operator
+
+
+class MetadataPolicy(Enum):
+    """Treatment of a metadata key that is already present."""
+
+    UPDATE = "update"
+    """The last received message wins (default)."""
+    REJECT = "reject"
+    """The first received message wins."""
+    RAISE = "raise"
+    """Equal values are accepted and different ones raise MetadataConflict, to detect misaligned
+    joins.
+    """
+    INPLACE_UPDATE = "update"  # noqa: PIE796 - alias of the Holoscan SDK
+
+
+def merge_metadata(into: dict[str, Any], received: dict[str, Any], policy: MetadataPolicy) -> None:
+    """Merge the metadata of a received message.
+
+    Args:
+        into: metadata of the current compute, modified.
+        received: metadata of the message.
+        policy: treatment of keys that are already present.
+
+    Raises:
+        MetadataConflict: a key has different values and `policy` is `RAISE`.
+    """
+    if policy is MetadataPolicy.UPDATE:
+        into.update(received)
+        return
+    for key, value in received.items():
+        present = into.setdefault(key, value)
+        if policy is MetadataPolicy.RAISE and present is not value and not _same_scalar(present, value):
+            raise MetadataConflict(f"metadata {key!r} is {present!r} in one message and {value!r} in another")
+
+
+def _same_scalar(one: Any, other: Any) -> bool:
+    """Compare plain values. Arrays compare by identity, which the caller has already checked."""
+    plain = (str, bytes, int, float, bool, tuple)
+    return isinstance(one, plain) and isinstance(other, plain) and one == other
 
 
 class Operator:
@@ -35,7 +134,7 @@ class Operator:
 
     def __init__(
         self,
-        fragment: Fragment,
+        fragment: Any,
         *args: Condition,
         name: str = "",
         fault_policy: FaultPolicy | None = None,
@@ -121,3 +220,149 @@ class Operator:
             if value is REQUIRED:
                 raise GraphInvalid(f"operator {self.name!r} needs the parameter {name!r}")
             setattr(self, name, value)
+
+
+class InputContext:
+    """Inputs of an operator during compute."""
+
+    __slots__ = ("_operator", "_ports", "_received", "_single")
+
+    def __init__(self, operator: Operator, edges: Mapping[str, list[Edge]], received: list[Message]) -> None:
+        """Connect the inputs of an operator.
+
+        Args:
+            operator: the operator.
+            edges: edges into each connected input.
+            received: list to which received messages are appended.
+        """
+        self._operator, self._received = operator, received
+        self._ports = {name: (port, edges.get(name, [])) for name, port in operator.spec.inputs.items()}
+        self._single = {name: edges[0] for name, (port, edges) in self._ports.items() if edges and not port.batched}
+
+    def receive(self, name: str, *, kind: str = "") -> Any:
+        """Return the oldest message's value, or None if no message is queued.
+
+        A port of size n > 1 returns a tuple of all queued values. A port of `ANY_SIZE` returns a
+        tuple with one entry per connection.
+        """
+        edge = self._single.get(name)
+        if edge is not None:
+            message = edge.pop()
+            if message is None:
+                return None
+            return self._taken(message)
+        return self._receive_batch(name)
+
+    def queued(self, name: str) -> int:
+        """Return the number of queued messages at an input with one connection; 0 if not
+        connected.
+        """
+        edge = self._single.get(name)
+        return 0 if edge is None else len(edge)
+
+    def _receive_batch(self, name: str) -> Any:
+        if name not in self._ports:
+            raise PortError(f"operator {self._operator.name!r} has no input {name!r}; it has {sorted(self._ports)}")
+        port, edges = self._ports[name]
+        if not edges:
+            return None
+        popped: list[Message | None]
+        if port.size == port.ANY_SIZE:
+            popped = [edge.pop() for edge in edges]
+        else:
+            popped = []
+            while (message := edges[0].pop()) is not None:
+                popped.append(message)
+        values = tuple(None if message is None else self._taken(message) for message in popped)
+        return values or None
+
+    def _taken(self, message: Message) -> Any:
+        """Return the value of a message after merging its metadata into the operator's."""
+        self._received.append(message)
+        if message.metadata:
+            merge_metadata(self._operator.metadata, message.metadata, self._operator.metadata_policy)
+        return message.value
+
+
+class OutputContext:
+    """Outputs of an operator during compute."""
+
+    __slots__ = ("_operator", "_ports", "_trail")
+
+    def __init__(
+        self, operator: Operator, edges: Mapping[str, list[Edge]], trail: Callable[[], Trail] | None = None
+    ) -> None:
+        """Connect the outputs of an operator.
+
+        Args:
+            operator: the operator.
+            edges: edges from each connected output.
+            trail: returns the trail of a message emitted now; None without flow tracking.
+        """
+        self._operator, self._trail = operator, trail
+        ports = operator.spec.outputs
+        self._ports = {name: (edges.get(name, []), runtime_type(port.type)) for name, port in ports.items()}
+
+    def emit(self, data: Any, name: str = "", emitter_name: str = "", acq_timestamp: int = -1) -> None:
+        """Emit a value with the operator's metadata along every edge of an output.
+
+        Args:
+            data: the value.
+            name: output port; optional if the operator has only one.
+            emitter_name: ignored; for compatibility with Holoscan.
+            acq_timestamp: ignored; for compatibility with Holoscan.
+
+        Raises:
+            PortError: unknown output or wrong type.
+            QueueFull: a blocking edge is full.
+        """
+        try:
+            edges, declared = self._ports[name]
+        except KeyError:
+            edges, declared = self._only_port(name)
+        if declared is not None and not isinstance(data, declared):
+            raise PortError(
+                f"operator {self._operator.name!r} emitted {type(data).__name__} on output {name!r}, which declares {declared}"
+            )
+        metadata = self._operator.metadata
+        trail = () if self._trail is None else self._trail()
+        message = Message(data, metadata.copy() if metadata else None, trail)
+        for edge in edges:
+            edge.push(message)
+
+    def _only_port(self, name: str) -> tuple[list[Edge], Any]:
+        if name == "" and len(self._ports) == 1:
+            return next(iter(self._ports.values()))
+        raise PortError(f"operator {self._operator.name!r} has no output {name!r}; it has {sorted(self._ports)}")
+
+
+class ExecutionContext:
+    """Environment of an operator during compute."""
+
+    __slots__ = ("_find", "_name", "clock", "input", "output")
+
+    def __init__(
+        self,
+        name: str,
+        inputs: InputContext,
+        outputs: OutputContext,
+        clock: Clock,
+        find: Callable[[str], Operator | None],
+    ) -> None:
+        self._name, self._find = name, find
+        self.input, self.output = inputs, outputs
+        self.clock = clock
+        """Clock of the scheduler, from the start of the run: `timestamp()` in ns, `time()` in s."""
+
+    def find_operator(self, name: str = "") -> Operator | None:
+        """Return an operator of the graph by name, or this operator without a name. None if
+        unknown.
+        """
+        return self._find(name or self._name)
+
+
+def runtime_type(declared: Any) -> Any:
+    """Return the part of a port's type that isinstance can check; None if any value is allowed."""
+    if declared in (None, Any, object):
+        return None
+    return getattr(declared, "__origin__", declared)

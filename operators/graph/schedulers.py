@@ -5,18 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from operators.errors import GraphInvalid, OperatorStuck
 from operators.graph.clock import Clock, ManualClock, RealtimeClock
 from operators.graph.conditions import SchedulingStatus
+from operators.graph.graph import Graph, OperatorTask
 from operators.graph.queues import Edge, LockedEdge
 from operators.graph.spec import QueuePolicy
-
-if TYPE_CHECKING:
-    from operators.graph.graph import Graph
-    from operators.graph.task import OperatorTask
-
 
 _LOOK_S = 0.25
 

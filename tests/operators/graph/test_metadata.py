@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from operators.errors import MetadataConflict
-from operators.graph.metadata import MetadataPolicy, merge_metadata
+from operators.graph.operator import MetadataPolicy, merge_metadata
 
 
 @pytest.mark.parametrize(("policy", "kept"), [(MetadataPolicy.UPDATE, 2), (MetadataPolicy.REJECT, 1)])
