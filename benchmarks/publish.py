@@ -39,7 +39,7 @@ class Column:
         digits: digits after the point.
         unit: printed after the figure.
         scale: the printed figure is the value times this.
-        better: `more` or `less`: which runs are worse; None where neither is.
+        better: `more` or `less`; the worst run is printed accordingly. None: no worst run is printed.
     """
 
     title: str
@@ -50,7 +50,7 @@ class Column:
     better: str | None = None
 
     def of(self, result: Mapping[str, Any]) -> float | None:
-        """The value in a result; None where it has none."""
+        """Return the value in a result, or None if the result lacks it."""
         for path in [self.path] if isinstance(self.path, str) else self.path:
             value: Any = result
             for key in path.split("."):
@@ -60,7 +60,7 @@ class Column:
         return None
 
     def cell(self, results: Iterable[Mapping[str, Any]]) -> str:
-        """The median over the runs; with several runs also the worst and their number."""
+        """Return the median over the runs as text; with several runs also the worst one and their number."""
         values = [value for result in results if (value := self.of(result)) is not None]
         if not values:
             return "–"
@@ -79,13 +79,15 @@ class Row:
         what: first cell.
         log: `DEVICE/NAME` of the log.
         where: values that a result must have to be this row's; needed where a log holds results of several kinds.
-        asked: what was asked for, in words; empty where nothing was.
+        asked: the requirement in words; empty if there is none.
+        front: part of the README's table.
     """
 
     what: str
     log: str
     where: Mapping[str, Any] = field(default_factory=dict)
     asked: str = ""
+    front: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     readme: tuple[str, ...] = ()
-    """Titles of the columns that the README shows; empty where the README has nothing of the table."""
+    """Titles of the columns that the README shows, for the rows marked as `front`."""
 
 
 def db(title: str, *paths: str, better: str | None = "more") -> Column:
@@ -154,8 +156,17 @@ STREAM_COLUMNS = (
 )
 
 
-def kernel(log: str, work: str, asked: str = "") -> Row:
-    return Row(work, f"cuda/{log}", {"work": work}, asked)
+LIVE_FRONT = (
+    "displayed frame (training error)",
+    "previous frame",
+    "next frame, before it is seen",
+    "age p50",
+    "age p99",
+)
+
+
+def kernel(log: str, work: str, asked: str = "", front: bool = False) -> Row:
+    return Row(work, f"cuda/{log}", {"work": work}, asked, front)
 
 
 TABLES = (
@@ -167,32 +178,33 @@ TABLES = (
         "recording",
         LIVE_COLUMNS,
         (
-            Row("`cutting`, 30 frames/s", "cuda/live_cutting", asked="42.5 dB, worst 37, p99 33 ms"),
+            Row("`cutting`, 30 frames/s", "cuda/live_cutting", asked="42.5 dB, worst 37, p99 33 ms", front=True),
             Row("`cutting`, 60 frames/s", "cuda/live_cutting_60", asked="40 dB, p99 25 ms"),
-            Row("`heart`, left eye, 30 frames/s", "cuda/live_heart", asked="37 dB, worst 30"),
+            Row("`heart`, left eye, 30 frames/s", "cuda/live_heart", asked="37 dB, worst 30", front=True),
             Row("`sinus`, 30 frames/s", "cuda/live_sinus", asked="38 dB"),
             Row("`resting_bowel`, 30 frames/s", "cuda/live_resting_bowel", asked="32 dB"),
-            Row("`laparoscopy`, 30 frames/s", "cuda/live_laparoscopy"),
+            Row("`laparoscopy`, 30 frames/s", "cuda/live_laparoscopy", front=True),
             Row("`laparoscopy`, 60 frames/s", "cuda/live_laparoscopy_60"),
             Row("`stereomis_like`, 30 frames/s", "cuda/live_stereomis_like"),
             Row("`cutting`, HexPlane field", "cuda/live_cutting_hexplane"),
         ),
-        ("displayed frame (training error)", "previous frame", "next frame, before it is seen", "age p50", "age p99"),
+        LIVE_FRONT,
     ),
     Table(
         "Live, two CPU cores",
-        "`intrasplat live RECORDING`, usual priority, nothing else running. The command chooses the size of the pictures by what the machine can do.",
+        "`intrasplat live RECORDING` at normal priority on an idle machine. The command measures at which picture size the machine keeps up.",
         "recording",
         LIVE_COLUMNS,
         (
-            Row("`cutting`, 30 frames/s", "cpu/live_cutting", asked="34 dB, p99 150 ms"),
+            Row("`cutting`, 30 frames/s", "cpu/live_cutting", asked="34 dB, p99 150 ms", front=True),
             Row("`heart`, left eye, 30 frames/s", "cpu/live_heart"),
             Row("`resting_bowel`, 30 frames/s", "cpu/live_resting_bowel"),
         ),
+        LIVE_FRONT,
     ),
     Table(
         "What a live model keeps, one NVIDIA H200",
-        "A recording that does not repeat, once through by the clock with the steps that live has time for (`endless.py --clock --once`). At its end the frames of the last 5 s are rendered from the final model and compared with what was recorded.",
+        "A recording that does not repeat, played once in real time with as many steps as live has time for (`endless.py --clock --once`). At its end the frames of the last 5 s are rendered from the final model and compared with the recorded frames.",
         "recording",
         STREAM_COLUMNS,
         tuple(
@@ -220,17 +232,17 @@ TABLES = (
         "recording",
         OFFLINE_COLUMNS,
         (
-            Row("`cutting`", "cuda/reconstruct_cutting"),
+            Row("`cutting`", "cuda/reconstruct_cutting", front=True),
             Row("`cutting`, `--steps 16000`", "cuda/reconstruct_cutting_16000", asked="40.0 dB in 15 s"),
-            Row("`heart`, left eye", "cuda/reconstruct_heart"),
-            Row("`sinus`", "cuda/reconstruct_sinus", asked="33 dB"),
+            Row("`heart`, left eye", "cuda/reconstruct_heart", front=True),
+            Row("`sinus`", "cuda/reconstruct_sinus", asked="33 dB", front=True),
             Row("`organ_still`, eight equal stereo frames", "cuda/reconstruct_organ_still", asked="48 dB"),
         ),
         ("held-out frames", "neighbours' mean", "whole command"),
     ),
     Table(
         "Depth of breathing tissue before a moving scope with given poses",
-        "Synthetic recordings, 5 s at 320x256, seeds 0 and 1 (median, worst). The planes know the truth. The estimator looks for a periodic motion; the generator's usual breath is a sine.",
+        "Synthetic recordings, 5 s at 320x256, seeds 0 and 1 (median, worst). Both planes are fitted to the true depth. The estimator searches for a periodic motion; breathing is a sine unless the row says otherwise.",
         "breathing",
         DEPTH_COLUMNS,
         (
@@ -242,22 +254,22 @@ TABLES = (
     ),
     Table(
         "Kernels, one NVIDIA H200",
-        "Milliseconds of one call, beside gsplat 1.5.3 and plain PyTorch in the same process.",
+        "Time of one call, next to gsplat 1.5.3 and plain PyTorch in the same process.",
         "work",
         KERNEL_COLUMNS,
         (
-            kernel("render", "surgical50k_640x512 forward", "0.06 ms"),
-            kernel("render", "surgical50k_640x512 forward+backward", "0.30 ms"),
-            kernel("render", "volume1m_1080p forward", "0.40 ms"),
+            kernel("render", "surgical50k_640x512 forward", "0.06 ms", front=True),
+            kernel("render", "surgical50k_640x512 forward+backward", "0.30 ms", front=True),
+            kernel("render", "volume1m_1080p forward", "0.40 ms", front=True),
             kernel("render", "volume1m_1080p forward, fp16", "0.30 ms"),
-            kernel("render", "volume1m_1080p forward+backward", "1.8 ms"),
+            kernel("render", "volume1m_1080p forward+backward", "1.8 ms", front=True),
             kernel("render", "volume4m_4k forward", "1.5 ms"),
             kernel("render", "volume4m_4k forward+backward", "7 ms"),
             Row("`rasterization()`, surgical50k_640x512 forward", "cuda/rasterization", {"work": "surgical50k_640x512 forward"}, "0.35 ms"),
             Row("`rasterization()`, surgical50k_640x512 forward+backward", "cuda/rasterization", {"work": "surgical50k_640x512 forward+backward"}, "1.2 ms"),
             Row("`rasterization()`, volume1m_1080p forward", "cuda/rasterization", {"work": "volume1m_1080p forward"}, "0.9 ms"),
             Row("`rasterization()`, volume1m_1080p forward+backward", "cuda/rasterization", {"work": "volume1m_1080p forward+backward"}, "2.8 ms"),
-            kernel("training", "training step, basis, 40000 Gaussians of degree 0, 640x512", "0.4 ms"),
+            kernel("training", "training step, basis, 40000 Gaussians of degree 0, 640x512", "0.4 ms", front=True),
             kernel("training", "training step, small, 50000 Gaussians of degree 0, 640x512", "0.6 ms"),
             kernel("deformation", "deform, hexplane 85M, fp32, 50000 Gaussians"),
             kernel("deformation", "deform and render, hexplane 85M, fp32, 50000 Gaussians, 640x512", "0.10 ms"),
@@ -286,14 +298,15 @@ def log_lines(log: str, logs: Path = LOGS) -> list[dict[str, Any]]:
 
 
 def results_of(row: Row, logs: Path = LOGS) -> list[dict[str, Any]]:
-    """The results of the row's log that have the values in `row.where`."""
+    """Return the results of the row's log that have the values in `row.where`."""
     found = [line["result"] for line in log_lines(row.log, logs) if "result" in line]
     return [result for result in found if all(result.get(key) == value for key, value in row.where.items())]
 
 
-def table_text(table: Table, logs: Path = LOGS, columns: tuple[str, ...] = ()) -> str:
-    """The table in Markdown; empty where none of its rows has a log. `columns` chooses among the columns by title."""
-    rows = [(row, results) for row in table.rows if (results := results_of(row, logs))]
+def table_text(table: Table, logs: Path = LOGS, front: bool = False) -> str:
+    """Return the table in Markdown, or the README's part of it; empty if none of its rows has a log."""
+    columns = table.readme if front else ()
+    rows = [(row, found) for row in table.rows if (row.front or not front) and (found := results_of(row, logs))]
     shown = [
         column
         for column in table.columns
@@ -303,7 +316,7 @@ def table_text(table: Table, logs: Path = LOGS, columns: tuple[str, ...] = ()) -
     if not rows:
         return ""
     asked = not columns and any(row.asked for row, _ in rows)
-    head = [table.first, *(column.title for column in shown), *(["asked"] if asked else [])]
+    head = [table.first, *(column.title for column in shown), *(["required"] if asked else [])]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row, results in rows:
         cells = [row.what, *(column.cell(results) for column in shown), *([row.asked] if asked else [])]
@@ -312,21 +325,21 @@ def table_text(table: Table, logs: Path = LOGS, columns: tuple[str, ...] = ()) -
 
 
 def provenance(table: Table, logs: Path = LOGS) -> str:
-    """A sentence for each machine and commit that the table's figures come from."""
+    """Return a sentence for each machine and commit at which the table's figures were measured."""
     lines = [line for log in dict.fromkeys(row.log for row in table.rows) for line in log_lines(log, logs)]
-    said: dict[str, set[str]] = {}
+    measured: dict[str, set[str]] = {}
     for line in lines:
         about = line["machine"]
         gpu = f"{about['gpu']}, " if "gpu" in about else ""
         name = f"{gpu}{about['cores']} cores of {about['cpu']}, {about['instruction_set']}, torch {about['torch']}"
-        said.setdefault(f"commit {line['commit']}, {line['date']}, {name}", set()).add(line["benchmark"])
-    if len(said) == 1:
-        return f"Measured at {next(iter(said))}."
-    return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in sorted(said.items()))
+        measured.setdefault(f"commit {line['commit']}, {line['date']}, {name}", set()).add(line["benchmark"])
+    if len(measured) == 1:
+        return f"Measured at {next(iter(measured))}."
+    return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in sorted(measured.items()))
 
 
 def failures(logs: Path = LOGS) -> list[str]:
-    """Commands in the logs that ended with an error."""
+    """Return a Markdown line for each logged command that ended with an error."""
     found = []
     for row in (row for table in TABLES for row in table.rows):
         found += [
@@ -338,7 +351,7 @@ def failures(logs: Path = LOGS) -> list[str]:
 
 
 def results_text(logs: Path = LOGS) -> str:
-    """RESULTS.md."""
+    """Return the text of RESULTS.md."""
     parts = [
         "# Results",
         "Generated by `python benchmarks/publish.py` from the logs in [logs](logs); do not edit. `python benchmarks/suite.py --device cpu` "
@@ -355,18 +368,18 @@ def results_text(logs: Path = LOGS) -> str:
 
 
 def readme_block(name: str, logs: Path = LOGS) -> str:
-    """The figures of one block of the README: the tables that it shows, in short."""
+    """Return the tables of one block of the README."""
     if name != "figures":
         raise ValueError(f"unknown block of results {name!r} in README.md; there is 'figures'")
     parts = []
     for table in TABLES:
-        if table.readme and (text := table_text(table, logs, table.readme)):
+        if table.readme and (text := table_text(table, logs, front=True)):
             parts.append(f"**{table.title}**\n\n{text}")
     return "\n\n".join(parts) + "\n" if parts else ""
 
 
 def with_figures(text: str, logs: Path = LOGS) -> str:
-    """A document with its blocks of figures made anew."""
+    """Return a document with its blocks of figures generated from the logs."""
     return BLOCK.sub(lambda found: found.group(1) + readme_block(found.group(2), logs) + found.group(3), text)
 
 
