@@ -31,6 +31,16 @@ __device__ inline Record<D> faint_record() {
   return r;
 }
 
+// Sets everything but the colours: mean (x, y), conic (a, b, c) and log2 of the opacity. Without a cap the conic is positive
+// definite.
+template <int D>
+__device__ inline void set_shape(Record<D>& r, float x, float y, const float* conic, float log2_opacity, float cap = INFINITY) {
+  r.xyab = make_float4(x, y, -0.5f * kLog2E * conic[0], -kLog2E * conic[1]);
+  r.c = -0.5f * kLog2E * conic[2];
+  r.l = log2_opacity;
+  r.cap = cap;
+}
+
 constexpr int kBlockThreads = 128;
 constexpr int kWarps = kBlockThreads / 32;
 constexpr int kQuadrant = 8;  // pixels on a side

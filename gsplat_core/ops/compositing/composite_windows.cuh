@@ -17,7 +17,7 @@ __global__ void make_records(Inputs in, Record<D>* records) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count) return;
   const float x = in.means2d[2 * i], y = in.means2d[2 * i + 1], opacity = in.opacities[i];
-  const float a = in.conics[3 * i], b = in.conics[3 * i + 1], c = in.conics[3 * i + 2];
+  const float conic[3] = {in.conics[3 * i], in.conics[3 * i + 1], in.conics[3 * i + 2]}, a = conic[0], b = conic[1], c = conic[2];
   Record<D> r = {};
   bool usable = isfinite(x) && isfinite(y) && isfinite(a) && isfinite(b) && isfinite(c) && isfinite(opacity);
   if constexpr (D > 0) {
@@ -31,10 +31,8 @@ __global__ void make_records(Inputs in, Record<D>* records) {
   if (!usable) {
     r = faint_record<D>();
   } else {
-    r.xyab = make_float4(x, y, -0.5f * kLog2E * a, -kLog2E * b);
-    r.c = -0.5f * kLog2E * c;
-    r.l = opacity > 0 ? log2f(opacity) : -INFINITY;
-    r.cap = a >= 0 && c >= 0 && a * c - b * b >= 0 ? INFINITY : r.l;
+    const float log2_opacity = opacity > 0 ? log2f(opacity) : -INFINITY;
+    set_shape(r, x, y, conic, log2_opacity, a >= 0 && c >= 0 && a * c - b * b >= 0 ? INFINITY : log2_opacity);
   }
   records[i] = r;
 }

@@ -2,12 +2,14 @@
 #pragma once
 
 #include "../projection/projection_math.h"
+#include "../spherical_harmonics/staged_harmonics.cuh"
 #include "frame.h"
 
 namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA::projection;
+using namespace spherical_harmonics;
 
 // The camera in shared memory. Its matrices come from device memory, so that a captured graph reads the current ones.
 struct Camera {
@@ -36,6 +38,7 @@ __device__ inline ProjectionInput projection_input(const Scene& in, const Camera
   p.eps2d = in.eps2d;
   p.near_plane = in.near_plane;
   p.far_plane = in.far_plane;
+  p.model = CameraModel(in.camera_model);
   return p;
 }
 
@@ -77,18 +80,6 @@ __device__ inline float opacity_of(const RawGaussian& g) { return 1.0f / (1.0f +
 __device__ inline Geometry geometry_of(const RawGaussian& g) {
   const float scales[3] = {expf(g.log_scale[0]), expf(g.log_scale[1]), expf(g.log_scale[2])};
   return GSPLAT_ISA::projection::geometry_of(g.quat, scales);
-}
-
-// The unit vector from the camera to the Gaussian, and one over their distance.
-__device__ inline float unit_direction(const Camera& camera, const float mean[3], float direction[3]) {
-  float squared = 0;
-  for (int k = 0; k < 3; ++k) {
-    direction[k] = mean[k] - camera.center[k];
-    squared = fmaf(direction[k], direction[k], squared);
-  }
-  const float inverse = 1.0f / sqrtf(squared);
-  for (int k = 0; k < 3; ++k) direction[k] *= inverse;
-  return inverse;
 }
 
 }  // namespace

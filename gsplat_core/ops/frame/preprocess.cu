@@ -1,93 +1,10 @@
 // One thread per Gaussian: deform, activate, project, colour, and count or emit its instances.
-#include <cuda_fp16.h>
-
-#include "../spherical_harmonics/spherical_harmonics_bases.h"
 #include "dependent_launch.cuh"
 #include "gaussian.cuh"
 #include "instances.cuh"
 
 namespace gsplat::frame {
 namespace {
-
-using namespace GSPLAT_ISA;
-using namespace GSPLAT_ISA::spherical_harmonics;
-
-template <int bytes>
-__device__ inline void copy_async(void* to, const void* from) {
-  const unsigned at = unsigned(__cvta_generic_to_shared(to));
-  if constexpr (bytes == 16) {
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(at), "l"(from));
-  } else {
-    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(at), "l"(from));
-  }
-}
-
-__device__ inline float to_float(float x) { return x; }
-__device__ inline float to_float(__half x) { return __half2float(x); }
-
-// Spherical-harmonics coefficients of a warp's 32 Gaussians in shared memory. Rows are an odd number of 16-byte words apart, so
-// that eight lanes reading theirs have no bank conflict.
-template <int degree, class Coefficient>
-struct StagedHarmonics {
-  static constexpr int kBases = (degree + 1) * (degree + 1), kRow = 3 * kBases, kInQuad = 16 / sizeof(Coefficient);
-  static constexpr int kQuads = (kRow + kInQuad - 1) / kInQuad, kStride = kInQuad * (kQuads | 1);
-  uint4 rows[32 * kStride / kInQuad];
-
-  // Called by a warp; starts asynchronous copies for the Gaussians with a bit in `visible`, which `wait` completes.
-  __device__ void load(const Coefficient* from, unsigned visible, bool aligned) {
-    const int lane = threadIdx.x & 31;
-    Coefficient* const to = reinterpret_cast<Coefficient*>(rows);
-    if (kRow % kInQuad == 0 && aligned) {
-#pragma unroll 4
-      for (int i = lane; i < 32 * kQuads; i += 32) {
-        const int row = i / kQuads;
-        if (visible >> row & 1) copy_async<16>(to + row * kStride + kInQuad * (i % kQuads), from + kInQuad * i);
-      }
-    } else {
-#pragma unroll 4
-      for (int i = lane; i < 32 * kRow; i += 32) {
-        const int row = i / kRow;
-        if (!(visible >> row & 1)) continue;
-        if constexpr (sizeof(Coefficient) == 4) {
-          copy_async<4>(to + row * kStride + i % kRow, from + i);
-        } else {
-          to[row * kStride + i % kRow] = from[i];
-        }
-      }
-    }
-  }
-
-  __device__ static void wait() {
-    asm volatile("cp.async.wait_all;" ::: "memory");
-    __syncwarp();
-  }
-
-  __device__ void color_at(const float direction[3], float color[3]) const {
-    float bases[kBases], values[kInQuad * kQuads];
-    bases_at<degree>(direction[0], direction[1], direction[2], bases);
-    const uint4* const row = rows + (threadIdx.x & 31) * (kStride / kInQuad);
-#pragma unroll
-    for (int i = 0; i < kQuads; ++i) {
-      const uint4 quad = row[i];
-      Coefficient of_quad[kInQuad];
-      memcpy(of_quad, &quad, sizeof(quad));
-#pragma unroll
-      for (int j = 0; j < kInQuad; ++j) values[kInQuad * i + j] = to_float(of_quad[j]);
-    }
-#pragma unroll
-    for (int k = 0; k < kBases; ++k)
-      for (int j = 0; j < 3; ++j) color[j] = fmaf(bases[k], values[3 * k + j], color[j]);
-  }
-};
-
-__device__ inline Projected project_with(const Scene& in, const ProjectionInput& settings, const float mean[3],
-                                         const Geometry& geometry, float opacity) {
-  switch (in.camera_model) {
-    case kOrtho: return project(settings, View<kOrtho>(settings), mean, geometry, &opacity, false);
-    case kFisheye: return project(settings, View<kFisheye>(settings), mean, geometry, &opacity, false);
-    default: return project(settings, View<kPinhole>(settings), mean, geometry, &opacity, false);
-  }
-}
 
 constexpr float kConstantBase = 0.28209479177387814f;
 
@@ -119,31 +36,30 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   float opacity = 0;
   if (g.usable) {
     opacity = opacity_of(g);
-    p = project_with(in, projection_input(in, camera), g.mean, geometry_of(g), opacity);
+    p = project(projection_input(in, camera), g.mean, geometry_of(g), &opacity, false);
   }
   const unsigned visible = __ballot_sync(kAll, p.valid);
-  if constexpr (degree > 0)
-    shared.harmonics.load(sh + (n - lane) * StagedHarmonics<degree, Coefficient>::kRow, visible,
-                          in.aligned);  // in flight while the boxes are computed
+  using Staged = StagedHarmonics<degree, Coefficient>;
+  if constexpr (degree > 0)  // in flight while the boxes are computed
+    shared.harmonics.load(sh + (n - lane) * Staged::kUsed, Staged::kUsed, visible, in.aligned);
 
   Record<4> r = {};
   Footprint footprint = {0, 0};
   if (p.valid) {
-    r.xyab = make_float4(p.u, p.v, -0.5f * kLog2E * p.conic[0], -kLog2E * p.conic[1]);
-    r.c = -0.5f * kLog2E * p.conic[2];
-    r.l = log2f(opacity);
-    r.cap = INFINITY;  // the conic is positive definite
+    set_shape(r, p.u, p.v, p.conic, log2f(opacity));
     TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, kTile, in.tile_width, in.tile_height);
     box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
     footprint = footprint_of(box);
   }
-  if constexpr (degree > 0) StagedHarmonics<degree, Coefficient>::wait();
+  if constexpr (degree > 0) Staged::wait();
   if (footprint.y != 0) {
-    float color[3], direction[3];
+    float color[3];
     for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
     if constexpr (degree > 0) {
-      unit_direction(camera, g.mean, direction);
-      shared.harmonics.color_at(direction, color);
+      float direction[3], bases[kBasesOf<degree>];
+      unit_direction(camera.center, g.mean, direction);
+      bases_at<degree>(direction[0], direction[1], direction[2], bases);
+      shared.harmonics.add_color(bases, color);
     } else {
       for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, to_float(sh[3 * n + j]), color[j]);
     }

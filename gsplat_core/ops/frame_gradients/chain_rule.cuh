@@ -2,14 +2,14 @@
 #pragma once
 
 #include "../frame/gaussian.cuh"
-#include "../spherical_harmonics/spherical_harmonics_bases.h"
+#include "../projection/projection_device.cuh"
 #include "frame_gradients.h"
 
 namespace gsplat::frame {
 namespace {
 
-using namespace GSPLAT_ISA;
-using namespace GSPLAT_ISA::spherical_harmonics;
+using projection::ellipse_gradient;
+using projection::EllipseGradient;
 
 // The sum of a Gaussian's gradient rows.
 struct SplatRow {
@@ -21,34 +21,6 @@ struct SplatRow {
 struct RawGradient {
   float mean[3], quat[4], log_scales[3], color[3], logit;
 };
-
-// a b - c d without cancellation where the products are nearly equal (Kahan; Jeannerod et al. 2013).
-__device__ inline float difference_of_products(float a, float b, float c, float d) {
-  const float cd = __fmul_rn(c, d);
-  return fmaf(a, b, -cd) + fmaf(-c, d, cd);
-}
-
-// Gradients of the projected mean and of the blurred covariance S (symmetric): S^-1 m and 1/2 S^-1 M S^-1, with m and M the
-// moments of first and second order. Computed along the axes u and w of the ellipse: in x and y, a thin splat's component along
-// its length, which is smaller by the squared ratio of the axes, would be lost to rounding.
-struct EllipseGradient {
-  float mean[2], covariance[3];
-};
-__device__ inline EllipseGradient ellipse_gradient(float a, float b, float c, const float* m) {
-  const float half = 0.5f * (a - c), radius = sqrtf(half * half + b * b);
-  const float longer = 0.5f * (a + c) + radius, shorter = difference_of_products(a, c, b, b) / longer;
-  float x = half < 0 ? b : half + radius, y = half < 0 ? radius - half : b;  // u; w is (-y, x)
-  const float norm = sqrtf(x * x + y * y);
-  x = norm > 0 ? x / norm : 1;
-  y = norm > 0 ? y / norm : 0;
-  const float m_u = (x * m[1] + y * m[2]) / longer, m_w = difference_of_products(x, m[2], y, m[1]) / shorter;
-  const float wx = difference_of_products(x, m[4], y, m[3]), wy = difference_of_products(x, m[5], y, m[4]);  // M w
-  const float uu = (x * (x * m[3] + y * m[4]) + y * (x * m[4] + y * m[5])) / (longer * longer);
-  const float uw = (x * wx + y * wy) / (longer * shorter), ww = difference_of_products(x, wy, y, wx) / (shorter * shorter);
-  return {{x * m_u - y * m_w, y * m_u + x * m_w},
-          {0.5f * (x * x * uu - 2 * x * y * uw + y * y * ww), 0.5f * (x * y * (uu - ww) + (x * x - y * y) * uw),
-           0.5f * (y * y * uu + 2 * x * y * uw + x * x * ww)}};
-}
 
 template <CameraModel model>
 __device__ inline RawGradient projection_gradient(const Scene& scene, const Camera& camera, const RawGaussian& gaussian,
@@ -72,15 +44,9 @@ __device__ inline RawGradient projection_gradient(const Scene& scene, const Came
 
 __device__ inline RawGradient projection_gradient(const Scene& scene, const Camera& camera, const RawGaussian& gaussian,
                                                   const SplatRow& sum) {
-  switch (scene.camera_model) {
-    case kOrtho: return projection_gradient<kOrtho>(scene, camera, gaussian, sum);
-    case kFisheye: return projection_gradient<kFisheye>(scene, camera, gaussian, sum);
-    default: return projection_gradient<kPinhole>(scene, camera, gaussian, sum);
-  }
+  return with_camera_model(scene.camera_model,
+                           [&](auto model) { return projection_gradient<decltype(model)::value>(scene, camera, gaussian, sum); });
 }
-
-template <int kDegree>
-constexpr int kBasesOf = (kDegree + 1) * (kDegree + 1);
 
 // Chain rule of the colour: to the view direction and so to the mean, and to the coefficients c, which are replaced by their
 // gradient. A channel that was clamped at zero has no gradient.
@@ -89,7 +55,7 @@ __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussia
                                           float (&c)[3 * kBasesOf<kDegree>], RawGradient& to) {
   constexpr int kBases = kBasesOf<kDegree>;
   float direction[3], b[kBases];
-  const float inverse = unit_direction(camera, gaussian.mean, direction);
+  const float inverse = unit_direction(camera.center, gaussian.mean, direction);
   bases_at<kDegree>(direction[0], direction[1], direction[2], b);
   float v[3];
   for (int j = 0; j < 3; ++j) {
@@ -100,12 +66,9 @@ __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussia
     to.color[j] = b[0] * v[j];
   }
   if constexpr (kDegree > 0) {  // a constant has no direction
-    float v_b[kBases] = {}, g[3];
-#pragma unroll
-    for (int k = 1; k < kBases; ++k) v_b[k] = v[0] * c[3 * k] + v[1] * c[3 * k + 1] + v[2] * c[3 * k + 2];
-    bases_backward<kDegree>(direction[0], direction[1], direction[2], v_b, g, g + 1, g + 2);
-    const float along = g[0] * direction[0] + g[1] * direction[1] + g[2] * direction[2];
-    for (int k = 0; k < 3; ++k) to.mean[k] += (g[k] - along * direction[k]) * inverse;
+    float v_mean[3];
+    direction_gradient<kDegree>(direction, inverse, c, v, v_mean);
+    for (int k = 0; k < 3; ++k) to.mean[k] += v_mean[k];
   }
 #pragma unroll
   for (int k = 0; k < kBases; ++k)

@@ -1,14 +1,9 @@
 #include "cuda_scratch.h"
 #include "projection.h"
-#include "projection_math.h"
+#include "projection_device.cuh"
 
 namespace gsplat::projection {
 namespace {
-
-using namespace GSPLAT_ISA::projection;
-
-constexpr int kWarps = kThreads / 32;
-constexpr int kViewSums = 12;  // rotation by rows, then translation
 
 template <int K>
 __device__ void load(const float* p, int64_t row, float* v) {
@@ -17,18 +12,6 @@ __device__ void load(const float* p, int64_t row, float* v) {
 template <int K>
 __device__ void store(float* p, int64_t row, const float* v) {
   for (int k = 0; k < K; ++k) p[K * row + k] = v[k];
-}
-
-__device__ Geometry load_geometry(const ProjectionInput& in, int64_t n) {
-  if (in.covars != nullptr) {
-    Symmetric3 sigma;
-    load<6>(in.covars, n, sigma.v);
-    return geometry_of(sigma);
-  }
-  float quat[4], scales[3];
-  load<4>(in.quats, n, quat);
-  load<3>(in.scales, n, scales);
-  return geometry_of(quat, scales);
 }
 
 // A block is of one image.
@@ -52,23 +35,6 @@ __global__ void __launch_bounds__(kThreads) forward(ProjectionInput all, Project
   out.depths[at] = p.valid ? p.depth : 0;
   for (int k = 0; k < 3; ++k) out.conics[3 * at + k] = p.valid ? p.conic[k] : 0;
   if (compensate) out.compensations[at] = p.valid ? p.compensation : 0;
-}
-
-// The block's sums of 12 values per thread, in a fixed order: halves of a warp, then warp after warp.
-__device__ void sum_over_block(const float* v, float* sums) {
-  __shared__ float warps[kWarps][kViewSums];
-  for (int i = 0; i < kViewSums; ++i) {
-    float x = v[i];
-    for (int half = 16; half > 0; half /= 2) x += __shfl_down_sync(~0u, x, half);
-    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32][i] = x;
-  }
-  __syncthreads();
-  if (threadIdx.x < kViewSums) {
-    float total = 0;
-    for (int w = 0; w < kWarps; ++w) total += warps[w][threadIdx.x];
-    sums[threadIdx.x] = total;
-  }
-  __syncthreads();
 }
 
 // A block is of one batch: each thread has one Gaussian and goes through the cameras in order.
@@ -97,7 +63,8 @@ __global__ void __launch_bounds__(kThreads)
       for (int k = 0; k < 4; ++k) total.quat[k] += g.quat[k];
       for (int k = 0; k < 3; ++k) total.scales[k] += g.scales[k];
     }
-    if (to.viewmat != nullptr) sum_over_block(g.viewmat, to.viewmat + (image * blocks + block) * kViewSums);
+    if (to.viewmat != nullptr)
+      sum_over_block<kMatrixSums, kThreads>(g.viewmat, to.viewmat + (image * blocks + block) * kMatrixSums);
   }
   if (n >= size.gaussians) return;
   const int64_t row = batch * size.gaussians + n;
@@ -108,16 +75,6 @@ __global__ void __launch_bounds__(kThreads)
     store<4>(to.quats, row, total.quat);
     store<3>(to.scales, row, total.scales);
   }
-}
-
-// A warp per image and sum; each lane adds up every 32nd block, and the lanes are added in a fixed order.
-__global__ void sum_over_blocks(const float* sums, int64_t blocks, float* v_viewmats) {
-  const int64_t image = blockIdx.x;
-  const int i = threadIdx.x / 32, lane = threadIdx.x % 32;
-  double total = 0;
-  for (int64_t block = lane; block < blocks; block += 32) total += sums[(image * blocks + block) * kViewSums + i];
-  for (int half = 16; half > 0; half /= 2) total += __shfl_down_sync(~0u, total, half);
-  if (lane == 0) v_viewmats[image * 16 + (i < 9 ? i / 3 * 4 + i % 3 : (i - 9) * 4 + 3)] = float(total);
 }
 
 }  // namespace
@@ -139,7 +96,7 @@ void project_backward_on_device(const ProjectionInput& in, const ProjectionSize&
   kernel<<<unsigned(blocks), kThreads, 0, stream>>>(in, size, from, to);
   const int64_t images = size.batches * size.cameras;
   if (to.viewmat != nullptr && images > 0)
-    sum_over_blocks<<<unsigned(images), 32 * kViewSums, 0, stream>>>(to.viewmat, per_image, v_viewmats);
+    sum_over_blocks<kMatrixSums><<<unsigned(images), 32 * kMatrixSums, 0, stream>>>(to.viewmat, per_image, v_viewmats, nullptr);
 }
 
 }  // namespace gsplat::projection

@@ -135,6 +135,28 @@ GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& vi
   return out;
 }
 
+template <CameraModel model_>
+struct CameraModelConstant {
+  static constexpr CameraModel value = model_;
+};
+
+// Return run(constant) for the constant of a camera model.
+template <class Run>
+GSPLAT_INLINE auto with_camera_model(int model, const Run& run) {
+  switch (model) {
+    case kOrtho: return run(CameraModelConstant<kOrtho>());
+    case kFisheye: return run(CameraModelConstant<kFisheye>());
+    default: return run(CameraModelConstant<kPinhole>());
+  }
+}
+
+// `project` for the camera model of the input.
+GSPLAT_INLINE Projected project(const ProjectionInput& in, const vfloat mean[3], const Geometry& geometry, const vfloat* opacity,
+                                bool compensate) {
+  return with_camera_model(
+      in.model, [&](auto model) { return project(in, View<decltype(model)::value>(in), mean, geometry, opacity, compensate); });
+}
+
 // Gradient of the blurred 2D covariance, as a symmetric matrix (xx, xy, yy), from those of its inverse and compensation. At its
 // floor the compensation has no gradient.
 GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, const ProjectionInput& in, const vfloat v_conic[3], bool compensate,

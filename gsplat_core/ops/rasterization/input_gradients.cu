@@ -7,30 +7,6 @@ namespace {
 constexpr int kWarps = frame::kGaussianThreads / 32;
 constexpr int kMoments = 6;
 
-// a b - c d without the loss of digits where they are nearly the same (Kahan; Jeannerod et al. 2013).
-__device__ inline float difference_of_products(float a, float b, float c, float d) {
-  const float cd = __fmul_rn(c, d);
-  return fmaf(a, b, -cd) + fmaf(-c, d, cd);
-}
-
-// Gradient of the blurred covariance S (a, b; b, c), as a symmetric matrix: 1/2 S^-1 M S^-1 with M the moments of second order.
-// Taken along the axes u and w of the ellipse: in x and y a thin splat's share along its length, smaller by the square of the
-// ratio of its axes, would be lost in rounding.
-__device__ inline void covariance_gradient(float a, float b, float c, const float* m, float (&g)[3]) {
-  const float half = 0.5f * (a - c), radius = ::sqrtf(half * half + b * b);
-  const float longer = 0.5f * (a + c) + radius, shorter = difference_of_products(a, c, b, b) / longer;
-  float x = half < 0 ? b : half + radius, y = half < 0 ? radius - half : b;  // u; w is (-y, x)
-  const float norm = ::sqrtf(x * x + y * y);
-  x = norm > 0 ? x / norm : 1;
-  y = norm > 0 ? y / norm : 0;
-  const float wx = difference_of_products(x, m[4], y, m[3]), wy = difference_of_products(x, m[5], y, m[4]);  // M w
-  const float uu = (x * (x * m[3] + y * m[4]) + y * (x * m[4] + y * m[5])) / (longer * longer);
-  const float uw = (x * wx + y * wy) / (longer * shorter), ww = difference_of_products(x, wy, y, wx) / (shorter * shorter);
-  g[0] = 0.5f * (x * x * uu - 2 * x * y * uw + y * y * ww);
-  g[1] = 0.5f * (x * y * (uu - ww) + (x * x - y * y) * uw);
-  g[2] = 0.5f * (y * y * uu + 2 * x * y * uw + x * x * ww);
-}
-
 // What came back for one splat.
 struct SplatGradient {
   float moments[kMoments], color[3], means2d[2], depth, conic[3], opacity;
@@ -64,8 +40,8 @@ __device__ inline BackProjected project_back(const Scene& scene, const Projectio
   const Point3 p = view.to_camera(mean);
   const ImagePoint image = Projector<model>::forward(view.k, p);
   const Ellipse e = ellipse_of(view, image, geometry.sigma);
-  float g[3];
-  covariance_gradient(e.a0 + in.eps2d, e.b, e.c0 + in.eps2d, v.moments, g);
+  EllipseGradient ellipse = ellipse_gradient(e.a0 + in.eps2d, e.b, e.c0 + in.eps2d, v.moments);
+  float (&g)[3] = ellipse.covariance;
   const float opacity = in.opacities[n];
   v_opacity += v.moments[0] / opacity;
   if (scene.antialiased || conics) {
@@ -87,18 +63,16 @@ __device__ inline BackProjected project_back(const Scene& scene, const Projectio
 template <bool kViews>
 __device__ inline BackProjected project_back(const Scene& scene, const ProjectionInput& in, const float* mean, int64_t n,
                                              const SplatGradient& v, bool conics, float& v_opacity) {
-  switch (in.model) {
-    case kOrtho: return project_back<kOrtho, kViews>(scene, in, mean, n, v, conics, v_opacity);
-    case kFisheye: return project_back<kFisheye, kViews>(scene, in, mean, n, v, conics, v_opacity);
-    default: return project_back<kPinhole, kViews>(scene, in, mean, n, v, conics, v_opacity);
-  }
+  return with_camera_model(in.model, [&](auto model) {
+    return project_back<decltype(model)::value, kViews>(scene, in, mean, n, v, conics, v_opacity);
+  });
 }
 
 // The colour's way back to the coefficients, whose gradient is added to v_c, and to the direction: v_mean gets what it means for
 // the Gaussian's place, and the negative is the camera centre's. A channel that was raised to zero has no gradient.
 template <int degree>
-__device__ inline void harmonics_back(const float* center, const float* mean, const float* c, const float* v_color, float* v_c,
-                                      float* v_mean) {
+__device__ inline void harmonics_back(const float (&center)[3], const float* mean, const float* c, const float* v_color,
+                                      float* v_c, float (&v_mean)[3]) {
   constexpr int kBases = kBasesOf<degree>;
   float direction[3], b[kBases], v[3];
   const float inverse = unit_direction(center, mean, direction);
@@ -112,31 +86,7 @@ __device__ inline void harmonics_back(const float* center, const float* mean, co
 #pragma unroll
   for (int k = 0; k < kBases; ++k)
     for (int j = 0; j < 3; ++j) v_c[3 * k + j] = fmaf(b[k], v[j], v_c[3 * k + j]);
-  if constexpr (degree > 0) {  // a constant has no direction
-    float v_b[kBases] = {}, g[3];
-#pragma unroll
-    for (int k = 1; k < kBases; ++k) v_b[k] = v[0] * c[3 * k] + v[1] * c[3 * k + 1] + v[2] * c[3 * k + 2];
-    bases_backward<degree>(direction[0], direction[1], direction[2], v_b, g, g + 1, g + 2);
-    const float along = g[0] * direction[0] + g[1] * direction[1] + g[2] * direction[2];
-    for (int k = 0; k < 3; ++k) v_mean[k] = (g[k] - along * direction[k]) * inverse;
-  }
-}
-
-// The block's sums of kViewSums values per thread, in a fixed order: halves of a warp, then warp after warp.
-__device__ inline void sum_views(const float* v, float* to) {
-  __shared__ float warps[kWarps][kViewSums];
-  for (int i = 0; i < kViewSums; ++i) {
-    float x = v[i];
-    for (int half = 16; half > 0; half /= 2) x += __shfl_down_sync(kWholeWarp, x, half);
-    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32][i] = x;
-  }
-  __syncthreads();
-  if (threadIdx.x < kViewSums) {
-    float total = 0;
-    for (int w = 0; w < kWarps; ++w) total += warps[w][threadIdx.x];
-    to[threadIdx.x] = total;
-  }
-  __syncthreads();
+  if constexpr (degree > 0) direction_gradient<degree>(direction, inverse, c, v, v_mean);  // a constant has no direction
 }
 
 template <int degree>
@@ -154,10 +104,11 @@ __device__ inline void store_row(float* to, int64_t row, const float* v) {
 // The coefficients of a warp while the gradients need them, then their gradients.
 template <int degree>
 struct WarpColors {
-  Coefficients<degree> coefficients;
+  StagedHarmonics<degree> coefficients;
 
-  __device__ void load(const Scene& scene, int64_t first, unsigned wanted, int lane) {
-    coefficients.load(scene.colors + first * scene.color_row, scene.color_row, wanted, lane);
+  __device__ void load(const Scene& scene, int64_t first, unsigned wanted) {
+    const float* const rows = scene.colors + first * scene.color_row;
+    coefficients.load(rows, scene.color_row, wanted, reinterpret_cast<uintptr_t>(rows) % 16 == 0);
     coefficients.wait();
   }
   // By the whole warp: the gradients of `count` Gaussians from `first` on.
@@ -167,13 +118,13 @@ struct WarpColors {
 #pragma unroll
     for (int k = 0; k < ColorSums<degree>::kFloats; ++k) row[k] = sums.v[k];
     __syncwarp();
-    coefficients.store(to + first * scene.color_row, scene.color_row, count, lane);
+    coefficients.store(to + first * scene.color_row, scene.color_row, count);
     __syncwarp();
   }
 };
 template <>
 struct WarpColors<kPlainColors> {
-  __device__ void load(const Scene&, int64_t, unsigned, int) {}
+  __device__ void load(const Scene&, int64_t, unsigned) {}
   __device__ void store(const Scene& scene, const ColorSums<kPlainColors>& sums, float* to, int64_t first, int count, int lane) {
     if (lane < count)
       for (int k = 0; k < scene.channels; ++k) to[(first + lane) * scene.color_row + k] = sums.v[k];
@@ -223,7 +174,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
       } else {
         const unsigned wanted = __ballot_sync(kWholeWarp, has_color);
         const int64_t set = (scene.colors_per_camera ? image : batch) * N + first;
-        if (wanted != 0) warp.load(scene, set, wanted, lane);
+        if (wanted != 0) warp.load(scene, set, wanted);
         if (has_color) {
           float v_mean[3] = {};
           harmonics_back<degree>(center, mean, warp.coefficients.row(lane), v.color, v_colors.v, v_mean);
@@ -246,7 +197,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
       float sums[kViewSums];
       for (int k = 0; k < 12; ++k) sums[k] = g.viewmat[k];
       for (int k = 0; k < 3; ++k) sums[12 + k] = v_center[k];
-      sum_views(sums, to.view_sums + (image * blocks + block) * kViewSums);
+      sum_over_block<kViewSums, frame::kGaussianThreads>(sums, to.view_sums + (image * blocks + block) * kViewSums);
     }
   }
   if (to.colors != nullptr && !kOne && !scene.colors_per_camera)
@@ -258,21 +209,6 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
   store_row<4>(to.quats, row, total.quat);
   store_row<3>(to.scales, row, total.scales);
   store_row<1>(to.opacities, row, &v_opacity);
-}
-
-// A warp per image and sum; each lane adds up every 32nd block, and the lanes are added in a fixed order.
-__global__ void sum_over_blocks(const float* sums, int64_t blocks, float* viewmats, float* centers) {
-  const int64_t image = blockIdx.x;
-  const int i = threadIdx.x / 32, lane = threadIdx.x % 32;
-  double total = 0;
-  for (int64_t block = lane; block < blocks; block += 32) total += sums[(image * blocks + block) * kViewSums + i];
-  for (int half = 16; half > 0; half /= 2) total += __shfl_down_sync(kWholeWarp, total, half);
-  if (lane > 0) return;
-  if (i < 12) {
-    viewmats[image * 16 + (i < 9 ? i / 3 * 4 + i % 3 : (i - 9) * 4 + 3)] = float(total);
-  } else if (centers != nullptr) {
-    centers[image * 3 + i - 12] = float(total);
-  }
 }
 
 }  // namespace
@@ -289,8 +225,8 @@ void input_gradients(const Scene& scene, const ProjectedGradients& from, const I
       kernel<<<unsigned(blocks), frame::kGaussianThreads, 0, stream>>>(scene, from, to);
     });
   if (views && scene.images() > 0)
-    sum_over_blocks<<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats,
-                                                                             to.centers);
+    sum_over_blocks<kViewSums>
+        <<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats, to.centers);
 }
 
 }  // namespace gsplat::rasterization

@@ -9,19 +9,10 @@ namespace {
 using namespace blending;
 using namespace frame;
 
-__device__ inline Projected project_one(const ProjectionInput& in, const float* mean, const Geometry& geometry, float opacity,
-                                        bool antialiased) {
-  switch (in.model) {
-    case kOrtho: return GSPLAT_ISA::projection::project(in, View<kOrtho>(in), mean, geometry, &opacity, antialiased);
-    case kFisheye: return GSPLAT_ISA::projection::project(in, View<kFisheye>(in), mean, geometry, &opacity, antialiased);
-    default: return GSPLAT_ISA::projection::project(in, View<kPinhole>(in), mean, geometry, &opacity, antialiased);
-  }
-}
-
 // A warp's coefficients; nothing for plain colours.
 template <int degree>
 struct WarpColors {
-  Coefficients<degree> coefficients;
+  StagedHarmonics<degree> coefficients;
 };
 template <>
 struct WarpColors<kPlainColors> {};
@@ -47,7 +38,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
   if (n < scene.gaussians) {
     for (int k = 0; k < 3; ++k) mean[k] = in.means[3 * n + k];
     opacity = in.opacities[n];
-    p = project_one(in, mean, load_geometry(in, n), opacity, scene.antialiased);
+    p = projection::project(in, mean, load_geometry(in, n), &opacity, scene.antialiased);
     if (p.valid && scene.antialiased) opacity *= p.compensation;
   }
   float color[3] = {};
@@ -58,22 +49,13 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
         for (int k = 0; k < scene.channels; ++k) color[k] = scene.colors[set * scene.color_row + k];
     } else {
       const unsigned shown = __ballot_sync(kWholeWarp, p.valid);
-      warps[warp].coefficients.load(scene.colors + (set - lane) * scene.color_row, scene.color_row, shown, lane);
+      const float* const rows = scene.colors + (set - lane) * scene.color_row;
+      warps[warp].coefficients.load(rows, scene.color_row, shown, reinterpret_cast<uintptr_t>(rows) % 16 == 0);
       float direction[3], bases[kBasesOf<degree>];
       unit_direction(center, mean, direction);
       bases_at<degree>(direction[0], direction[1], direction[2], bases);
       warps[warp].coefficients.wait();
-      const float4* const row = reinterpret_cast<const float4*>(warps[warp].coefficients.row(lane));
-      float values[4 * Coefficients<degree>::kQuads];
-#pragma unroll
-      for (int i = 0; i < Coefficients<degree>::kQuads; ++i) {
-        const float4 q = row[i];
-        values[4 * i] = q.x, values[4 * i + 1] = q.y, values[4 * i + 2] = q.z, values[4 * i + 3] = q.w;
-      }
-      if (p.valid)
-#pragma unroll
-        for (int k = 0; k < kBasesOf<degree>; ++k)
-          for (int j = 0; j < 3; ++j) color[j] = fmaf(bases[k], values[3 * k + j], color[j]);
+      if (p.valid) warps[warp].coefficients.add_color(bases, color);
     }
     if (!(0 * color[0] + 0 * color[1] + 0 * color[2] == 0)) p.valid = 0;  // 0 times a number is 0, unless it is not finite
     if constexpr (degree != kPlainColors)
@@ -83,10 +65,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
   Footprint footprint = {0, 0};
   if (p.valid) {
     Record<4> r = {};
-    r.xyab = make_float4(p.u, p.v, -0.5f * kLog2E * p.conic[0], -kLog2E * p.conic[1]);
-    r.c = -0.5f * kLog2E * p.conic[2];
-    r.l = log2f(opacity);
-    r.cap = INFINITY;  // the conic is definite
+    set_shape(r, p.u, p.v, p.conic, log2f(opacity));
     for (int j = 0; j < 3; ++j) r.colors[j] = color[j];
     r.colors[3] = p.depth;
     reinterpret_cast<Record<4>*>(out.records)[at] = r;

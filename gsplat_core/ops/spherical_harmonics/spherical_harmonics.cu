@@ -1,22 +1,13 @@
-#include <cuda_pipeline.h>
-
 #include "cuda_scratch.h"
 #include "spherical_harmonics.h"
-#include "spherical_harmonics_bases.h"
+#include "staged_harmonics.cuh"
 
 namespace gsplat::spherical_harmonics {
 namespace {
 
-using namespace GSPLAT_ISA::spherical_harmonics;
-
 constexpr int kSets = 32;  // of a warp, one per lane
 constexpr int kWarps = 4;
 constexpr int kBlockSets = kWarps * kSets;
-
-// Coefficients of a set that a degree uses. Their pitch in shared memory is odd: lanes that read the same place of their own
-// sets read from different banks.
-constexpr int width_of(int degree) { return 3 * (degree + 1) * (degree + 1); }
-constexpr int pitch_of(int degree) { return width_of(degree) | 1; }
 
 struct UnitDirection {
   float v[3], inverse_norm;
@@ -28,57 +19,28 @@ __device__ UnitDirection unit_direction(const float* dirs, int64_t i) {
   return {{x * inverse, y * inverse, z * inverse}, inverse};
 }
 
-// A set's coefficients are 3 K consecutive floats, so a lane alone would touch as many sectors of memory as it reads
-// numbers. The warp's sets together are one run: it is copied through shared memory, neighbouring lanes at neighbouring places,
-// without the sets that `wanted` (a bit per lane) leaves out.
-template <int degree>
-__device__ void fetch_sets(float* shared, const float* coeffs, int64_t row, unsigned wanted, int lane) {
-  constexpr int width = width_of(degree), pitch = pitch_of(degree);
-#pragma unroll 12
-  for (int at = lane; at < kSets * width; at += 32) {
-    const int set = at / width, place = at % width;
-    if (wanted >> set & 1) __pipeline_memcpy_async(shared + set * pitch + place, coeffs + set * row + place, sizeof(float));
-  }
-  __pipeline_commit();
-  __pipeline_wait_prior(0);
-  __syncwarp();
-}
-
-// Copies back: the used coefficients of the warp's `sets` sets, and zeros for those that the degree does not use.
-template <int degree>
-__device__ void put_sets(float* coeffs, const float* shared, int64_t row, int sets, int lane) {
-  constexpr int width = width_of(degree), pitch = pitch_of(degree);
-  __syncwarp();
-#pragma unroll 12
-  for (int at = lane; at < kSets * width; at += 32) {
-    const int set = at / width, place = at % width;
-    if (set < sets) coeffs[set * row + place] = shared[set * pitch + place];
-  }
-  const int unused = int(row) - width;
-  for (int at = lane; at < sets * unused; at += 32) coeffs[at / unused * row + width + at % unused] = 0;
-}
-
 // A block has 128 sets and one row of directions.
 template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4) forward(SphericalHarmonicsInput in, int64_t sets, float* __restrict__ colors) {
-  constexpr int used = (degree + 1) * (degree + 1);
-  __shared__ float shared[kWarps][kSets * pitch_of(degree)];
+  constexpr int used = kBasesOf<degree>;
+  __shared__ StagedHarmonics<degree> staged[kWarps];
   const int64_t blocks = (sets + kBlockSets - 1) / kBlockSets, set = blockIdx.x % blocks * kBlockSets + threadIdx.x;
   const int64_t i = blockIdx.x / blocks * sets + set;
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
   const bool visible = set < sets && (in.mask == nullptr || in.mask[i]);
   const unsigned wanted = __ballot_sync(~0u, visible);
-  if (wanted != 0) fetch_sets<degree>(shared[warp], in.coeffs + (set - lane) * in.bases * 3, in.bases * 3, wanted, lane);
+  if (wanted != 0) {
+    const float* const rows = in.coeffs + (set - lane) * in.bases * 3;
+    staged[warp].load(rows, in.bases * 3, wanted, reinterpret_cast<uintptr_t>(rows) % 16 == 0);
+    staged[warp].wait();
+  }
   if (set >= sets) return;
   float color[3] = {};
   if (visible) {
     const UnitDirection d = unit_direction(in.dirs, i);
     float b[used];
     bases_at<degree>(d.v[0], d.v[1], d.v[2], b);
-    const float* c = shared[warp] + lane * pitch_of(degree);
-#pragma unroll
-    for (int k = 0; k < used; ++k)
-      for (int j = 0; j < 3; ++j) color[j] += b[k] * c[3 * k + j];
+    staged[warp].add_color(b, color);
   }
   for (int j = 0; j < 3; ++j) colors[3 * i + j] = color[j];
 }
@@ -89,12 +51,12 @@ template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4)
     backward(SphericalHarmonicsInput in, int64_t rows, int64_t sets, const float* __restrict__ v_colors,
              float* __restrict__ v_dirs, float* __restrict__ v_coeffs) {
-  constexpr int used = (degree + 1) * (degree + 1);
-  __shared__ float shared[kWarps][kSets * pitch_of(degree)];
+  constexpr int used = kBasesOf<degree>;
+  __shared__ StagedHarmonics<degree> staged[kWarps];
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
   const int64_t set = int64_t(blockIdx.x) * kBlockSets + threadIdx.x, first = set - lane;
   if (first >= sets) return;
-  float* const c = shared[warp] + lane * pitch_of(degree);
+  float* const c = staged[warp].row(lane);
   unsigned fetched = 0;
   float v_c[used][3] = {};
   for (int64_t row = 0; row < rows; ++row) {
@@ -105,23 +67,23 @@ __global__ void __launch_bounds__(kBlockSets, 4)
     const bool shown = !(v[0] == 0 && v[1] == 0 && v[2] == 0);
     if (degree > 0 && v_dirs != nullptr) {  // a constant has no direction, not even a zero one
       const unsigned wanted = __ballot_sync(~0u, shown) & ~fetched;
-      if (wanted != 0) fetch_sets<degree>(shared[warp], in.coeffs + first * in.bases * 3, in.bases * 3, wanted, lane);
+      if (wanted != 0) {
+        const float* const rows = in.coeffs + first * in.bases * 3;
+        staged[warp].load(rows, in.bases * 3, wanted, reinterpret_cast<uintptr_t>(rows) % 16 == 0);
+        staged[warp].wait();
+      }
       fetched |= wanted;
     }
     if (shown) {
       const UnitDirection d = unit_direction(in.dirs, i);
-      float b[used], v_b[used] = {};
+      float b[used];
       bases_at<degree>(d.v[0], d.v[1], d.v[2], b);
 #pragma unroll
       for (int k = 0; k < used; ++k)
         for (int j = 0; j < 3; ++j) v_c[k][j] += b[k] * v[j];
       if constexpr (degree > 0) {
         if (v_dirs != nullptr) {
-#pragma unroll
-          for (int k = 1; k < used; ++k) v_b[k] = v[0] * c[3 * k] + v[1] * c[3 * k + 1] + v[2] * c[3 * k + 2];
-          bases_backward<degree>(d.v[0], d.v[1], d.v[2], v_b, g, g + 1, g + 2);
-          const float along = g[0] * d.v[0] + g[1] * d.v[1] + g[2] * d.v[2];
-          for (int j = 0; j < 3; ++j) g[j] = (g[j] - along * d.v[j]) * d.inverse_norm;
+          direction_gradient<degree>(d.v, d.inverse_norm, c, v, g);
         }
       }
     }
@@ -131,7 +93,8 @@ __global__ void __launch_bounds__(kBlockSets, 4)
 #pragma unroll
   for (int k = 0; k < used; ++k)
     for (int j = 0; j < 3; ++j) c[3 * k + j] = v_c[k][j];
-  put_sets<degree>(v_coeffs + first * in.bases * 3, shared[warp], in.bases * 3, int(min(int64_t(kSets), sets - first)), lane);
+  __syncwarp();
+  staged[warp].store(v_coeffs + first * in.bases * 3, in.bases * 3, int(min(int64_t(kSets), sets - first)));
 }
 
 template <int degree>
