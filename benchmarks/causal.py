@@ -27,9 +27,9 @@ from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 
 
 class HalfFlow:
@@ -89,11 +89,8 @@ def measure(path: str, arguments: argparse.Namespace) -> dict[str, Any]:
     frames, camera = list(recording), recording.camera_at(0)
     config = with_settings(ReconstructorConfig(motion_prior=arguments.prior), arguments.set)
     device = arguments.device
-    reconstructor = (
-        LiveReconstructor(config, camera, live=with_settings(LiveTraining(), arguments.set_live), device=device)
-        if arguments.live
-        else Reconstructor(config, camera, device=device)
-    )
+    live = with_settings(LiveTraining(), arguments.set_live) if arguments.live else None
+    reconstructor = Reconstructor(config, camera, live=live, device=device)
     shown, half_flow = Shown(reconstructor, camera), HalfFlow()
     means = {name: ScoredMean() for name in ("causal", "hold", "copy", "half_flow", "start", "live")}
     worst, learning_s = np.inf, 0.0
@@ -107,7 +104,7 @@ def measure(path: str, arguments: argparse.Namespace) -> dict[str, Any]:
         began_s = time.perf_counter()
         reconstructor.observe(frame, steps=arguments.steps if before is not None else max(60, arguments.steps))
         shown.publish()
-        if arguments.rehearse and isinstance(reconstructor, LiveReconstructor):
+        if arguments.rehearse and arguments.live:
             reconstructor.grow(frame)
             reconstructor.rehearse(arguments.rehearse)
         live_db = shown.psnr_db(frame)

@@ -36,8 +36,8 @@ from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.renderer import PendingFrame
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.live_settings import LiveSettings
 from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.frame_clock import FrameClock
@@ -80,7 +80,7 @@ class Stream:
         self.steps, self.rehearse = Budget.of_steps(arguments.steps), arguments.rehearse
         settings = LiveSettings(source=str(arguments.recording), out=Path("unused"), device=arguments.device)
         config = settings.reconstructor_config(recording.camera.width_px * recording.camera.height_px)
-        self.reconstructor = LiveReconstructor(
+        self.reconstructor = Reconstructor(
             config, recording.camera, live=settings.chosen_training, device=arguments.device
         )
         self.renderer = AlphaRenderer(recording.camera, torch.device(arguments.device))

@@ -36,7 +36,6 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.training.budget import Budget
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.live_settings import LiveSettings
@@ -118,16 +117,16 @@ class Scores:
         }
 
 
-def live(asked: Arguments, eyes: str, camera: Camera) -> LiveReconstructor:
+def live(asked: Arguments, eyes: str, camera: Camera) -> Reconstructor:
     """Return a reconstructor configured as in the live application."""
     settings = LiveSettings(source="", out=Path(), device=asked.device, eyes=eyes)  # type: ignore[arg-type]
     config = replace(settings.reconstructor_config(camera.width_px * camera.height_px), **asked.set)
-    learning = LiveReconstructor(config, camera, live=settings.chosen_training, device=asked.device)
+    learning = Reconstructor(config, camera, live=settings.chosen_training, device=asked.device)
     warm_reconstructor(learning, stereo=eyes == "both")
     return learning
 
 
-def by_steps(learning: LiveReconstructor, frame: Frame, steps: int) -> Iterator[Model]:
+def by_steps(learning: Reconstructor, frame: Frame, steps: int) -> Iterator[Model]:
     """Train on a frame, show it, rehearse."""
     learning.observe(frame, steps=steps)
     yield learning.publish().as_model()
@@ -135,7 +134,7 @@ def by_steps(learning: LiveReconstructor, frame: Frame, steps: int) -> Iterator[
     learning.rehearse(steps // 2)
 
 
-def by_clock(learning: LiveReconstructor, frame: Frame, fps: float, first: bool, made: list[int]) -> Iterator[Model]:
+def by_clock(learning: Reconstructor, frame: Frame, fps: float, first: bool, made: list[int]) -> Iterator[Model]:
     """Train within the frame's time budget and yield the model to score."""
     began = time.monotonic()
     until = began + min(SHOW_AFTER / fps, SHOW_AFTER_S)

@@ -23,8 +23,8 @@ from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.io.recordings import FileRecording, open_recording
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.live_settings import LiveSettings
 
 Arguments = argparse.Namespace
@@ -61,7 +61,7 @@ def run(asked: Arguments, recording: FileRecording, points: SparsePoints | None,
     """Measure one run. `late`: delay of the depth in frames, or None for no depth."""
     settings = LiveSettings(source="", out=Path())
     config = settings.reconstructor_config(recording.width_px * recording.height_px)
-    learning = LiveReconstructor(config, recording.camera, live=settings.chosen_training)
+    learning = Reconstructor(config, recording.camera, live=settings.chosen_training)
     finder = DepthFinder(asked.depth, recording.camera, has_time=True)
     errors, psnr_db, taken = DepthErrors(recording, points), [], 0
     under_way: deque[Frame] = deque()

@@ -30,9 +30,9 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from operators.applications.live import analysis_operator
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
@@ -88,7 +88,7 @@ def new_reconstructor(path: str, camera: Camera, arguments: argparse.Namespace) 
     settings = LiveSettings(source=path, out=Path("unused"), device=arguments.like, field=arguments.field)
     live: LiveTraining = with_settings(settings.chosen_training, arguments.set_live)
     config = with_settings(settings.reconstructor_config(pixels), arguments.set)
-    return LiveReconstructor(config, camera, live=live, device=arguments.device)
+    return Reconstructor(config, camera, live=live, device=arguments.device)
 
 
 class Analysis(Application):
@@ -151,7 +151,7 @@ class Run:
     def _learn(self, frame: Frame) -> None:
         """Train on a frame before it is shown."""
         made, first = self.reconstructor, self._scene is None
-        if isinstance(made, LiveReconstructor) and not first and frame.scene != self._scene and frame.withheld is None:
+        if self.arguments.engine == "live" and not first and frame.scene != self._scene and frame.withheld is None:
             made.begin_scene(frame)
             first = True
         if first and frame.withheld is not None:
@@ -166,7 +166,7 @@ class Run:
     def _rehearse(self, frame: Frame) -> None:
         """Do what a live run does after a frame was shown."""
         made = self.reconstructor
-        if self._scene is None or not isinstance(made, LiveReconstructor):
+        if self._scene is None or self.arguments.engine == "replay":
             return
         if self._grows:
             made.grow(frame)

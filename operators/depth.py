@@ -21,8 +21,8 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.threads import use_one_thread
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.placement import LateDepth
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.graph.tracking import Histogram
 from operators.outcome import OutcomeBuilder
@@ -411,7 +411,7 @@ class LateDepths:
         if self._found is not None:
             self._found.offer(frame)
 
-    def give(self, reconstructor: LiveReconstructor, now_ns: Callable[[], int]) -> Frame | None:
+    def give(self, reconstructor: Reconstructor, now_ns: Callable[[], int]) -> Frame | None:
         """Pass a new estimate, if any, to the model.
 
         Args:

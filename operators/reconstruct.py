@@ -34,7 +34,6 @@ from gsplat_core.io.sessions.records import (
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.placement import MOST_LATE
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.depth import DepthFound, LateDepths
@@ -258,7 +257,7 @@ class LiveReconstructOp(Operator):
         self,
         fragment: Any,
         *args: Any,
-        make_reconstructor: Callable[[], LiveReconstructor],
+        make_reconstructor: Callable[[], Reconstructor],
         clock: FrameClock,
         listener: ScheduleListener | None = None,
         depth: DepthFound | None = None,
@@ -273,7 +272,7 @@ class LiveReconstructOp(Operator):
         self.model: Model | None = None
         """Newest model including archived parts; set when the run has ended."""
         self.counts = TrainingCounts()
-        self._reconstructor: LiveReconstructor | None = None
+        self._reconstructor: Reconstructor | None = None
         self._learned: Frame | None = None
         """Newest frame that the model was trained on."""
         self._scene = 0
@@ -472,7 +471,7 @@ class LiveReconstructOp(Operator):
 
 
 class ScheduledReconstructOp(ReconstructOp):
-    """`ReconstructOp` that repeats the recorded calls of a `LiveReconstructor`.
+    """`ReconstructOp` that repeats the recorded calls of a `Reconstructor`.
 
     Frames that the session dropped produce no output.
 
@@ -487,7 +486,7 @@ class ScheduledReconstructOp(ReconstructOp):
         self,
         fragment: Any,
         *args: Any,
-        make_reconstructor: Callable[[], LiveReconstructor],
+        make_reconstructor: Callable[[], Reconstructor],
         schedule: Callable[[], Iterator[ScheduleLine | LostLine]],
         late_depths: Callable[[], Iterator[dict[str, Any] | None]],
         **kwargs: Any,
@@ -500,7 +499,7 @@ class ScheduledReconstructOp(ReconstructOp):
         self._lines: Iterator[ScheduleLine | LostLine] = iter(())
         self._depths: Iterator[dict[str, Any] | None] = iter(())
         self._due: ScheduleLine | LostLine | None = None
-        self._live: LiveReconstructor | None = None
+        self._live: Reconstructor | None = None
         self._observed: OrderedDict[int, Frame] = OrderedDict()
         """The most recently observed frames, by sequence number."""
         super().__init__(fragment, *args, make_reconstructor=make_reconstructor, **kwargs)
@@ -560,7 +559,7 @@ class ScheduledReconstructOp(ReconstructOp):
                 self._call(self._live, line, frame)
         return None
 
-    def _call(self, live: LiveReconstructor, line: SceneBegun | Grown | Rehearsed, frame: Frame) -> None:
+    def _call(self, live: Reconstructor, line: SceneBegun | Grown | Rehearsed, frame: Frame) -> None:
         """Replay one call that precedes the observation of `frame`."""
         if isinstance(line, Rehearsed):
             if live.gaussians:

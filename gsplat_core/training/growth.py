@@ -220,6 +220,21 @@ class Covering:
         for each in under_way:
             self._append(step, each.result())
 
+    def cover(self, step: TrainingStep, frame: Frame, observation: Observation, *, first: bool = False) -> None:
+        """Add Gaussians where an eye of the frame shows uncovered tissue.
+
+        Args:
+            step: training step of the scene.
+            frame: the frame.
+            observation: the same frame as tensors.
+            first: the scene was created from the left picture of this frame, which is skipped.
+        """
+        self.join(step)
+        if not first:
+            self.look(step, observation, lambda: frame, has_depth=frame.depth is not None)
+        if (right := observation.right) is not None:
+            self.look(step, right, right.as_frame)
+
     def look(
         self, step: TrainingStep, observation: Observation, frame: Callable[[], Frame], *, has_depth: bool = False
     ) -> None:

@@ -18,6 +18,7 @@ priors are added as modules registered in `MOTION_PRIORS`.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -35,6 +36,7 @@ from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, RAW_COLUMNS, Gaussi
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Flow, ImageMotion, SurfaceMotion, beside, revealed_px, typical_px
 from gsplat_core.training.motion_priors import MOTION_PRIORS
+from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
@@ -365,6 +367,68 @@ def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> Mo
     """
     prior: MotionPrior | None = MOTION_PRIORS[config.motion_prior](config)
     return prior if field.continues else None
+
+
+class Following:
+    """Delivery of a stream's frames to its motion prior.
+
+    Processing a frame takes longer than some training steps, and a picture that was just trained on
+    needs no prior. Without `at_once`, the two newest trained frames are therefore delivered only
+    when a frame is skipped.
+    """
+
+    def __init__(self, config: ReconstructorConfig, *, at_once: bool) -> None:
+        self.prior: MotionPrior | None = None
+        """Prior of the current scene; None if the settings or the field have none."""
+        self._config, self._at_once = config, at_once
+        self._waiting: deque[tuple[Frame, Observation]] = deque(maxlen=2)
+
+    def begin(self, field: DeformationField) -> None:
+        """Create the prior of a new scene."""
+        self.prior = new_motion_prior(self._config, field)
+
+    def restart(self) -> None:
+        """Reset the prior for a scene that reuses the memory of the previous one."""
+        if self.prior is not None:
+            self.prior.forget()
+
+    def forget(self) -> None:
+        """Discard the frames of a scene that is left."""
+        self._waiting.clear()
+
+    def observe(self, step: TrainingStep, frame: Frame, observation: Observation, *, first: bool) -> None:
+        """Process a frame before the model is trained on it. `first`: the scene starts with it."""
+        if self._at_once:
+            self._deliver(step, frame, observation)
+        elif not first:
+            self._waiting.append((frame, observation))
+
+    def skip(self, step: TrainingStep) -> None:
+        """Process the newest trained frames, since the next one is displayed without training, so
+        that the published scene keeps moving.
+        """
+        if self._at_once:
+            return
+        if len(self._waiting) == 2 and self.prior is not None:
+            self.prior.forget()
+            for frame, observation in self._waiting:
+                self._deliver(step, frame, observation)
+        self._waiting.clear()
+
+    def has_revealed(self, least_px: float) -> bool:
+        """Return True if a strip of at least `least_px` pixels was revealed at an edge and the scene
+        was moved accordingly.
+        """
+        return self.prior is not None and self._at_once and self.prior.revealed_px >= least_px
+
+    def cover_revealed(self) -> None:
+        """Record that revealed tissue was searched."""
+        if self.prior is not None:
+            self.prior.revealed_px = 0.0
+
+    def _deliver(self, step: TrainingStep, frame: Frame, observation: Observation) -> None:
+        if self.prior is not None:
+            self.prior.observe(frame, observation.time_s, observation.camera, step)
 
 
 @contextmanager

@@ -219,7 +219,14 @@ class Placement:
     refine it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, postpones: bool = False) -> None:
+        """Set the state before the first scene.
+
+        Args:
+            postpones: postpone corrections by a frame's own depth to `catch_up`, so that the
+                displayed picture does not wait for them.
+        """
+        self._postpones = postpones
         self._captured: CapturedCorrection | None = None
         self.begin(None)
 
@@ -228,10 +235,6 @@ class Placement:
         self._first = first
         self.is_placed = _has_depth(first)
         """True once the scene was placed by a depth."""
-        self.postpones = False
-        """Postpone corrections by a frame's own depth to `catch_up`, so that the displayed picture
-        does not wait for them.
-        """
         self._postponed: tuple[Frame, Observation] | None = None
 
     def catch_up(self, step: TrainingStep) -> None:
@@ -260,7 +263,7 @@ class Placement:
                 for late depth.
             late: prepared depth of the frame, if any.
         """
-        if self.postpones and self.is_placed and shown_s is None:
+        if self._postpones and self.is_placed and shown_s is None:
             self._postponed = frame, observation
             return
         if frame is self._first or frame.depth is None:

@@ -1,4 +1,4 @@
-"""Scenes that a stream has left, kept for recognition when the stream shows one of them again."""
+"""Scenes that a stream has left, kept for recognition when the stream shows one of them again, and for the memory of the next one."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.step import TrainingStep
 
 MOST_PLACES = 8
 """Largest number of kept places; the one left first is dropped."""
@@ -92,6 +94,54 @@ class Places:
             if mask is not None:
                 known &= cv2.resize((mask > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
         return likeness_of(shown, image, known)
+
+
+class LeftScenes:
+    """Scenes that a stream has left: their last states, and the memory of the newest one.
+
+    A scene of the same picture size reuses that memory, so that captured graphs stay valid.
+    """
+
+    def __init__(self) -> None:
+        self.places = Places()
+        self._recognised: tuple[int, Place] | None = None
+        """Number of the frame that starts the next scene, and the place that it shows."""
+        self._kept: TrainingStep | None = None
+        self._kept_size: tuple[int, int] | None = None
+        """Picture size of the newest scene."""
+
+    def forget(self) -> None:
+        """Discard the places."""
+        self.places, self._recognised = Places(), None
+
+    def leave(self, step: TrainingStep, camera: Camera, time_s: float) -> None:
+        """Keep the last state of a scene, seen by `camera` at `time_s`, to recognise it later."""
+        self.places.leave(step.at(time_s), camera, time_s)
+
+    def recognise(self, frame: Frame) -> bool:
+        """Return True if the frame, which starts the next scene, shows a place left before."""
+        place = self.places.take(frame)
+        self._recognised = None if place is None else (frame.seq, place)
+        return place is not None
+
+    def recognised(self, seq: int) -> Gaussians | None:
+        """Return the Gaussians of the place that frame `seq` was recognised as, or None."""
+        return self._recognised[1].gaussians if self._recognised and self._recognised[0] == seq else None
+
+    def keep_memory(self, step: TrainingStep | None) -> None:
+        """Keep the memory of a scene for the next one. None keeps that of an earlier scene."""
+        self._kept = step or self._kept
+
+    def restarted(self, gaussians: Gaussians, observation: Observation) -> TrainingStep | None:
+        """Start a scene of these Gaussians from its first observation in the memory of the previous
+        scene. Return None if there is no such memory or the scene does not fit into it.
+        """
+        kept, self._kept = self._kept, None
+        size = observation.camera.width_px, observation.camera.height_px
+        same_size, self._kept_size = size == self._kept_size, size
+        if kept is None or not same_size:
+            return None
+        return kept if kept.restart(gaussians, observation.time_s, observation.camera) else None
 
 
 def compared_size(width_px: int, height_px: int) -> tuple[int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
@@ -19,33 +18,35 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
-from gsplat_core.training.budget import Budget, ObserveReport, Spending, StepsInFlight
+from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import Covering
 from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
+from gsplat_core.training.motion_prior import Following, continued, newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.offline import FitSettings, OfflineTraining
 from gsplat_core.training.parallax import to_fit
-from gsplat_core.training.placement import Placement
+from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
+from gsplat_core.training.places import LeftScenes
 from gsplat_core.training.right_eye import BothEyes, for_eyes
+from gsplat_core.training.schedule import LiveTraining, NewestFirstSchedule, Schedule, WindowSchedule
+from gsplat_core.training.start_on_device import StartOnDevice
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_tracks import SurfaceTracks
+from gsplat_core.training.upkeep import PostponedGrowth
 from gsplat_core.transfers import HostCopy
-
-USUAL_DECAY = 0.1
-"""Weight of the newest frames in the usual first loss."""
-STEP_TIME_DECAY = 0.3
-"""Weight of the newest frames in the estimated step time of timed budgets."""
 
 
 class Reconstructor:
     """Owner of the model that is being learned.
 
-    Online: call `observe` for each frame in order, and `snapshot` for a copy to display. Offline:
+    Online: call `observe` for each frame in order, and `publish` for a model to display. Offline:
     call `fit`. The result is deterministic for equal frames, settings and seed. With the basis
     field it is also independent of the number of threads. The HexPlane's network uses torch's
     matrix products, which round differently with other numbers of threads.
+
+    For a stream that does not wait, give `live`. All steps of `observe` then train on the newest
+    frame. After `publish`, call `grow` and `rehearse` until the next frame.
 
     All tensors are kept and trained on `device`. A GPU works on a frame's steps while the host
     prepares the next frame.
@@ -56,39 +57,73 @@ class Reconstructor:
         config: ReconstructorConfig,
         camera: Camera,
         *,
+        live: LiveTraining | None = None,
         seed: int = 0,
         recording_digest: str | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
+        """Set the parameters; the first observed frame creates the model.
+
+        Args:
+            config: model size, losses and learning rates.
+            camera: camera of the frames.
+            live: settings of the steps in a live stream. None to mix steps on the newest frame and
+                on earlier ones, and to grow the scene before each frame is trained on.
+            seed: seed of all random numbers.
+            recording_digest: digest of the recording, stated by the model.
+            device: device of all tensors.
+
+        Raises:
+            InvalidSetting: if `live` does not suit `config`.
+        """
         self.config, self.camera = config, camera
         self.device = torch.device(device)
         self._seed, self._recording_digest = seed, recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self.eyes = BothEyes(config.eyes, self.device)
         self._step: TrainingStep | None = None
-        self._prior: MotionPrior | None = None
-        self._placement = Placement()
-        self._covering = Covering(config, beside=self._covers_beside and self.device.type == "cuda")
-        self._unsettled: Observation | None = None
-        """Frame whose steps are queued and not yet checked for overflow of the tile lists."""
-        self._in_flight = StepsInFlight(self.device)
-        self._step_s: float | None = None
+        self._left = LeftScenes()
+        self._covering = Covering(config, beside=live is not None and self.device.type == "cuda")
+        self._schedule: Schedule
+        self._growth: PostponedGrowth | None
+        if live is None:
+            self._schedule, self._growth = WindowSchedule(config, self.device), None
+        else:
+            self._schedule = NewestFirstSchedule(live, config, self.device)
+            self._growth = PostponedGrowth(config, self.device, self._covering)
+        self._placement = Placement(postpones=live is not None)
+        # If training starts from the predicted motion, the prior must process each frame first.
+        self._motion = Following(config, at_once=live is None or config.start_from_motion)
+        self._start_here: StartOnDevice | None = None
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
-        self._usual_first_loss = math.inf
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
         """Reasons why `fit` found no depth, with numbers of frames of a moving camera."""
 
-    _covers_beside = False
-    """Create new Gaussians concurrently with training on a GPU."""
-    _follows_at_once = True
-    """Let the motion prior process a frame before the model is trained on it."""
-
     @property
     def gaussians(self) -> int:
         """Current number of Gaussians."""
         return 0 if self._step is None else self._step.gaussians.count
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters of the whole model; 0 before there is one."""
+        if self._step is None:
+            return 0
+        return sum(t.numel() for t in self._step.gaussians.tensors().values()) + self._step.field.parameter_count
+
+    @property
+    def step_ns(self) -> float:
+        """Usual duration of a step in nanoseconds; 0 if unknown."""
+        return (self._schedule.step_s or 0.0) * 1e9
+
+    def kept(self) -> dict[str, int]:
+        """Return the sizes of all stream-dependent stores; each is bounded."""
+        columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
+        archived = 0 if self._growth is None else self._growth.archived
+        held = {"window_frames": len(self._window), "columns": columns, "places": len(self._left.places)}
+        return {**held, "archived": archived}
 
     @property
     def _fixed_rows(self) -> int:
@@ -133,79 +168,121 @@ class Reconstructor:
                 f"frame {frame.seq} is at {observation.time_s:.3f} s, before the last one at {self._last_time_s:.3f} s;"
                 " frames must come in order"
             )
-        self._settle()
-        assert self._step is not None
-        self._step.field.cover(observation.time_s, self._last_time_s)
+        step = self._step
+        assert step is not None
+        if not train:
+            self._motion.skip(step)
+        self._schedule.settle(step)
+        step.field.cover(observation.time_s, self._last_time_s)
         self._last_time_s = observation.time_s
-        self._window.forget_before(self._step.field.time_window_s[0])
+        self._window.forget_before(step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
         self._learned_s = observation.time_s
         self._depth_source = DepthSource.after(self._depth_source, frame)
-        if self._follows_at_once:
-            self._follow(frame, observation)
+        self._motion.observe(step, frame, observation, first=first)
         self._window.add(observation)
-        self._placement.apply(self._step, frame, observation)
-        self._grow(frame, observation, first)
+        self._placement.apply(step, frame, observation)
+        if self._growth is None:
+            self._covering.cover(step, frame, observation, first=first)
+        elif not first:
+            self._growth.prepare(step, frame, observation, self._motion)
         if budget is None:
             budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
-        return self._train_on(observation, budget, first)
+        return self._schedule.train(step, self._window, observation, budget, first=first)
 
-    def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
-        """Spend a budget on the newest frame and the window. A jump gets extra steps, or with a
-        deadline all remaining ones.
+    def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
+        """Use the depth of a frame that was trained on before its depth was available, for
+        rehearsal and for placing the scene.
+
+        Args:
+            frame: the frame, with its depth.
+            late: `LateDepth.of` the frame on this device, if another thread has prepared it.
+
+        Returns:
+            False, with nothing changed, if the frame belongs to another scene, was not trained on,
+                or has `MOST_LATE` newer ones.
+        """
+        if self._step is None or (seen := self._window.find(frame.seq, MOST_LATE)) is None:
+            return False
+        self._schedule.settle(self._step)
+        late = late or LateDepth.of(frame, self.device)
+        observation, was_placed = late.added_to(seen), self._placement.is_placed
+        self._window.replace(observation)
+        self._placement.apply(self._step, frame, observation, self._learned_s, late)
+        is_first = self._placement.is_placed and not was_placed
+        self._depth_source = DepthSource.of_first(frame) if is_first else DepthSource.after(self._depth_source, frame)
+        return True
+
+    def rehearse(self, steps: int) -> None:
+        """Train on frames of the window.
+
+        Raises:
+            InvalidInput: before the first frame.
+        """
+        if self._step is None:
+            raise InvalidInput("there is nothing to rehearse yet: observe a frame first")
+        self._schedule.rehearse(self._step, self._window, steps)
+
+    def rehearsal_ns(self, steps: int) -> float:
+        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0
+        if unknown.
+        """
+        return self._schedule.rehearsal_ns(steps)
+
+    def grow(self, frame: Frame) -> None:
+        """Do the work that `observe` postpones in a live stream until `frame`, the newest trained
+        one, has been displayed. The scene is corrected by its depth, Gaussians are added for
+        uncovered tissue, and Gaussians are archived or restored.
         """
         assert self._step is not None
-        spending = Spending(budget, self._step_s)
-        plan: list[Observation] = [observation]
-        first_loss: HostCopy | None = None
-        jump = False
-        while spending.allows_step():
-            if not plan:
-                if budget.is_timed and not jump:
-                    jump = self._is_jump(first_loss, first)
-                count = spending.planned()
-                plan = [observation] * count if jump else self._window.schedule(count)[::-1]
-            loss = self._step(plan.pop().by_turns(spending.turn))
-            first_loss = first_loss or HostCopy(loss)
-            spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
-        if first_loss is None:
-            return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)
-        extra = 0
-        # Read the loss only now, so that the host does not wait for a GPU before its queue is
-        # filled.
-        if not budget.is_timed and self._is_jump(first_loss, first):
-            extra = spending.made * self.config.jump_extra
-        for turn in range(extra):
-            loss = self._step(observation.by_turns(turn))
-        self._unsettled = observation
-        if budget.is_timed or first:
-            self._settle()
-        if budget.is_timed:
-            self._learn_step_time(spending)
-        if not first:
-            self._learn_first_loss(first_loss.item())
-        return ObserveReport(observation.seq, spending.made + extra, HostCopy(loss), self.gaussians, spending.ending)
+        self._placement.catch_up(self._step)
+        if self._growth is not None:
+            self._growth.finish(self._step, frame, self._window.newest, self._motion)
 
-    def _settle(self) -> None:
-        """Wait for the queued steps and repeat those that overflowed the tile lists."""
-        if self._step is not None and self._unsettled is not None:
-            self._step.settle(self._unsettled)
-        self._unsettled = None
+    def look_after_once(self) -> None:
+        """Run every periodic growth step of `grow` immediately, forcing eviction. For warm-up,
+        since the first run of each is slow.
+        """
+        if self._step is not None and self._growth is not None:
+            self._growth.once(self._step, self._window.newest)
 
-    def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:
-        """Return True if a frame's first loss shows a cut or a sudden motion. Waits for the loss."""
-        usual = self.config.jump_ratio * self._usual_first_loss
-        return not first and first_loss is not None and first_loss.item() > usual
+    def begin_scene(self, frame: Frame) -> bool:
+        """Leave the scene. The next observed frame, `frame`, starts a new scene or one that was
+        left before.
 
-    def _learn_first_loss(self, first_loss: float) -> None:
-        known = self._usual_first_loss if self._usual_first_loss < math.inf else first_loss
-        self._usual_first_loss = known + USUAL_DECAY * (min(first_loss, self.config.jump_ratio * known) - known)
+        A bounded number of left scenes is kept in host memory in their last state. The frame may
+        have another size. Version numbers continue.
 
-    def _learn_step_time(self, spending: Spending) -> None:
-        spending.all_finished()
-        known = spending.step_s if self._step_s is None else self._step_s
-        self._step_s = known + STEP_TIME_DECAY * (spending.step_s - known)
+        Returns:
+            True if the frame shows a place that was left before.
+        """
+        if self._step is not None:
+            self._left.leave(self._step, self._window.newest.camera, self._last_time_s)
+        self._end_scene()
+        if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
+            self.camera = self.camera.resized(frame.width_px, frame.height_px)
+        return self._left.recognise(frame)
+
+    def forget(self) -> None:
+        """Reset to the state before the first frame, but keep the allocated memory and the
+        estimated step time.
+        """
+        self._end_scene()
+        self._left.forget()
+        self._version = 0
+
+    def _end_scene(self) -> None:
+        self._schedule.settle(self._step)
+        self._left.keep_memory(self._step)
+        self._step = None
+        self._schedule.forget()
+        self._motion.forget()
+        self._covering.forget()
+        if self._growth is not None:
+            self._growth.forget()
+        self.eyes.forget()
+        self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
     def fit(
         self,
@@ -237,7 +314,7 @@ class Reconstructor:
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
             first_new = self.gaussians if number else 0
-            self._grow(frame, observation, number == 0)
+            self._covering.cover(self._step, frame, observation, first=number == 0)
             tracks.apply(self._step, number, first_new)
         most, settings = self.config.max_gaussians, settings or FitSettings()
         loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
@@ -251,61 +328,83 @@ class Reconstructor:
         """
         if self._step is None:
             raise InvalidInput("there is no model yet: observe a frame first")
-        self._settle()
+        self._schedule.settle(self._step)
         self._version += 1
-        with continued(self._step, self._prior, self._learned_s):
+        with continued(self._step, self._motion.prior, self._learned_s):
             gaussians, field = self._step.copy()
         return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
-        """Return the current model for display with the next version number.
+        """Return the model for displaying the time of the newest trained frame and later, with the
+        next version number.
 
-        On a GPU it is copied into a preallocated slot without allocation or synchronisation, see
-        `gsplat_core.scene.snapshots`. Otherwise it equals `snapshot`.
+        On a GPU the whole model is copied into a preallocated slot without allocation or
+        synchronisation, see `gsplat_core.scene.snapshots`. On a CPU with a motion prior only the
+        current state is copied; `whole_model` includes the past. Otherwise it equals `snapshot`.
         """
-        if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
+        step, prior = self._step, self._motion.prior
+        if step is not None and prior is not None and self.device.type == "cpu":
+            self._version += 1
+            gaussians, field = newest_state(step, prior, self._learned_s)
+            facts = {**self._facts(), "time_window_s": (self._learned_s, self._last_time_s)}
+            return Model(gaussians=gaussians, field=field, **facts)
+        if step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(step.field):
             return self.snapshot()
         self._version += 1
-        with continued(self._step, self._prior, self._learned_s):
-            return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
+        with continued(step, prior, self._learned_s):
+            return self._slots.publish(step.gaussians, step.field, **self._facts())
+
+    def whole_model(self, shown: Model | Snapshot) -> Model:
+        """Return the model with its past in its own memory. `shown` is the last published model."""
+        return shown.as_model() if isinstance(shown, Snapshot) else self.snapshot()
 
     def _facts(self) -> dict[str, Any]:
         """Return the metadata of a model or snapshot."""
-        known = dict(training_digest=self._recording_digest, depth_source=self._depth_source)
-        return dict(version=self._version, camera=self.camera, time_window_s=self._time_window_s, **known)
-
-    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
-        """Create the first Gaussians of a scene, and set its camera and start time from the frame."""
-        self._first_time_s, self.camera = observation.time_s, observation.camera
-        self._depth_source = DepthSource.of_first(frame)
-        count, degree, plane = self.config.gaussians, self.config.sh_degree, self.config.default_depth_mm
-        return gaussians_from_frame(
-            frame, self.camera, count, sh_degree=degree, default_depth_mm=plane, seed=self._seed
-        ).to(self.device)
+        unseen_s = None if self._growth is None else self._growth.unseen_s(self.gaussians)
+        known = dict(
+            training_digest=self._recording_digest, depth_source=self._depth_source, time_window_s=self._time_window_s
+        )
+        return dict(version=self._version, camera=self.camera, unseen_s=unseen_s, **known)
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        """Create the scene from its first frame; `end_s` is the time of the last frame offline."""
+        if self._growth is not None:
+            self._growth.begin(observation.camera)
         gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
+        if end_s is None:
+            self._step = self._left.restarted(gaussians, observation)
+            if self._step is not None:
+                self._motion.restart()
+                return
         wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers are initialised randomly
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)
-        self._prior = None if end_s is not None else new_motion_prior(self.config, field)
+        if end_s is None:
+            self._motion.begin(field)
         is_captured = self.device.type == "cuda" and SnapshotSlots.can_hold(field)
         self._covering.begin(self.camera if is_captured else None, self.device, self._fixed_rows)
 
-    def _follow(self, frame: Frame, observation: Observation) -> None:
-        """Let the motion prior process the next frame."""
-        if self._prior is not None and self._step is not None:
-            self._prior.observe(frame, observation.time_s, observation.camera, self._step)
-
-    def _grow(self, frame: Frame, observation: Observation, first: bool = False) -> None:
-        """Add Gaussians where an eye of the frame shows uncovered tissue. The first left picture is
-        skipped, since the scene was created from it.
-        """
-        assert self._step is not None
-        self._covering.join(self._step)
-        if not first:
-            self._covering.look(self._step, observation, lambda: frame, has_depth=frame.depth is not None)
-        if (right := observation.right) is not None:
-            self._covering.look(self._step, right, right.as_frame)
+    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        """Create the first Gaussians of a scene, and set its camera and start time from the frame."""
+        self._first_time_s, self.camera = observation.time_s, observation.camera
+        recognised = self._left.recognised(frame.seq)
+        if recognised is not None:
+            return recognised.to(self.device)
+        self._depth_source = DepthSource.of_first(frame)
+        config = self.config
+        if self._growth is None or self.device.type != "cuda":
+            return gaussians_from_frame(
+                frame,
+                self.camera,
+                config.gaussians,
+                sh_degree=config.sh_degree,
+                default_depth_mm=config.default_depth_mm,
+                seed=self._seed,
+            ).to(self.device)
+        if self._start_here is None or not self._start_here.fits(observation.camera):
+            self._start_here = StartOnDevice(observation.camera, config.gaussians, self.device, self._seed)
+        return self._start_here(
+            frame, observation, sh_degree=config.sh_degree, default_depth_mm=config.default_depth_mm
+        )

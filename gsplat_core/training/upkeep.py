@@ -16,11 +16,14 @@ import torch
 from torch import Tensor
 
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.densification import halves
-from gsplat_core.training.growth import grid_spacing
+from gsplat_core.training.growth import Covering, grid_spacing
 from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
+from gsplat_core.training.motion_prior import Following
+from gsplat_core.training.moving_view import OutOfView, fill_new_tissue, has_moved
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.unseen import LastSeen, around_cells, depth_of, pixels_of, value_at
@@ -189,6 +192,75 @@ class Upkeep:
         count = min(missing, round(MOST_SPLIT * step.gaussians.count), self._capacity - step.gaussians.count)
         if count > 0:
             step.split(step.busiest(count, shown), halves)
+
+
+REVEALED_SHARE = 0.01
+"""Width of a newly revealed strip, as a share of the picture's width, from which new tissue is
+searched before the first step.
+"""
+
+
+class PostponedGrowth:
+    """Growth and maintenance of live scenes, most of which waits until a frame has been displayed."""
+
+    def __init__(self, config: ReconstructorConfig, device: torch.device, covering: Covering) -> None:
+        self._config, self._covering = config, covering
+        self._out_of_view = OutOfView(config.max_gaussians, device) if config.preallocate else None
+        self._upkeep: Upkeep | None = None
+        self._camera_before: Camera | None = None
+        """Camera at the last search for tissue that came into view."""
+
+    @property
+    def archived(self) -> int:
+        """Number of archived Gaussians."""
+        return 0 if self._out_of_view is None else len(self._out_of_view.archive)
+
+    def unseen_s(self, count: int) -> Tensor | None:
+        """Return `Model.unseen_s` of the scene's `count` Gaussians; None if it is not recorded."""
+        return None if self._out_of_view is None else self._out_of_view.unseen_s(count)
+
+    def begin(self, camera: Camera) -> None:
+        """Start a scene that `camera` sees first."""
+        if self._out_of_view is not None:
+            self._out_of_view.restart()
+        self._upkeep = None if self._config.history_s is None else Upkeep(camera, self._config)
+
+    def forget(self) -> None:
+        """Leave the scene."""
+        self._camera_before = None
+
+    def prepare(self, step: TrainingStep, frame: Frame, observation: Observation, motion: Following) -> None:
+        """Fill tissue that came into view, before the first training step on the newest frame."""
+        before, camera = self._camera_before, observation.camera
+        if before is None:
+            self._camera_before = camera
+        elif before != camera and has_moved(camera, before, step.distance(camera)):
+            self._camera_before = camera
+            fill_new_tissue(step, frame, observation, before, self._config, self._out_of_view)
+        # After the scene was moved by the flow, a revealed edge contains nothing to train.
+        if motion.has_revealed(REVEALED_SHARE * camera.width_px):
+            self._cover(step, frame, observation, motion)
+
+    def finish(self, step: TrainingStep, frame: Frame, observation: Observation, motion: Following) -> None:
+        """Archive, restore, maintain and add Gaussians after the display of the newest frame."""
+        if self._out_of_view is not None:
+            self._out_of_view.follow(step, observation)
+        if self._upkeep is not None:
+            self._upkeep(step, observation, self._last_seen)
+        self._cover(step, frame, observation, motion)
+
+    def once(self, step: TrainingStep, observation: Observation) -> None:
+        """Run all maintenance immediately, forcing eviction. For warm-up."""
+        if self._upkeep is not None:
+            self._upkeep.once(step, observation, self._last_seen)
+
+    @property
+    def _last_seen(self) -> LastSeen | None:
+        return None if self._out_of_view is None else self._out_of_view.last_seen
+
+    def _cover(self, step: TrainingStep, frame: Frame, observation: Observation, motion: Following) -> None:
+        self._covering.cover(step, frame, observation)
+        motion.cover_revealed()
 
 
 def _repeated(cells: Tensor, counted: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
-from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture
 from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
@@ -144,10 +144,10 @@ OPENCV_THREADS = 1
 """Number of OpenCV threads. Starting more takes longer than processing a small picture."""
 
 
-def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
+def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> Reconstructor:
     """Create a reconstructor for the frames of a source."""
     camera = source.description.camera
-    return LiveReconstructor(
+    return Reconstructor(
         settings.reconstructor_config(camera.width_px * camera.height_px),
         camera,
         live=settings.chosen_training,
@@ -160,7 +160,7 @@ def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveR
 class LiveParts:
     """Components of a live session."""
 
-    reconstructor: LiveReconstructor
+    reconstructor: Reconstructor
     rasterizer: Rasterizer
 
 

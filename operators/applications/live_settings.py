@@ -10,7 +10,7 @@ from gsplat_core.depth.registry import check_depth, depth_inputs
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail
-from gsplat_core.training.live import LiveTraining
+from gsplat_core.training.schedule import LiveTraining
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.session import RunSettings
 from operators.display import DisplaySettings

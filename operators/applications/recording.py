@@ -20,7 +20,7 @@ from gsplat_core.io.sessions.records import (
     ScheduleLine,
     camera_record,
 )
-from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Application, Operator
 from operators.output_folder import RECORDINGS
 from operators.reconstruct import ScheduleEvent, ScheduleListener
@@ -127,13 +127,13 @@ class RunRecording:
 
         return record_event
 
-    def made_by(self, make: Callable[[], LiveReconstructor]) -> Callable[[], LiveReconstructor]:
+    def made_by(self, make: Callable[[], Reconstructor]) -> Callable[[], Reconstructor]:
         """Return a factory that calls `make` and records the settings of the new reconstructor."""
         if self.recorder is None:
             return make
         recorder, settings = self.recorder, self._settings
 
-        def made() -> LiveReconstructor:
+        def made() -> Reconstructor:
             reconstructor = make()
             recorder.line(
                 ReconstructorMade(

@@ -36,8 +36,8 @@ from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from operators.applications.device import check_device, scheduler_for, seeded
 from operators.applications.limits import check_picture, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
@@ -393,10 +393,10 @@ class FollowedSession:
     training: LiveTraining
     device: str
 
-    def new_reconstructor(self) -> LiveReconstructor:
+    def new_reconstructor(self) -> Reconstructor:
         """Create a reconstructor with the session's settings, warmed up identically."""
         with seeded(self.made.seed, self.device):
-            reconstructor = LiveReconstructor(
+            reconstructor = Reconstructor(
                 self.config,
                 camera_of(self.made.camera),
                 live=self.training,

@@ -12,7 +12,7 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget
-from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.reconstructor import Reconstructor
 
 WARM_FRAMES = 4
 WARM_STEPS = {"cpu": 3, "cuda": 40}
@@ -22,7 +22,7 @@ EYES_APART = 0.07
 
 
 def warm_reconstructor(
-    reconstructor: LiveReconstructor,
+    reconstructor: Reconstructor,
     draw: Callable[[Frame, Model | Snapshot], object] = lambda *_: None,
     *,
     stereo: bool = False,

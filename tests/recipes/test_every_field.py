@@ -14,8 +14,9 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.upkeep import RENEW_EVERY
 from services.cli.app import run
 from tests.recipes.test_deformation_field import DRIFT, POLYNOMIAL
@@ -80,7 +81,7 @@ def test_everything_that_a_live_scene_goes_through_takes_the_field(recording, fi
         field=field, gaussians=200, max_gaussians=300, history_s=0.5, preallocate=True, motion_prior="flow",
         start_from_motion=True, squared_error=True,
     )  # fmt: skip
-    made = LiveReconstructor(config, camera, live=LiveTraining(colour_relaxation=1.0))
+    made = Reconstructor(config, camera, live=LiveTraining(colour_relaxation=1.0))
     for k, frame in enumerate(frames):
         frame = frame.with_fields(depth=None)
         if k in (5, 8):

@@ -16,7 +16,7 @@ import torch
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications import live as live_module
 from operators.applications.live_settings import LiveSettings
 from operators.errors import RunFailed, SourceLost
@@ -111,14 +111,14 @@ def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
 
 @pytest.mark.slow
 def test_a_device_without_memory(scope, tmp_path, monkeypatch):
-    observe = LiveReconstructor.observe
+    observe = Reconstructor.observe
 
     def observing(self, frame, **more):
         if frame.seq >= 90:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
         return observe(self, frame, **more)
 
-    monkeypatch.setattr(LiveReconstructor, "observe", observing)
+    monkeypatch.setattr(Reconstructor, "observe", observing)
     written = []
     settings = LiveSettings(str(scope), tmp_path / "out", loop=True)
     with pytest.raises(RunFailed) as failed:

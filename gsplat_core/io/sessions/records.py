@@ -202,14 +202,14 @@ class ReconstructorMade(Record):
 
 
 class SceneBegun(Record):
-    """Call of `LiveReconstructor.begin_scene`."""
+    """Call of `Reconstructor.begin_scene`."""
 
     event: Literal["begin_scene"] = "begin_scene"
     seq: Count
 
 
 class Observed(Record):
-    """Calls of `LiveReconstructor.observe` and then `publish`."""
+    """Calls of `Reconstructor.observe` and then `publish`."""
 
     event: Literal["observe"] = "observe"
     seq: Count
@@ -218,7 +218,7 @@ class Observed(Record):
 
 
 class DepthTaken(Record):
-    """Call of `LiveReconstructor.take_depth` with an already observed frame and its late depth."""
+    """Call of `Reconstructor.take_depth` with an already observed frame and its late depth."""
 
     event: Literal["take_depth"] = "take_depth"
     seq: Count
@@ -230,14 +230,14 @@ class DepthTaken(Record):
 
 
 class Grown(Record):
-    """Call of `LiveReconstructor.grow` with the last observed frame."""
+    """Call of `Reconstructor.grow` with the last observed frame."""
 
     event: Literal["grow"] = "grow"
     seq: Count
 
 
 class Rehearsed(Record):
-    """Call of `LiveReconstructor.rehearse`."""
+    """Call of `Reconstructor.rehearse`."""
 
     event: Literal["rehearse"] = "rehearse"
     steps: Steps

@@ -8,9 +8,10 @@ import torch
 
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.placement import CapturedCorrection, _correct_at
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from tests.gsplat_core.training.test_late_depth import CAMERA, found, frame_at
 
 pytestmark = pytest.mark.cuda
@@ -21,7 +22,7 @@ FRAME = frame_at(2)
 def step(gpu):
     """Return the training step of a scene at 80 mm that has unused rows."""
     config = ReconstructorConfig(gaussians=300, max_gaussians=400, preallocate=True, depth_weight=0.1)
-    made = LiveReconstructor(config, CAMERA, device="cuda")
+    made = Reconstructor(config, CAMERA, device="cuda", live=LiveTraining())
     for k in range(3):
         made.observe(frame_at(k), steps=3)
     made.take_depth(found(frame_at(1)))

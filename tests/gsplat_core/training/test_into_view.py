@@ -12,10 +12,11 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.moving_view import NewTissue, entered, has_moved
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.unseen import around_cells
 
 WIDTH, HEIGHT, FOCAL, DEPTH_MM = 48, 40, 50.0, 60.0
@@ -96,7 +97,7 @@ def test_a_camera_that_moves_on_does_not_drag_the_scene_along(device, pixels_a_f
         gaussians=300, max_gaussians=6000, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True,
         default_depth_mm=DEPTH_MM,
     )  # fmt: skip
-    made = LiveReconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
+    made = Reconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
     columns = [0] * 15 + [pixels_a_frame * k for k in range(frames)]
     scores = []
     for seq, column in enumerate(columns):

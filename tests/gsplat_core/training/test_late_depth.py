@@ -13,8 +13,9 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.placement import MOST_LATE
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 
 WIDTH, HEIGHT = 48, 40
 CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)
@@ -35,15 +36,15 @@ def found(frame: Frame, depth: float | np.ndarray = 80.0, origin: DepthOrigin = 
     return frame.with_fields(depth=plane, depth_confidence=np.ones_like(plane), depth_origin=origin, right_camera=eye)
 
 
-def learner(frames: int = 3, **config: object) -> LiveReconstructor:
+def learner(frames: int = 3, **config: object) -> Reconstructor:
     settings = {"gaussians": 300, "max_gaussians": 400, "window_frames": 40, "depth_weight": 0.1, **config}
-    made = LiveReconstructor(ReconstructorConfig(**settings), CAMERA)
+    made = Reconstructor(ReconstructorConfig(**settings), CAMERA, live=LiveTraining())
     for k in range(frames):
         made.observe(frame_at(k), steps=3)
     return made
 
 
-def distance(made: LiveReconstructor, k: int) -> float:
+def distance(made: Reconstructor, k: int) -> float:
     with torch.no_grad():
         output = render(made.snapshot().at(frame_at(k).time_s), CAMERA, depth=True)
     return float(output.depth.median())
@@ -95,44 +96,44 @@ def test_the_loss_does_not_see_depth_by_light() -> None:
 
 @pytest.mark.parametrize(("origin", "goes_to"), [(DepthOrigin.STEREO, (50 * 80) ** 0.5), (DepthOrigin.LIGHT, 50.0)])
 def test_a_scene_that_started_from_depth_is_corrected_and_not_placed_again(origin: DepthOrigin, goes_to: float) -> None:
-    made = LiveReconstructor(ReconstructorConfig(gaussians=300, max_gaussians=400), CAMERA)
+    made = Reconstructor(ReconstructorConfig(gaussians=300, max_gaussians=400), CAMERA, live=LiveTraining())
     made.observe(frame_at(0, depth=np.full((HEIGHT, WIDTH), 50, np.float32)), steps=3)
     made.observe(frame_at(1), steps=3)
     assert made.take_depth(found(frame_at(1), 80.0, origin))
     assert distance(made, 1) == pytest.approx(goes_to, rel=0.02)
 
 
-def another_scene(made: LiveReconstructor) -> None:
+def another_scene(made: Reconstructor) -> None:
     other = frame_at(3)
     other = other.with_fields(image=255 - other.image)
     made.begin_scene(other)
     made.observe(other, steps=3)
 
 
-def another_size(made: LiveReconstructor) -> None:
+def another_size(made: Reconstructor) -> None:
     wide = frame_at(3, width=2 * WIDTH)
     made.begin_scene(wide)
     made.observe(wide, steps=3)
 
 
-def a_scene_that_has_not_begun(made: LiveReconstructor) -> None:
+def a_scene_that_has_not_begun(made: Reconstructor) -> None:
     made.begin_scene(frame_at(3))
 
 
-def withheld(made: LiveReconstructor) -> None:
+def withheld(made: Reconstructor) -> None:
     made.observe(frame_at(3), train=False)
     assert not made.take_depth(found(frame_at(3)))
     made.forget()
     made.observe(frame_at(4), steps=1)
 
 
-def long_ago(made: LiveReconstructor) -> None:
+def long_ago(made: Reconstructor) -> None:
     for k in range(3, 3 + MOST_LATE):
         made.observe(frame_at(k), steps=1)
 
 
 @pytest.mark.parametrize("overtakes", [another_scene, another_size, a_scene_that_has_not_begun, withheld, long_ago])
-def test_depth_of_what_is_gone_changes_nothing(overtakes: Callable[[LiveReconstructor], None]) -> None:
+def test_depth_of_what_is_gone_changes_nothing(overtakes: Callable[[Reconstructor], None]) -> None:
     made, untouched = learner(), learner()
     overtakes(made)
     overtakes(untouched)
@@ -170,7 +171,7 @@ def test_a_scene_after_a_cut_is_placed_by_its_own_depth() -> None:
 @pytest.mark.cuda
 def test_a_gpu_learns_it_too(gpu: torch.device) -> None:
     config = ReconstructorConfig(gaussians=300, max_gaussians=400, preallocate=True, depth_weight=0.1)
-    made = LiveReconstructor(config, CAMERA, device="cuda")
+    made = Reconstructor(config, CAMERA, device="cuda", live=LiveTraining())
     for k in range(3):
         made.observe(frame_at(k), steps=3)
     assert made.take_depth(found(frame_at(1)))
@@ -179,7 +180,7 @@ def test_a_gpu_learns_it_too(gpu: torch.device) -> None:
     assert distance_on_gpu(made, 2) == pytest.approx(80, rel=0.02)
 
 
-def distance_on_gpu(made: LiveReconstructor, k: int) -> float:
+def distance_on_gpu(made: Reconstructor, k: int) -> float:
     with torch.no_grad():
         output = render(made.snapshot().at(frame_at(k).time_s), CAMERA, depth=True)
     return float(output.depth.median().cpu())

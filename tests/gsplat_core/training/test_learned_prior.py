@@ -119,7 +119,7 @@ def test_pictures_without_tissue_or_light_give_finite_models(value: int) -> None
 def test_another_scene_begins_without_what_was_learned() -> None:
     reconstructor = learner()
     learned(reconstructor, stream([0.0, 1.0, 2.0]))
-    step, prior = reconstructor._step, reconstructor._prior
+    step, prior = reconstructor._step, reconstructor._motion.prior
     assert step is not None and isinstance(prior, LearnedPrior)
     assert prior.velocity(step) is not None
     prior.forget()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -13,8 +11,9 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.step import TrainingStep
 
 WIDTH, HEIGHT = 48, 40
@@ -30,7 +29,7 @@ def frame_at(k, width=WIDTH, height=HEIGHT):
 
 def reconstructor(*, preallocate=False, **live):
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, window_frames=8, preallocate=preallocate)
-    return LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining(**live))
+    return Reconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining(**live))
 
 
 def run(made, steps=((10, 4), (3, 0), (5, 7))):
@@ -154,9 +153,7 @@ def test_settings_out_of_range_are_refused(wrong):
 
 def test_colours_that_depend_on_the_view_are_not_corrected_on_a_gpu():
     with pytest.raises(InvalidSetting, match="set sh_degree or colour_relaxation to 0"):
-        LiveReconstructor(
-            ReconstructorConfig(sh_degree=1), CAMERA, live=LiveTraining(colour_relaxation=1.0), device="cuda"
-        )
+        Reconstructor(ReconstructorConfig(sh_degree=1), CAMERA, live=LiveTraining(colour_relaxation=1.0), device="cuda")
 
 
 def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():
@@ -164,7 +161,7 @@ def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():
 
     def shown_db(relaxation):
         config = ReconstructorConfig(gaussians=400, max_gaussians=400, squared_error=True)
-        made = LiveReconstructor(config, CAMERA, live=LiveTraining(colour_relaxation=relaxation))
+        made = Reconstructor(config, CAMERA, live=LiveTraining(colour_relaxation=relaxation))
         made.observe(frame_at(0), budget=Budget.of_steps(30))
         for k in range(1, 6):
             frame = frame_at(k)
@@ -178,7 +175,7 @@ def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():
 def test_a_picture_that_was_just_trained_on_is_shown_as_it_was_trained():
     """The motion prior does not look at every frame, and says nothing about one that it has not seen."""
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow")
-    made = LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT))
+    made = Reconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining())
     for k in range(4):
         frame = frame_at(6 * k)
         made.observe(frame, budget=Budget.of_steps(20))
@@ -189,7 +186,7 @@ def test_a_picture_that_was_just_trained_on_is_shown_as_it_was_trained():
 
 def test_where_nothing_can_be_trained_on_the_motion_of_the_last_two_frames_goes_on():
     config = ReconstructorConfig(gaussians=300, max_gaussians=600, motion_prior="flow")
-    made = LiveReconstructor(config, Camera.from_focal(80.0, 2 * WIDTH, 2 * HEIGHT))
+    made = Reconstructor(config, Camera.from_focal(80.0, 2 * WIDTH, 2 * HEIGHT), live=LiveTraining())
     frames = [frame_at(k, 2 * WIDTH, 2 * HEIGHT) for k in range(5)]
     for frame in frames[:4]:
         made.observe(frame, budget=Budget.of_steps(20))
@@ -208,7 +205,7 @@ def test_what_a_moving_picture_reveals_is_covered_before_it_is_shown():
     config = ReconstructorConfig(
         gaussians=600, max_gaussians=1200, motion_prior="flow", motion_detail="half", start_from_motion=True
     )
-    made = LiveReconstructor(config, Camera.from_focal(120.0, 2 * WIDTH, 2 * HEIGHT))
+    made = Reconstructor(config, Camera.from_focal(120.0, 2 * WIDTH, 2 * HEIGHT), live=LiveTraining())
     wide = frame_at(0, 4 * WIDTH, 2 * HEIGHT).image
     for k in range(8):
         left = WIDTH - 3 * k  # content moves to the right, 3 pixels a frame
@@ -220,7 +217,7 @@ def test_what_a_moving_picture_reveals_is_covered_before_it_is_shown():
 
 def test_a_published_picture_stays_as_it_is_while_training_goes_on():
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow", start_from_motion=True)
-    made = LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT))
+    made = Reconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining())
     made.observe(frame_at(0), budget=Budget.of_steps(4))
     published = made.publish()
     before = {name: tensor.clone() for name, tensor in published.gaussians.tensors().items()}
@@ -275,22 +272,10 @@ def test_six_in_ten_rehearsal_steps_go_to_the_newest_frame_and_the_others_are_sp
     assert counts[:7] == pytest.approx([0.4 / 8 * 400] * 7, abs=13)
 
 
-def test_shorter_steps_are_believed_at_once_and_longer_ones_slowly():
-    made = reconstructor()
-    usual = []
-    for step_s in (0.010, 0.004, 0.006, 1.0):
-        made._learn_step_time(SimpleNamespace(all_finished=lambda: None, step_s=step_s))
-        usual.append(made.step_ns * 1e-9)
-    assert usual == pytest.approx([0.010, 0.004, 0.0042, 0.00462])
-    assert made.rehearsal_ns(5) == pytest.approx(5 * made.step_ns)
-    made.device = torch.device("cuda")  # steps that are queued there have to end first
-    assert made.rehearsal_ns(5) == pytest.approx(7 * made.step_ns)
-
-
 @pytest.mark.parametrize(("newer", "is_taken"), [(0, True), (29, True), (30, False)])
 def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
     config = ReconstructorConfig(gaussians=60, max_gaussians=60, window_frames=60)
-    made = LiveReconstructor(config, CAMERA)
+    made = Reconstructor(config, CAMERA, live=LiveTraining())
     for k in range(newer + 1):
         made.observe(frame_at(k), budget=Budget.of_steps(1))
     depth = np.full((HEIGHT, WIDTH), 40.0, np.float32)

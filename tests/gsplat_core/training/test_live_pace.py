@@ -5,10 +5,12 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from gsplat_core.training.schedule import LiveTraining, NewestFirstSchedule
 
 
 def test_rates_fall_from_2_to_a_half_within_thirty_steps_in_equal_ratios():
@@ -40,11 +42,38 @@ def test_what_is_beyond_is_refused(name, value):
         LiveTraining(**{name: value})
 
 
-def test_a_longer_step_changes_the_usual_time_by_a_tenth_and_a_shorter_one_at_once(camera):
-    made = LiveReconstructor(ReconstructorConfig(gaussians=10, max_gaussians=10), camera)
-    usual = []
-    for step_s in (1.0, 1.5, 9.0, 0.5):
-        made._learn_step_time(SimpleNamespace(all_finished=lambda: None, step_s=step_s))
-        usual.append(made.step_ns / 1e9)
+class TimedStep:
+    """Training step that takes a given time of a clock of its own."""
+
+    def __init__(self):
+        self.now_s = self.takes_s = 0.0
+        self.gaussians = SimpleNamespace(count=1)
+
+    def __call__(self, observation, rate, relaxation):
+        self.now_s += self.takes_s
+        return torch.zeros(())
+
+    def settle(self, observation):
+        pass
+
+
+def test_a_longer_step_changes_the_usual_time_by_a_tenth_and_a_shorter_one_at_once():
+    schedule, step, usual = new_schedule("cpu"), TimedStep(), []
+    observation = SimpleNamespace(seq=0, right_eye=None, by_turns=lambda turn: None)
+    for step.takes_s in (1.0, 1.5, 9.0, 0.5):
+        budget = Budget.until(step.now_s, at_least=1, clock=lambda: step.now_s)
+        schedule.train(step, None, observation, budget, first=False)
+        usual.append(schedule.step_s)
     assert usual == pytest.approx([1.0, 1.05, 1.155, 0.5])  # what is far longer counts as twice the usual
-    assert made.rehearsal_ns(3) == pytest.approx(1.5e9)
+
+
+@pytest.mark.parametrize(("device", "steps"), [("cpu", 3), ("cuda", 5)])
+def test_rehearsal_on_a_gpu_waits_for_two_queued_steps(device, steps):
+    schedule = new_schedule(device)
+    assert schedule.rehearsal_ns(3) == 0
+    schedule.step_s = 0.5
+    assert schedule.rehearsal_ns(3) == pytest.approx(steps * 0.5e9)
+
+
+def new_schedule(device):
+    return NewestFirstSchedule(LiveTraining(), ReconstructorConfig(), torch.device(device))

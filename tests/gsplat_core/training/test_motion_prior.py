@@ -16,10 +16,10 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, new_motion_prior, widened
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from tests.gsplat_core.training.continuation_checks import check_published_continuations
 
 SIZE = 64, 96
@@ -153,7 +153,7 @@ def test_without_a_prior_nothing_is_added() -> None:
 def test_new_gaussians_and_a_prior_that_starts_anew() -> None:
     reconstructor = learner(start_from_motion=True)
     learned(reconstructor, stream([0.0, 1.0, 2.0]))
-    step, prior = reconstructor._step, reconstructor._prior
+    step, prior = reconstructor._step, reconstructor._motion.prior
     assert step is not None and isinstance(prior, FlowPrior)
     step.append(step.gaussians.select(slice(0, 10)).clone())
     published = reconstructor.publish()
@@ -176,7 +176,7 @@ def test_pictures_without_tissue_texture_or_light_give_finite_models() -> None:
 def test_a_field_that_cannot_be_continued_has_no_prior() -> None:
     reconstructor = learner(field="hexplane")
     reconstructor.observe(next(stream([0.0])), steps=1)
-    assert reconstructor._prior is None
+    assert reconstructor._motion.prior is None
 
 
 def test_an_unknown_prior_is_refused() -> None:
@@ -213,7 +213,7 @@ def test_what_is_published_live_shows_what_the_whole_model_does(start_from_motio
     config = ReconstructorConfig(
         gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=start_from_motion, history_s=1.0
     )
-    reconstructor = LiveReconstructor(config, CAMERA)
+    reconstructor = Reconstructor(config, CAMERA, live=LiveTraining())
     for seq, frame in enumerate(stream([0.0, 1.0, 2.2, 3.0, 3.1])):
         trained = seq != 3
         reconstructor.observe(frame, steps=4, train=trained)
@@ -233,7 +233,7 @@ def test_what_is_published_live_shows_what_the_whole_model_does(start_from_motio
 
 
 def test_what_is_published_live_is_whole_where_nothing_says_how_it_goes_on() -> None:
-    reconstructor = LiveReconstructor(ReconstructorConfig(gaussians=700, max_gaussians=900), CAMERA)
+    reconstructor = Reconstructor(ReconstructorConfig(gaussians=700, max_gaussians=900), CAMERA, live=LiveTraining())
     assert reconstructor.parameter_count == 0
     with pytest.raises(InvalidInput, match="no model yet"):
         reconstructor.publish()

@@ -14,9 +14,10 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import RowMoves
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
 
 WIDTH, HEIGHT = 48, 40
@@ -45,7 +46,7 @@ def reconstructor(rows, device="cpu"):
         default_depth_mm=DEPTH_MM,
     )  # fmt: skip
     # Rates for a few steps a frame: those of a live run are made for dozens.
-    return LiveReconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
+    return Reconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
 
 
 def watch(made, frames, steps=6):

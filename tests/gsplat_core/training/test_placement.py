@@ -8,8 +8,8 @@ import pytest
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, depth_of_surface, video
 
 INSIDE = np.s_[12:-12, 12:-12]
@@ -124,7 +124,7 @@ def test_a_scene_whose_first_depth_is_possible_nowhere_is_placed_by_the_next_one
 def test_live_the_depth_that_a_frame_comes_with_moves_the_scene_after_it_was_shown() -> None:
     """The first one starts the scene; those after it wait for `grow`, so that no picture waits for them."""
     config = ReconstructorConfig(gaussians=1500, max_gaussians=2000, squared_error=True)
-    reconstructor, frames = LiveReconstructor(config, FIRST), stream(1)
+    reconstructor, frames = Reconstructor(config, FIRST, live=LiveTraining()), stream(1)
     reconstructor.observe(with_depth(frames[0], DepthOrigin.MEASURED), steps=8)
     later = frames[0].with_fields(seq=1, pts_ns=2_000_000_000)
     reconstructor.observe(with_depth(later, DepthOrigin.MEASURED, 1.21), steps=0)

@@ -12,9 +12,10 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.places import MOST_PLACES, Places, likeness_of
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.from_focal(60.0, WIDTH, HEIGHT)
@@ -126,7 +127,7 @@ def reconstructor(device="cpu"):
         gaussians=500, max_gaussians=1000, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True
     )
     # Rates for a few steps a frame: those of a live run are made for dozens.
-    return LiveReconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
+    return Reconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
 
 
 def watch(made, frames, steps):

@@ -9,10 +9,10 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.offline import FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes, right_tissue
+from gsplat_core.training.schedule import LiveTraining
 from tests.gsplat_core.training.two_eyes import HEIGHT, LEFT, RIGHT, THIRD, WIDTH, seen, stereo_frame
 
 CONFIG = ReconstructorConfig(
@@ -210,7 +210,7 @@ def test_each_eye_keeps_its_own_colours(way, better_db):
     frames = [tinted(seq) for seq in range(4)]
     if way == "live":
         config = dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True)
-        learning = LiveReconstructor(config, LEFT, live=LiveTraining(colour_relaxation=1.5))
+        learning = Reconstructor(config, LEFT, live=LiveTraining(colour_relaxation=1.5))
         for frame in frames:
             learning.observe(frame, steps=20)
             learning.grow(frame)
@@ -239,7 +239,7 @@ def test_a_scene_of_one_eye_has_no_colours_for_the_other():
 
 
 def test_live_the_eyes_take_turns_and_the_left_one_begins(monkeypatch):
-    learning = LiveReconstructor(
+    learning = Reconstructor(
         dataclasses.replace(CONFIG, squared_error=True), LEFT, live=LiveTraining(colour_relaxation=1.0)
     )
     learning.observe(stereo_frame(), steps=2)
@@ -253,7 +253,7 @@ def test_live_the_eyes_take_turns_and_the_left_one_begins(monkeypatch):
 
 
 def test_live_makes_both_eyes_better():
-    learning = LiveReconstructor(
+    learning = Reconstructor(
         dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True),
         LEFT,
         live=LiveTraining(colour_relaxation=1.5),

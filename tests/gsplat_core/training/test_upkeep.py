@@ -13,8 +13,9 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
-from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.unseen import LastSeen, pixels_of
 from gsplat_core.training.upkeep import MOST_SPLIT, RELAX_EVERY, RENEW_EVERY, SURFACE_STEPS, THINNEST_PX, Upkeep
 
@@ -26,7 +27,7 @@ SPACING_PX = math.sqrt(48 * 40 / 300)
 
 def trained(make_frame, camera, frames=6, **fields):
     """The step of a scene that was trained on a moving pattern, and its newest observation."""
-    made = LiveReconstructor(CONFIG, camera)
+    made = Reconstructor(CONFIG, camera, live=LiveTraining())
     for seq in range(frames):
         made.observe(make_frame(seq, shift_px=seq, **fields), budget=Budget.of_steps(4))
     return made._step, made._window.newest
@@ -58,7 +59,7 @@ def test_a_rotation_of_length_one_turns_as_the_longer_one_did_at_all_times(make_
 
 def test_a_field_that_cannot_follow_keeps_its_rotations(make_frame, camera):
     config = dataclasses.replace(CONFIG, field="hexplane", history_s=None)
-    made = LiveReconstructor(config, camera)
+    made = Reconstructor(config, camera, live=LiveTraining())
     made.observe(make_frame(0), budget=Budget.of_steps(2))
     made._step.gaussians.quats.mul_(3)
     made._step.shorten_rotations()
@@ -171,7 +172,7 @@ def test_a_stream_that_has_gone_on_for_days_learns_what_one_that_begins_learns(m
     config = dataclasses.replace(CONFIG, bump_spacing_s=0.125, history_s=0.5)
     images = []
     for start_ns in (0, 360_000 * 10**9):
-        made = LiveReconstructor(config, camera)
+        made = Reconstructor(config, camera, live=LiveTraining())
         for seq in range(24):  # longer than the history: bumps and archived Gaussians leave
             frame = make_frame(seq, shift_px=0.2 * seq)
             frame = dataclasses.replace(frame, pts_ns=start_ns + seq * 31_250_000)

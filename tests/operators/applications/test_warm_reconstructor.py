@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.upkeep import Upkeep
 from operators.applications.warm_reconstructor import warm_reconstructor
 
@@ -20,7 +21,7 @@ def test_upkeep_is_done_once_in_each_scene_and_nothing_of_it_stays(monkeypatch):
 
     monkeypatch.setattr(Upkeep, "once", noted)
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, history_s=1.0, preallocate=True)
-    reconstructor = LiveReconstructor(config, Camera.from_focal(50.0, 48, 40))
+    reconstructor = Reconstructor(config, Camera.from_focal(50.0, 48, 40), live=LiveTraining())
     drawn = []
     warm_reconstructor(reconstructor, lambda frame, model: drawn.append(model))
     assert done == [True, True] and len(drawn) == 5
