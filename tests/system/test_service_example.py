@@ -1,10 +1,9 @@
-"""The commands of the service's guide do what it says, on a server that has nothing yet."""
+"""Runs examples/06_service_life_cycle.sh against a new server."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import tempfile
@@ -24,16 +23,13 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def programs() -> None:
-    """Require the programs that the guide's commands call. If one is missing, skip the test; fail in CI."""
+    """Require the programs that the example calls. If one is missing, skip the test; fail in CI."""
     absent = [name for name in ("bash", "curl", "openssl") if shutil.which(name) is None]
     if absent:
-        missing(f"the guide's commands need {', '.join(absent)}; install it")
+        missing(f"the example needs {', '.join(absent)}; install it")
 
 
 def test_the_life_cycle_with_curl(tiny, tmp_path):
-    (commands,) = re.findall(
-        r"^```bash\n(.*?)^```", (ROOT / "docs" / "service.md").read_text(), re.MULTILINE | re.DOTALL
-    )
     for name, colour in (("one", (0.9, 0.1, 0.1)), ("two", (0.1, 0.9, 0.1))):
         save_bundle(uniform(colour), tmp_path / name)
         pack(tmp_path / name, tmp_path / f"{name}.isplat")
@@ -42,9 +38,8 @@ def test_the_life_cycle_with_curl(tiny, tmp_path):
             archive.write(path, f"case/{path.relative_to(tiny)}")
     with tempfile.TemporaryDirectory(prefix="isg-") as folder, serving(Path(folder)) as (url, _):
         environment = {**os.environ, "URL": url, "KEY_FILE": f"{folder}/data/admin.key"}
-        done = subprocess.run(
-            ["bash", "-euc", commands], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-        )
+        example = ROOT / "examples" / "06_service_life_cycle.sh"
+        done = subprocess.run([example], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "pictures.mjpeg").read_bytes().count(b"\xff\xd8\xff") >= 1
     events = [entry["event"] for entry in json.loads((tmp_path / "audit.json").read_text())["entries"]]
