@@ -2,16 +2,20 @@
 
     python -m tests.mutants --count 60 --seed 1            # as in `make mutants`
     python -m tests.mutants --only operators/display.py --count 10
+    python -m tests.mutants --only services/audit --count 40
     python -m tests.mutants --survivors out/mutants.jsonl   # only survivors of an earlier run
 
 A mutant is a module with one changed expression: a comparison reversed or shifted at its boundary,
 an arithmetic operator or number replaced, `and` swapped with `or`, `min` with `max`, a condition
-negated, or a call removed. Tests run with the mutant in place of the module, in all processes that
-they start. Each run is a fork of one process that has imported the large libraries. No file of the
-checkout is changed. Test files named after the module run first, then those that import it, then
-those that import it indirectly. A run ends at the first failure. A test that also fails without the
-mutant is flaky: it is listed and excluded, and the remaining tests decide. A mutant survives if all
-of them pass. Mutants are drawn at random with a seed, in equal parts from each folder.
+negated, or a call removed. One pytest session collects the tests and runs each mutant in a fork of
+itself. There the code of the changed function is replaced in the loaded functions. Processes that
+tests start, and modules not yet imported, import the mutant in place of the module. A change outside
+functions needs a session of its own. No file of the checkout is changed.
+
+Only tests that execute the changed line run, for a minute at most; `tests/executed.py` records them.
+A mutant on a line that no test executes survives. A run ends at the first failure. A test that also
+fails without the mutant is flaky: it is listed and excluded, and the remaining tests decide. Mutants
+are drawn at random with a seed, in equal parts from each folder.
 """
 
 from __future__ import annotations
@@ -19,50 +23,35 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
-import importlib
+import gc
 import json
-import multiprocessing
 import os
 import random
-import signal
+import shutil
 import sys
 import tempfile
 import time
-import traceback
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from types import CodeType, FunctionType
+from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = (
-    "operators",
-    "services",
-    "gsplat_core/training",
-    "gsplat_core/geometry",
-    "gsplat_core/depth",
-    "gsplat_core/poses",
-    "gsplat_core/endoscope",
-)
-PACKAGES = ("gsplat_core", "operators", "services")
-MOST_TEST_FILES = 24
-"""Maximum number of test files in addition to those that import the module itself."""
-LIMIT_S = 300.0
-"""Time limit in seconds for one run of pytest. A mutant that exceeds it hangs and
-counts as killed.
-"""
-NO_TESTS = 5
-"""Exit code of pytest when every collected test is deselected."""
-PRECHECK_FILES = 3
-"""Number of test files in the first, short pytest run.
+from tests.executed import Executed, bring_up_to_date
+from tests.forks import RAISED, ROOT, Fork, execute_everywhere, import_libraries, pytest_fork
 
-Most mutants are killed there without collecting the remaining files.
-"""
+PARTS = ("training", "geometry", "depth", "poses", "endoscope")
+"""Packages of the core that are sampled, wherever they are in its tree. Kernels and data classes are left out."""
+MOST_S = 60.0
+"""Seconds of tests, as recorded, that run for a mutant."""
+SLOWER, LEAST_LIMIT_S = 5.0, 30.0
+"""A mutant hangs, which counts as killed, after this multiple of the recorded time and these seconds."""
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+APART = "apart"
+"""Name in place of a failed test's where the loaded functions cannot be replaced."""
 COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.GtE, ast.LtE), ast.LtE: (ast.Gt, ast.Lt), ast.Gt: (ast.LtE, ast.GtE), ast.GtE: (ast.Lt, ast.Gt),
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
@@ -74,13 +63,6 @@ OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
 EXCHANGED = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "maximum", "maximum": "minimum"}
 UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_progress"}
 """Calls with no effect except a log line, which are not mutated."""
-
-LIBRARIES = ("torch", "numpy", "cv2", "pydantic", "fastapi", "uvicorn", "zmq", "httpx", "typer", "onnx")
-"""Libraries that take long to import. None of them imports the project."""
-SINGLE = ("PYTHONDONTWRITEBYTECODE", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Environment variables that are 1 for all tests: no bytecode of a mutant is kept, and two runs share two cores."""
-NO_RESULT = 70
-"""Exit code of a fork in which pytest itself raised an exception."""
 
 HOOK = """
 import importlib.abc, importlib.machinery, importlib.util, os, sys
@@ -106,14 +88,18 @@ class Mutant:
     Attributes:
         path: the module, relative to the root.
         line: line of the changed expression.
+        kind: kind of the change.
         change: the expression before and after.
-        source: text of the changed module.
+        tree: the changed module.
+        inside: whether the change is inside a function.
     """
 
     path: str
     line: int
+    kind: str
     change: str
-    source: str
+    tree: ast.Module
+    inside: bool
 
 
 @cache
@@ -129,11 +115,18 @@ def mutant_at(path: Path, index: int, number: int) -> Mutant | None:
     tree = copy.deepcopy(changeable(path)[0])
     node = next(each for place, each in enumerate(ast.walk(tree)) if place == index)
     before = ast.unparse(node)
-    _changes(node)[number]()
+    kind, apply = _changes(node)[number]
+    apply()
     after = ast.unparse(node)
     if after == before:
         return None
-    return Mutant(str(path.relative_to(ROOT)), getattr(node, "lineno", 0), f"{before}  =>  {after}", ast.unparse(tree))
+    ast.fix_missing_locations(tree)
+    line = getattr(node, "lineno", 0)
+    inside = any(
+        each.body[0].lineno <= line <= (each.end_lineno or 0) for each in ast.walk(tree) if isinstance(each, FUNCTIONS)
+    )
+    change = f"{before}  =>  {after}"
+    return Mutant(str(path.relative_to(ROOT)), line, kind, change, tree, inside)
 
 
 def mutants_of(path: Path) -> Iterator[Mutant]:
@@ -141,26 +134,28 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
     return filter(None, (mutant_at(path, *place) for place in changeable(path)[1]))
 
 
-def _changes(node: ast.AST) -> list[Callable[[], None]]:
-    """Return functions that each change the node in place in one way."""
+def _changes(node: ast.AST) -> list[tuple[str, Callable[[], None]]]:
+    """Return the kinds of changes to a node, each with a function that changes it in place."""
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
-        return [lambda new=new: node.ops.__setitem__(0, new()) for new in COMPARISONS.get(type(node.ops[0]), ())]
+        kinds = zip(("comparison", "boundary"), COMPARISONS.get(type(node.ops[0]), ()), strict=False)
+        return [(kind, lambda new=new: node.ops.__setitem__(0, new())) for kind, new in kinds]
     if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _is_text(node):
-        return [lambda: setattr(node, "op", OPERATORS[type(node.op)]())]
+        return [("arithmetic", lambda: setattr(node, "op", OPERATORS[type(node.op)]()))]
     if isinstance(node, ast.BoolOp):
-        return [lambda: setattr(node, "op", ast.Or() if isinstance(node.op, ast.And) else ast.And())]
+        return [("and/or", lambda: setattr(node, "op", ast.Or() if isinstance(node.op, ast.And) else ast.And()))]
     if isinstance(node, ast.If | ast.IfExp) and not _only_types(node.test):
-        return [lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test))]
+        return [("condition", lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test)))]
     if isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value not in (0, 1, -1, 2):
-        return [lambda: setattr(node, "value", node.value * (100 if isinstance(node.value, float) else 2))]
+        factor = 100 if isinstance(node.value, float) else 2
+        return [("number", lambda: setattr(node, "value", node.value * factor))]
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in EXCHANGED:
-        return [lambda: setattr(node.func, "id", EXCHANGED[node.func.id])]
+        return [("min/max", lambda: setattr(node.func, "id", EXCHANGED[node.func.id]))]
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in EXCHANGED:
-        return [lambda: setattr(node.func, "attr", EXCHANGED[node.func.attr])]
+        return [("min/max", lambda: setattr(node.func, "attr", EXCHANGED[node.func.attr]))]
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) and _called(node.value) not in UNSEEN_CALLS:
-        return [lambda: setattr(node, "value", ast.Constant(None))]
+        return [("call", lambda: setattr(node, "value", ast.Constant(None)))]
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
-        return [lambda: setattr(node, "op", ast.UAdd())]
+        return [("sign", lambda: setattr(node, "op", ast.UAdd()))]
     return []
 
 
@@ -186,167 +181,248 @@ def module_name(path: str) -> str:
     return name.removesuffix(".__init__")
 
 
-@cache
-def imports_of(path: Path) -> frozenset[str]:
-    """Return the project modules that a file imports, including imports inside functions."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return frozenset(name for name in found if name.split(".")[0] in PACKAGES)
+def tests_for(mutant: Mutant, executed: Executed) -> dict[str, float]:
+    """Return the tests that execute a mutant's line with their seconds as recorded, up to `MOST_S`.
 
-
-@cache
-def importers() -> dict[str, frozenset[Path]]:
-    """Return the product and test files that import each module."""
-    found = defaultdict(set)
-    for folder in (*PACKAGES, "tests"):
-        for path in (ROOT / folder).rglob("*.py"):
-            for name in imports_of(path):
-                found[name].add(path)
-    return {name: frozenset(paths) for name, paths in found.items()}
-
-
-def tests_for(path: str) -> list[str]:
-    """Return the test files for a mutant of a module, nearest first.
-
-    Files named after the module in the mirrored folder come first, then other files of that name, then files that import the module, those in the
-    mirrored folder before others. Files that import the module through other modules follow, breadth first.
+    Tests of files named after the module come first, then those of the mirrored folder. Quick tests come before slow ones.
     """
-    name, stem = module_name(path), Path(path).stem
-    mirror = ROOT / "tests" / Path(path).parent
-    named = [each for each in sorted((ROOT / "tests").rglob("test_*.py")) if each.stem.startswith(f"test_{stem}")]
-    direct = [each for each in sorted(importers().get(name, ())) if each.name.startswith("test_")]
-    near = sorted(named, key=lambda each: each.parent != mirror)
-    near += sorted(direct, key=lambda each: (each.parent != mirror, len(imports_of(each))))
-    chosen = list(dict.fromkeys(near))
-    seen, level = {name}, {name}
-    while level and len(chosen) < MOST_TEST_FILES:
-        above = {each for one in level for each in importers().get(one, ())}
-        further = sorted(
-            (each for each in above if each.name.startswith("test_")),
-            key=lambda each: (each.parent != mirror, len(imports_of(each)), each),
-        )
-        chosen = list(dict.fromkeys([*chosen, *further]))
-        level = {
-            module_name(str(each.relative_to(ROOT))) for each in above if each.parts[len(ROOT.parts)] in PACKAGES
-        } - seen
-        seen |= level
-    return [str(each.relative_to(ROOT)) for each in chosen[: max(MOST_TEST_FILES, len(near))]]
+    mirror, stem = f"tests/{Path(mutant.path).parent}/", f"test_{Path(mutant.path).stem}"
+
+    def rank(test: int) -> int:
+        file = Path(executed.tests[test].split("::")[0])
+        return 0 if file.stem.startswith(stem) else 1 if str(file).startswith(mirror) else 2
+
+    chosen, total = {}, 0.0
+    for test in sorted(executed.tests_of(ROOT / mutant.path, mutant.line), key=rank):
+        total += executed.seconds[test]
+        if total > MOST_S and chosen:
+            break
+        chosen[executed.tests[test]] = executed.seconds[test]
+    return chosen
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Result of the tests of a mutant.
-
-    Attributes:
-        killed_by: the first test that fails only with the mutant, `time` where the tests do not end, `pytest itself` where
-            it dies or cannot load a conftest, None where the mutant survives.
-        flaky: tests that also fail without the mutant.
-    """
-
-    killed_by: str | None
-    flaky: tuple[str, ...] = ()
-
-
-def failed_test(output: str) -> str | None:
-    """Return the id of the first failed test in pytest's output, or None. Captured log lines may begin with ERROR, too."""
-    for line in output.splitlines():
-        if line.startswith(("FAILED tests/", "ERROR tests/")):
-            return line.split(" - ")[0].split(" ", 1)[1].strip()
-    return None
+def replace_code(mutant: Mutant) -> bool:
+    """Replace the code of changed functions in all loaded functions. Return False if the mutant must be imported instead."""
+    path = str(ROOT / mutant.path)
+    before = dict(_codes(compile(changeable(ROOT / mutant.path)[0], path, "exec", dont_inherit=True)))
+    after = dict(_codes(compile(mutant.tree, path, "exec", dont_inherit=True)))
+    changed = {key: new for key, new in after.items() if before.get(key) != new}
+    found = [each for each in gc.get_objects() if type(each) is FunctionType and each.__code__.co_filename == path]
+    if not found:
+        return module_name(mutant.path) not in sys.modules
+    replaced = False
+    for function in found:
+        new = changed.get((function.__code__.co_qualname, function.__code__.co_firstlineno))
+        if new is not None:
+            if len(new.co_freevars) != len(function.__code__.co_freevars):
+                return False
+            function.__code__ = new
+            replaced = True
+    return replaced
 
 
-def import_libraries() -> None:
-    """Import the large libraries once. Every run of pytest is a fork of this process and does not import them again."""
-    for name in LIBRARIES:
-        with suppress(ImportError):
-            importlib.import_module(name)
-    loaded = [name for name in sys.modules if name.split(".")[0] in PACKAGES]
-    if loaded:
-        sys.exit(f"the libraries imported {loaded[0]}: a mutant of it would not be loaded")
+def _codes(code: CodeType) -> Iterator[tuple[tuple[str, int], CodeType]]:
+    for each in code.co_consts:
+        if isinstance(each, CodeType):
+            yield (each.co_qualname, each.co_firstlineno), each
+            yield from _codes(each)
 
 
-def run_pytest(arguments: list[str], folder: Path, hooked: bool) -> tuple[int | None, str]:
-    """Run pytest in a fork of this process.
+class Chosen:
+    """Plugin of pytest that runs some of the collected tests up to the first failure.
 
     Args:
-        arguments: options and test files.
-        folder: folder with `sitecustomize.py` and the changed module; receives the output.
-        hooked: whether the mutant replaces its module, here and in the processes that tests start.
-
-    Returns:
-        The exit code, negative where a signal ended pytest, None after `LIMIT_S`; and the output.
+        tests: ids of the tests, or files of which all tests run.
+        result: file for the id of the failed test; empty if all pass.
     """
-    output = folder / "output.txt"
-    child = os.fork()
-    if child == 0:
-        code = NO_RESULT
-        try:
-            os.setsid()
-            file = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-            os.dup2(file, 1)
-            os.dup2(file, 2)
-            if hooked:
-                os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
-                exec(compile((folder / "sitecustomize.py").read_text(encoding="utf-8"), "sitecustomize.py", "exec"), {})
-            code = int(pytest.main(arguments))
-        finally:
-            if sys.exc_info()[0] is not None:
-                traceback.print_exc()
-            sys.stdout.flush()
-            os._exit(code)
-    deadline = time.monotonic() + LIMIT_S
-    status = None
-    while status is None and time.monotonic() < deadline:
-        ended, waited = os.waitpid(child, os.WNOHANG)
-        status = waited if ended else None
-        if status is None:
-            time.sleep(0.02)
-    with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)  # processes that its tests started and left running
-    if status is None:
-        os.waitpid(child, 0)
-    text = output.read_text(encoding="utf-8", errors="replace") if output.exists() else ""
-    return None if status is None else os.waitstatus_to_exitcode(status), text
 
+    def __init__(self, tests: Container[str], result: Path) -> None:
+        self.tests, self.result = tests, result
+        self.failed: list[str] = []
 
-def outcome_of(mutant: Mutant, folder: Path) -> Outcome:
-    """Run the tests of a mutant, nearest files first, up to the first failure that the mutant causes."""
-    files = tests_for(mutant.path)
-    source = folder / "mutant.py"
-    source.write_text(mutant.source, encoding="utf-8")
-    replaced = (module_name(mutant.path), str(source), str(ROOT / mutant.path))
-    (folder / "sitecustomize.py").write_text(HOOK.format(replaced=replaced), encoding="utf-8")
-    options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
-    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # plugins that the libraries imported before pytest
-    flaky: list[str] = []
-    for group in filter(None, (files[:PRECHECK_FILES], files[PRECHECK_FILES:])):
-        while True:
-            arguments = [*options, *(f"--deselect={each}" for each in flaky), *group]
-            code, output = run_pytest(arguments, folder, hooked=True)
-            if code is None:
-                return Outcome("time", tuple(flaky))
-            if code in (0, NO_TESTS):
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = [item for item in items if item.nodeid in self.tests or item.nodeid.split("::")[0] in self.tests]
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.failed:
+            self.failed.append(report.nodeid)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.failed.append(report.nodeid)
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        self.run(session.items)
+        return True
+
+    def pytest_sessionfinish(self) -> None:
+        self.result.write_text("".join(self.failed[:1]), encoding="utf-8")
+
+    def run(self, items: list[pytest.Item]) -> None:
+        """Run tests up to the first failure and write its id to `result`."""
+        for item, following in zip(items, [*items[1:], None], strict=True):
+            if self.failed:
                 break
-            test = failed_test(output)
-            if test is None and run_pytest([*arguments, "--collect-only"], folder, hooked=False)[0] == 0:
-                return Outcome("pytest itself", tuple(flaky))
-            if test is None or test in flaky:
-                sys.exit(f"pytest ended with {code} and names no new failed test:\n{output[-4000:]}")
-            if run_pytest([*options, test], folder, hooked=False)[0] == 0:
-                return Outcome(test, tuple(flaky))
-            flaky.append(test)
-    return Outcome(None, tuple(flaky))
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        self.pytest_sessionfinish()
+
+
+@dataclass
+class Run:
+    """Tests of a mutant, and their outcome.
+
+    Attributes:
+        tests: ids of the tests, quick and near ones first, with their seconds as recorded; or files of tests.
+        number: number of the mutant.
+        killed_by: the first test that fails only with the mutant, `time` where the tests do not end, `pytest itself` where
+            it dies, None where the mutant survives.
+        flaky: tests that also fail without the mutant.
+        apart: whether the mutant must be imported by a session of its own.
+    """
+
+    mutant: Mutant
+    tests: dict[str, float]
+    number: int
+    killed_by: str | None = None
+    flaky: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    apart: bool = False
+
+
+Start = Callable[[Run, "Mutant | None", list[str], Path], Fork]
+"""Starts tests with a mutant or without one; the fork writes the id of the first failed test to a file `failed` in a folder."""
+
+
+def judged(run: Run, folder: Path, start: Start) -> Iterator[Fork]:
+    """Run the tests of a mutant up to the first failure that it causes. Yields each fork, and continues when it has ended."""
+    begin = time.perf_counter()
+    folder.mkdir()
+    while run.tests:
+        yield from _in_fork(fork := start(run, run.mutant, list(run.tests), folder))
+        failed = _failed(fork, folder)
+        run.apart = failed == APART
+        if failed in run.tests:
+            yield from _in_fork(fork := start(run, None, [failed], folder))
+            if _failed(fork, folder):
+                run.flaky.append(failed)
+                run.tests.pop(failed)
+                continue
+        run.killed_by = failed or None
+        break
+    run.seconds = time.perf_counter() - begin
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _in_fork(fork: Fork) -> Iterator[Fork]:
+    while not fork.ended():
+        yield fork
+
+
+def _failed(fork: Fork, folder: Path) -> str:
+    result = folder / "failed"
+    if fork.code == RAISED:
+        sys.exit(f"the session failed:\n{fork.output.read_text(encoding='utf-8', errors='replace')[-4000:]}")
+    name = "time" if fork.timed_out else result.read_text(encoding="utf-8") if result.exists() else "pytest itself"
+    result.unlink(missing_ok=True)
+    return name
+
+
+def judge_all(runs: list[Run], jobs: int, folder: Path, start: Start, ended: Callable[[Run], None]) -> None:
+    """Judge mutants, some at a time."""
+    waiting = [(run, judged(run, folder / str(run.number), start)) for run in reversed(runs)]
+    active: list[tuple[Run, Iterator[Fork]]] = []
+    while waiting or active:
+        active += [waiting.pop() for _ in range(min(len(waiting), jobs - len(active)))]
+        left = []
+        for run, steps in active:
+            if next(steps, None) is None:
+                ended(run)
+            else:
+                left.append((run, steps))
+        active = left
+        time.sleep(0.005)
+
+
+class Collected:
+    """Plugin of pytest that judges mutants with the tests it has collected. A fork of the session runs each mutant."""
+
+    def __init__(self, runs: list[Run], jobs: int, folder: Path, ended: Callable[[Run], None]) -> None:
+        self.runs, self.jobs, self.folder, self.ended = runs, jobs, folder, ended
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        items = {item.nodeid: item for item in session.items}
+        for run in self.runs:
+            whole = {name: 1.0 for name in items if name.split("::")[0] in run.tests}
+            run.tests = whole | {name: seconds for name, seconds in run.tests.items() if name in items}
+
+        def start(run: Run, mutant: Mutant | None, tests: list[str], folder: Path) -> Fork:
+            def execute() -> int:
+                os.environ["PYTEST_DEBUG_TEMPROOT"] = str(folder)
+                if mutant is not None:
+                    execute_everywhere(hook_of(mutant, folder), folder)
+                    if not replace_code(mutant):
+                        (folder / "failed").write_text(APART, encoding="utf-8")
+                        return 0
+                chosen = Chosen((), folder / "failed")
+                session.config.pluginmanager.register(chosen)
+                chosen.run([items[name] for name in tests])
+                return 0
+
+            return Fork(execute, folder / "output.txt", limit_of(run))
+
+        judge_all(self.runs, self.jobs, self.folder, start, self.ended)
+        return True
+
+
+def judge_apart(runs: list[Run], jobs: int, folder: Path, ended: Callable[[Run], None]) -> None:
+    """Judge mutants with a session of pytest for each, which imports the mutant."""
+
+    def start(run: Run, mutant: Mutant | None, tests: list[str], folder: Path) -> Fork:
+        files = list(dict.fromkeys(test.split("::")[0] for test in tests))
+        hook = "" if mutant is None else hook_of(mutant, folder)
+        return pytest_fork(
+            files, folder, Chosen(frozenset(tests), folder / "failed"), hook, limit_of(run) + LEAST_LIMIT_S
+        )
+
+    judge_all(runs, jobs, folder, start, ended)
+
+
+def limit_of(run: Run) -> float:
+    """Return the time limit of a mutant's tests in seconds."""
+    return LEAST_LIMIT_S + SLOWER * sum(run.tests.values())
+
+
+def hook_of(mutant: Mutant, folder: Path) -> str:
+    """Write the module and return code that lets Python import it in place of the product's."""
+    source = folder / "mutant.py"
+    source.write_text(ast.unparse(mutant.tree), encoding="utf-8")
+    return HOOK.format(replaced=(module_name(mutant.path), str(source), str(ROOT / mutant.path)))
+
+
+def folders() -> list[Path]:
+    """Return the folders that are sampled in equal parts."""
+    core = [
+        path
+        for path in sorted((ROOT / "gsplat_core").rglob("*"))
+        if path.name in PARTS and (path / "__init__.py").exists()
+    ]
+    return [ROOT / "operators", ROOT / "services", *core]
 
 
 def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant]:
     """Draw random mutants, in equal parts from each folder, in random order: the first ones are a sample, too."""
     rng = random.Random(seed)
-    groups = [[ROOT / each for each in only]] if only else [sorted((ROOT / folder).rglob("*.py")) for folder in FOLDERS]
+    groups = (
+        [
+            [
+                path
+                for each in only
+                for path in ([ROOT / each] if each.endswith(".py") else sorted((ROOT / each).rglob("*.py")))
+            ]
+        ]
+        if only
+        else [sorted(folder.rglob("*.py")) for folder in folders()]
+    )
     chosen: list[Mutant] = []
     for number, files in enumerate(groups):
         share = count * (number + 1) // len(groups) - count * number // len(groups)
@@ -366,18 +442,14 @@ def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant
     return chosen
 
 
-def timed_outcome(run: tuple[Mutant, Path]) -> tuple[Mutant, Outcome, float]:
-    """Return a mutant with its outcome and the seconds that took; the folder is created."""
-    mutant, folder = run
-    folder.mkdir()
-    start = time.perf_counter()
-    return mutant, outcome_of(mutant, folder), time.perf_counter() - start
+def lines_of(log: Path) -> list[dict[str, Any]]:
+    """Return the results in a log."""
+    return [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
 
 
 def survivors_of(log: Path) -> list[Mutant]:
     """Return the survivors of an earlier run whose expressions still exist."""
-    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    wanted = {(line["path"], line["change"]) for line in lines if "path" in line and line["killed_by"] is None}
+    wanted = {(line["path"], line["change"]) for line in lines_of(log) if line["killed_by"] is None}
     return [
         each
         for path in sorted({path for path, _ in wanted})
@@ -390,41 +462,64 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="*", help="modules to change")
+    parser.add_argument("--only", nargs="*", help="modules or folders to change")
     parser.add_argument("--survivors", type=Path, help="log of an earlier run; only mutants that survived it")
+    parser.add_argument("--tests", nargs="*", help="test files to run in place of those that execute the line")
+    parser.add_argument("--stored", action="store_true", help="do not record changed test files again first")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.jsonl")
     parser.add_argument("--least", type=float, default=0.85, help="exit code 1 where a smaller share is killed")
     options = parser.parse_args()
-    os.environ.update({name: "1" for name in SINGLE})
-    sys.dont_write_bytecode = True
-    chosen = (
-        survivors_of(options.survivors)
-        if options.survivors
-        else chosen_mutants(options.only, options.count, options.seed)
-    )
+    import_libraries()
+    if options.survivors:
+        chosen = survivors_of(options.survivors)
+    else:
+        chosen = chosen_mutants(options.only, options.count, options.seed)
+    if options.tests is None:
+        if not options.stored:
+            bring_up_to_date(options.jobs)
+        executed = Executed()
+        runs = [Run(mutant, tests_for(mutant, executed), number) for number, mutant in enumerate(chosen)]
+        files = sorted({test.split("::")[0] for run in runs for test in run.tests})
+    else:
+        runs = [Run(mutant, dict.fromkeys(options.tests, 30.0), number) for number, mutant in enumerate(chosen)]
+        files = options.tests
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    killed, flaky = 0, set[str]()
-    with tempfile.TemporaryDirectory() as folder, options.out.open("w", encoding="utf-8") as log:
-        import_libraries()
-        runs = [(mutant, Path(folder) / str(number)) for number, mutant in enumerate(chosen)]
-        with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork")) as pool:
-            for finished in as_completed(pool.submit(timed_outcome, run) for run in runs):
-                mutant, outcome, seconds = finished.result()
-                by = outcome.killed_by
-                killed += by is not None
-                flaky.update(outcome.flaky)
-                result = {"path": mutant.path, "line": mutant.line, "change": mutant.change, "killed_by": by}
-                log.write(json.dumps(result | {"flaky": outcome.flaky, "seconds": round(seconds, 1)}) + "\n")
-                log.flush()
-                print(
-                    f"{'killed  ' if by else 'SURVIVED'} {mutant.path}:{mutant.line} {mutant.change[:120]!r}",
-                    flush=True,
-                )
-    for test in sorted(flaky):
+    options.out.write_text("", encoding="utf-8")
+
+    progress = os.fdopen(os.dup(1), "w")  # forks of pytest write elsewhere
+
+    def ended(run: Run) -> None:
+        if run.apart:
+            return
+        mutant, by = run.mutant, run.killed_by
+        line = {"path": mutant.path, "line": mutant.line, "kind": mutant.kind, "change": mutant.change, "killed_by": by}
+        with options.out.open("a", encoding="utf-8") as log:
+            log.write(
+                json.dumps(line | {"flaky": run.flaky, "seconds": round(run.seconds, 1), "number": run.number}) + "\n"
+            )
+        print(
+            f"{'killed  ' if by else 'SURVIVED'} {mutant.path}:{mutant.line} {mutant.change[:120]!r}",
+            file=progress,
+            flush=True,
+        )
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        plugin = Collected([run for run in runs if run.mutant.inside], options.jobs, folder, ended)
+        if files and pytest_fork(files, folder, plugin).wait():
+            sys.exit((folder / "output.txt").read_text(encoding="utf-8", errors="replace")[-8000:])
+        done = {line["number"] for line in lines_of(options.out)}
+        judge_apart([run for run in runs if run.number not in done], options.jobs, folder, ended)
+    lines = lines_of(options.out)
+    for kind in sorted({line["kind"] for line in lines}):
+        of_kind = [line["killed_by"] is None for line in lines if line["kind"] == kind]
+        print(f"{kind}: {sum(of_kind)} of {len(of_kind)} survive")
+    for test in sorted({test for line in lines for test in line["flaky"]}):
         print(f"flaky: {test} fails without a mutant, too")
-    share = killed / max(1, len(chosen))
-    print(f"{killed} of {len(chosen)} mutants killed ({share:.0%}); {options.out}")
+    killed = sum(line["killed_by"] is not None for line in lines)
+    share = killed / max(1, len(lines))
+    print(f"{killed} of {len(lines)} mutants killed ({share:.0%}); {options.out}")
     return 0 if share >= options.least else 1
 
 

@@ -1,31 +1,115 @@
-"""Reading pytest's output and choosing test files in the mutation run."""
+"""Choice of tests and reading of pytest's output in the mutation run."""
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import pytest
 
-from tests import mutants
+from tests import executed
+
+MODULE = """
+LIMIT = 3
+
+
+def clipped(value, most=LIMIT):
+    if value > most:
+        return most
+    return value
+
+
+class Scale:
+    def apply(self, value):
+        for _ in range(2):
+            value = value * LIMIT
+        return value
+"""
+
+
+def executed_lines(path: Path, call: str) -> set[int]:
+    """Return the lines that a call executes, by the marks of the compiled module."""
+    marks = bytearray(1000)
+    names: dict[str, Any] = {"__marks__": marks, "__name__": "sample"}
+    exec(executed.marked(path, 100), names)
+    assert not any(marks)  # statements outside functions have none
+    eval(call, names)
+    executed.parsed.cache_clear()
+    statements = executed.parsed(path)[1]
+    return {statements[number - 100].node.lineno for number, mark in enumerate(marks) if mark}
 
 
 @pytest.mark.parametrize(
-    ("output", "test"),
-    [
-        ("FAILED tests/a/test_b.py::test_c[1-2] - assert 1 == 2", "tests/a/test_b.py::test_c[1-2]"),
-        ("ERROR tests/a/test_b.py - ImportError: no", "tests/a/test_b.py"),
-        (
-            "ERROR    services.audit:log.py:9 the disk is full\nFAILED tests/test_d.py::test_e",
-            "tests/test_d.py::test_e",
-        ),
-        ("ERROR    services.audit:log.py:9 the disk is full\nERROR services are gone", None),
-        ("FAILED to open", None),
-    ],
+    ("call", "lines"), [("clipped(2)", {6, 8}), ("clipped(4)", {6, 7}), ("Scale().apply(1)", {13, 14, 15})]
 )
-def test_only_lines_that_name_a_test_file_name_the_failed_test(output: str, test: str | None) -> None:
-    assert mutants.failed_test(f"F.\n{output}\n1 failed in 0.1s\n") == test
+def test_marks_are_the_statements_of_functions_that_ran(tmp_path: Path, call: str, lines: set[int]) -> None:
+    path = tmp_path / "sample.py"
+    path.write_text(MODULE, encoding="utf-8")
+
+    assert executed_lines(path, call) == lines
 
 
-def test_the_file_that_mirrors_the_module_runs_first() -> None:
-    chosen = mutants.tests_for("services/settings/load.py")
+def test_a_statement_keeps_its_key_when_other_functions_change_and_the_module_moves(tmp_path: Path) -> None:
+    first, second = tmp_path / "sample.py", tmp_path / "elsewhere" / "sample.py"
+    second.parent.mkdir()
+    first.write_text(MODULE, encoding="utf-8")
+    second.write_text(
+        MODULE.replace("def clipped", "def new():\n    return 1\n\n\ndef clipped").replace(
+            "value > most", "value >= most"
+        ),
+        encoding="utf-8",
+    )
+    keys = [{ast.unparse(each.node): each.key for each in executed.parsed(path)[1]} for path in (first, second)]
 
-    assert chosen[0] == "tests/services/settings/test_load.py"
-    assert len(set(chosen)) == len(chosen) >= mutants.PRECHECK_FILES
+    same = {text for text in keys[0] if keys[1].get(text) == keys[0][text]}
+
+    assert {text.split("\n")[0] for text in keys[0].keys() - same} == {
+        "if value > most:",
+        "def clipped(value, most=LIMIT):",
+    }
+
+
+def recorded(folder: Path, path: Path, tests: dict[str, tuple[float, set[int]]]) -> None:
+    """Write a record in which each test takes some seconds and executes some lines of a module."""
+    statements = executed.parsed(path)[1]
+    pairs = sorted(
+        (key, number)
+        for number, (_, lines) in enumerate(tests.values())
+        for each in statements
+        if each.node.lineno in lines
+        for key in (each.key, each.function or 0)
+    )
+    known = np.unique(np.array([each.key for each in statements], np.uint64))
+    np.save(folder / "known-1.npy", known)
+    np.savez(
+        folder / "tests+test_mutants.npz", key=np.array([key for key, _ in pairs], np.uint64), known=np.array("1"),
+        test=np.array([number for _, number in pairs], np.int32), tests=np.array(list(tests)), digest=np.array(""),
+        seconds=np.array([seconds for seconds, _ in tests.values()]),
+    )  # fmt: skip
+
+
+def test_tests_that_execute_a_line_run_quickest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "sample.py"
+    path.write_text(MODULE, encoding="utf-8")
+    recorded(
+        tmp_path, path, {"test_large": (3.0, {6, 7}), "test_small": (1.0, {6, 8}), "test_scale": (2.0, {13, 14, 15})}
+    )
+    monkeypatch.setattr(executed, "RECORDS", tmp_path)
+    monkeypatch.setattr(executed, "product_files", lambda: [path])
+    executed.users.cache_clear()
+    found = executed.Executed()
+
+    def names(line: int) -> list[str]:
+        return [found.tests[test].split("::")[1] for test in found.tests_of(path, line)]
+
+    assert names(6) == ["test_small", "test_large"]
+    assert names(7) == ["test_large"]
+    assert names(5) == ["test_small", "test_large"]  # a default value
+    assert names(2) == ["test_scale"]  # a constant
+    executed.users.cache_clear()
+
+    path.write_text(MODULE.replace("return value\n\n\nclass", "return value + 0\n\n\nclass"), encoding="utf-8")
+    executed.parsed.cache_clear()
+    assert names(8) == ["test_small", "test_large"]  # newer than the record: tests of its function
