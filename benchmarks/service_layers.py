@@ -20,8 +20,9 @@ from pathlib import Path
 from service_watchers import Watch, quantiles
 
 from services.bus.runtime import LAYERS, RuntimeFolder
-from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
-from services.supervisor.stream import StreamSupervisor
+from services.settings import StreamSettings
+from services.supervisor.stream import Stream
+from services.supervisor.worker import specs_of
 
 
 def cpu_s(pid: int) -> float:
@@ -30,7 +31,7 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-async def part(stream: StreamSupervisor, what: str, layers: tuple[str, ...], seconds: float) -> None:
+async def part(stream: Stream, what: str, layers: tuple[str, ...], seconds: float) -> None:
     """Watch the screen and these layers for a while."""
     shown = Watch(stream.folder.pictures("engine"))
     beside = {layer: Watch(stream.folder.endpoint(layer)) for layer in layers}
@@ -38,12 +39,12 @@ async def part(stream: StreamSupervisor, what: str, layers: tuple[str, ...], sec
     for watch in (shown, *beside.values()):
         watch.begin()
     pictures, began_s, drawn = shown.pictures, time.monotonic(), {layer: beside[layer].pictures for layer in layers}
-    pid = stream.state().engine.pid
+    pid = stream.engine.state.pid
     assert pid is not None
     before_s, scores = cpu_s(pid), []
     while time.monotonic() - began_s < seconds:
         await asyncio.sleep(0.5)
-        psnr_db = (stream.state().engine.figures.get("picture") or {}).get("psnr_db")
+        psnr_db = (stream.engine.state.figures.get("picture") or {}).get("psnr_db")
         scores += [psnr_db] if psnr_db is not None else []
     took_s = time.monotonic() - began_s
     figures = {
@@ -65,14 +66,14 @@ async def part(stream: StreamSupervisor, what: str, layers: tuple[str, ...], sec
     print(json.dumps(figures), flush=True)
 
 
-async def snapshots(stream: StreamSupervisor, count: int, folder: Path) -> None:
+async def snapshots(stream: Stream, count: int, folder: Path) -> None:
     """Take snapshots while the screen is watched."""
     shown = Watch(stream.folder.pictures("engine"))
     await asyncio.sleep(2)
     shown.begin()
     said = []
     for number in range(count):
-        said.append(await stream.command("engine", "snapshot", timeout_s=60, folder=str(folder / str(number))))
+        said.append(await stream.engine.command("snapshot", timeout_s=60, folder=str(folder / str(number))))
         await asyncio.sleep(0.5)
     shown.close()
     figures = {
@@ -95,12 +96,12 @@ async def main() -> None:
     parser.add_argument("--snapshots", type=int, default=5)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="isp-") as folder:
-        spec = StreamSpec(name="a", source=SourceSpec(address=given.source), engine=EngineSpec(device=given.device))
-        stream = StreamSupervisor(spec, RuntimeFolder(Path(folder) / "r"))
+        settings = StreamSettings(source=given.source, device=given.device)
+        stream = Stream(settings, specs_of("a", settings), RuntimeFolder(Path(folder) / "r"))
         await stream.start()
         try:
             async with asyncio.timeout(90):
-                while (stream.state().engine.figures.get("picture") or {}).get("state") != "live":
+                while (stream.engine.state.figures.get("picture") or {}).get("state") != "live":
                     await asyncio.sleep(0.1)
             await asyncio.sleep(5)
             if given.seconds > 0:

@@ -33,7 +33,7 @@ def bare(options: argparse.Namespace) -> dict[str, Any]:
     """`live` in this process."""
     from operators.applications.live import live
     from services.supervisor.engine import live_settings
-    from services.supervisor.specs import EngineSpec
+    from services.supervisor.worker import EngineSpec
 
     shown: list[tuple[float, int]] = []
     steps: list[int] = []

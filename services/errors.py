@@ -38,15 +38,15 @@ class CommandRefused(BusError):
 
 
 class RegistryError(UserError):
-    """Base class of the registry's errors."""
+    """Base class of the errors of stored and running resources: models, recordings, replays and streams."""
 
 
 class NotFound(RegistryError):
-    """The model or version does not exist."""
+    """The resource does not exist."""
 
 
 class Conflict(RegistryError):
-    """A concurrent change was first, or the version's state does not permit the operation."""
+    """A concurrent change was first, or the state of the resource does not permit the operation."""
 
 
 class StillActive(Conflict):
@@ -54,7 +54,7 @@ class StillActive(Conflict):
 
 
 class Rejected(RegistryError):
-    """The upload is invalid; nothing was stored."""
+    """The upload or the settings are invalid; nothing was stored."""
 
 
 class StoreUnavailable(RegistryError):

@@ -17,7 +17,6 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from services.api.parts import CheckResult
 from services.audit.system_events import SystemEvents
 from services.errors import StoreUnavailable
 from services.jobs.records import JOBS, JobState
@@ -26,6 +25,7 @@ from services.recordings import store as recording_records
 from services.recordings.store import RECORDINGS, UPLOAD, file_name
 from services.registry.database import Database
 from services.registry.records import VERSIONS
+from services.schemas.service import CheckResult
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ WITHOUT_TORCH = [
     "services.bus.runtime",
     "services.supervisor.launcher",
     "services.supervisor.process",
-    "services.supervisor.specs",
+    "services.supervisor.worker",
     "services.supervisor.stream",
     "services.display.hub",
     "services.registry.models",

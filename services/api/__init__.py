@@ -2,6 +2,6 @@
 processes."""
 
 from services.api.app import new_app
-from services.api.parts import Parts
+from services.api.state import Parts
 
 __all__ = ["Parts", "new_app"]

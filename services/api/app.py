@@ -16,14 +16,13 @@ from fastapi.routing import APIRoute
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from services.api import audit as audit_routes
-from services.api import display, health, models, pages, recordings, replays, service, snapshots, streams
+from services.api import display, models, pages, recordings, replays, service, snapshots, streams
 from services.api import keys as key_routes
 from services.api.middleware import AddressRate, HeadLength, KnownHosts, Observed, SecurityHeaders, TokenBuckets
 from services.api.observability import Measures
 from services.api.pages import ABOUT, describe
-from services.api.parts import Parts
 from services.api.problems import answer_with_problems
-from services.api.state import ControlState, Storage, ViewerCount, folders_of
+from services.api.state import ControlState, Parts, Storage, ViewerCount, folders_of
 from services.audit import AuditLog, AuditUnwritable, Keeping
 from services.auth.keys import KeyStore, changed_outside, first_admin_key, keys_read_again
 from services.auth.roles import Tickets
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 ROUTERS: tuple[APIRouter, ...] = (
-    health.router, service.router, streams.router, display.router, models.router, snapshots.router, snapshots.exports_router, replays.router,
-    recordings.router, key_routes.router, audit_routes.router, service.metrics_router, pages.router,
+    service.router, service.service_router, streams.router, display.router, models.router, snapshots.router, snapshots.exports_router, replays.router,
+    recordings.router, key_routes.router, audit_routes.router, pages.router,
 )  # fmt: skip
 KEYS_FILE = "keys.json"
 AUDIT_FILE = "audit.jsonl"

@@ -15,8 +15,8 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from services.api import pages
-from services.api.parts import CheckResult, NewStream, Parts
 from services.api.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable
+from services.api.state import Parts
 from services.audit.files import Outcome
 from services.audit.system_events import SystemEvents
 from services.bus.runtime import RuntimeFolder
@@ -44,10 +44,11 @@ from services.recordings.archives import RecordingLimits
 from services.recordings.store import RecordingStore, State
 from services.registry.limits import NICENESS, RegistryLimits
 from services.registry.models import DATABASE_FILE, ModelRegistry
+from services.schemas.service import CheckResult
 from services.settings import ServiceSettings
 from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent
-from services.supervisor.stream import ShownModels, StreamDisplays, SupervisedStreams
+from services.supervisor.stream import ShownModels, SupervisedStreams
 
 log = logging.getLogger(__name__)
 
@@ -177,14 +178,9 @@ def assembled(settings: ServiceSettings) -> Parts:
     exports = ModelExports(models, snapshots, ExportCache(settings.data_dir / "exports"))
     clock = ClockGuard(settings.data_dir)
     archive = new_archive(settings, events, clock.trusts_ages)
-    at_start = [
-        NewStream(name, stream.source, stream.show, stream.device, stream.options)
-        for name, stream in settings.streams.items()
-    ]
-    started = [name for name, stream in settings.streams.items() if stream.start]
 
     async def streams_are_well() -> CheckResult:
-        unwell = [stream for stream in streams.now() if stream.state in ("failed", "source lost")]
+        unwell = [stream for stream in streams.all() if stream.state in ("failed", "source lost")]
         # without reasons, because /readyz needs no key
         said = "; ".join(f"{stream.name}: {stream.state}" for stream in unwell)
         return CheckResult(not unwell, said or "no stream has failed or lost its source", needed=False)
@@ -203,7 +199,7 @@ def assembled(settings: ServiceSettings) -> Parts:
     return Parts(
         streams=streams,
         models=models,
-        display=StreamDisplays(streams),
+        display=streams,
         snapshots=StreamSnapshots(streams, models, snapshots),
         exports=exports,
         jobs=archive.replays,
@@ -212,7 +208,7 @@ def assembled(settings: ServiceSettings) -> Parts:
         background=[
             lambda: recovered(models, events),
             exports.running,
-            lambda: streams.running(at_start, started),
+            lambda: streams.running(settings.streams),
             ShownModels(streams, models, events).following,
             archive.recording_retention.running,
             archive.files.running,

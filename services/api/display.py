@@ -19,11 +19,10 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from services.api.guard import CallerOf, new_router, requires, still_valid
-from services.api.parts import PictureKind
-from services.api.problems import Missing, Unavailable, problem_answer
+from services.api.problems import Unavailable, problem_answer
 from services.api.state import ControlState, control_of, part
 from services.auth.roles import Caller
-from services.display.hub import BOUNDARY, EncodedPicture
+from services.display.hub import BOUNDARY, EncodedPicture, PictureKind
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
@@ -55,13 +54,12 @@ async def viewing(
 
     Raises:
         Unavailable: if the limit on open displays is reached.
-        Missing: if the stream does not exist.
+        NotFound: if the stream does not exist.
     """
     control = control_of(connection)
     display = part(connection, lambda parts: parts.display, "a display")
     streams = part(connection, lambda parts: parts.streams, "streams")
-    if all(each.name != stream for each in await streams.all()):
-        raise Missing("there is no stream with this name; GET /v1/streams lists them")
+    streams.get(stream)
     gauge = control.measures.viewers.labels(transport)
     if control.viewers.full:
         raise Unavailable(f"{control.settings.limits.viewers} displays are open, which is as many as may be; close one")

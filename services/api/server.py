@@ -23,8 +23,8 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import SecurityError
 
 from services.api.certificate import ServerCertificate
-from services.api.health import ProbeListener
 from services.api.middleware import MOST_HEAD_BYTES, network_of_address
+from services.api.service import ProbeListener
 from services.api.state import ControlState
 from services.audit.system_events import SystemEvents
 from services.errors import CannotServe

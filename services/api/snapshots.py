@@ -62,7 +62,7 @@ async def take_snapshot(
 
     if wanted.model is not None and caller.streams is not None:
         raise Forbidden(f"the key {caller.name} is limited to streams; keep the snapshot as a file, without `model`")
-    await streams_of(request).get(name)
+    streams_of(request).get(name)  # 404 if there is none
     asked = f"snapshot {name} {wanted.model}"
     view: SnapshotView = await control_of(request).repeated.once(caller.key_id, idempotency_key, asked, take)
     where = f"/v1/streams/{name}/snapshots/{view.id}"

@@ -1,4 +1,8 @@
-"""State shared by the routes of one application: parts, stores, open displays, cached answers, and checks of disk and audit log."""
+"""State shared by the routes of one application: parts, stores, open displays, cached answers, and checks of disk and audit log.
+
+The registry, recordings, replays and exports are synchronous and thread-safe; routes call them in worker threads. `Parts.errors` maps their errors to
+problems.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,13 @@ import logging
 import os
 import shutil
 from collections import Counter, OrderedDict
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from fastapi import Header
+from fastapi import APIRouter, Header
 from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
@@ -21,15 +25,49 @@ from starlette.requests import HTTPConnection
 
 from services.api.middleware import TokenBuckets
 from services.api.observability import Measures
-from services.api.parts import CheckResult, Parts
 from services.api.problems import Missing, NotBuiltIn, Problem, Unprocessable
 from services.audit import AuditError, AuditLog
+from services.audit.system_events import SystemEvents
 from services.auth.keys import KeyStore
 from services.auth.roles import Tickets
+from services.schemas.service import CheckResult
 from services.settings import ServiceSettings
 
 if TYPE_CHECKING:
     from services.auth.oidc import OpenIdPersons
+    from services.exports.snapshots import ModelExports, StreamSnapshots
+    from services.jobs.replays import Replays
+    from services.recordings.store import RecordingStore
+    from services.registry.models import ModelRegistry
+    from services.supervisor.stream import SupervisedStreams
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parts of a server. Requests for an absent part are answered with 503."""
+
+    streams: SupervisedStreams | None = None
+    models: ModelRegistry | None = None
+    display: SupervisedStreams | None = None
+    jobs: Replays | None = None
+    recordings: RecordingStore | None = None
+    snapshots: StreamSnapshots | None = None
+    exports: ModelExports | None = None
+    routers: Sequence[APIRouter] = ()
+    """Further routers, created by `new_router`."""
+    background: Sequence[Callable[[], AbstractAsyncContextManager[Any]]] = ()
+    """Context managers entered in order at server start and left in reverse order after the drain.
+    """
+    checks: Mapping[str, Callable[[], Awaitable[CheckResult]]] = field(default_factory=dict)
+    """Health checks for /readyz, by name."""
+    collectors: Sequence[Collector] = ()
+    """Metric collectors for /metrics."""
+    events: SystemEvents = field(default_factory=SystemEvents)
+    """Events of the parts for the audit log, not caused by a request."""
+    trusts_ages: Callable[[], bool] = lambda: True
+    """Return True if old audit segments may be deleted by age now."""
+    errors: Mapping[type[Exception], type[Problem]] = field(default_factory=dict)
+    """Problem type for each error type of the parts; the error text is sent to the caller."""
 
 
 class ViewerCount:

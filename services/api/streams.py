@@ -14,14 +14,13 @@ from urllib.parse import urlsplit
 from starlette.requests import Request
 
 from services.api.guard import CallerOf, new_router, recorded, requires
-from services.api.parts import NewStream
 from services.api.problems import Forbidden, Unprocessable
 from services.api.state import control_of, part
 from services.schemas.streams import StreamOptions, StreamRequest, StreamView, VirtualCamera
 from services.settings import ResourceName, SourceRules
 
 if TYPE_CHECKING:
-    from services.supervisor.stream import StreamFacts, SupervisedStreams
+    from services.supervisor.stream import SupervisedStreams
 
 OF_NETWORKS = frozenset(
     {"rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https", "zmq+tcp"}
@@ -123,7 +122,7 @@ def streams_of(request: Request) -> SupervisedStreams:
 @requires("viewer", scope="any")
 async def streams(request: Request, caller: CallerOf) -> list[StreamView]:
     """List the streams that the key may access."""
-    return [_view(stream) for stream in await streams_of(request).all() if caller.may_use(stream.name)]
+    return [stream for stream in streams_of(request).all() if caller.may_use(stream.name)]
 
 
 @router.post("/streams", status_code=201)
@@ -136,18 +135,17 @@ async def create_stream(request: Request, caller: CallerOf, wanted: StreamReques
     detail = {"scheme": wanted.source.partition(":")[0][:20] if wanted.source.isascii() else "", "show": wanted.show}
     async with recorded(request, caller, "stream.create", wanted.name, {**detail}):
         check_source(wanted.source, control_of(request).settings.sources)
-        new = NewStream(wanted.name, wanted.source, wanted.show, wanted.device, wanted.options)
-        state = await found.create(new)
+        view = found.create(wanted.name, wanted)
         if wanted.start:
-            state = await found.start(wanted.name)
-    return _view(state)
+            view = await found.start(wanted.name)
+    return view
 
 
 @router.get("/streams/{name}")
 @requires("viewer", scope="stream")
 async def stream(request: Request, name: ResourceName) -> StreamView:
     """Return a stream with its state and processes."""
-    return _view(await streams_of(request).get(name))
+    return streams_of(request).get(name)
 
 
 @router.post("/streams/{name}/start")
@@ -156,7 +154,7 @@ async def start_stream(request: Request, caller: CallerOf, name: ResourceName) -
     """Start a stream. No effect on a running stream."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.start", name):
-        return _view(await found.start(name))
+        return await found.start(name)
 
 
 @router.post("/streams/{name}/stop")
@@ -165,7 +163,7 @@ async def stop_stream(request: Request, caller: CallerOf, name: ResourceName) ->
     """Stop a stream, including its raw picture."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.stop", name):
-        return _view(await found.stop(name))
+        return await found.stop(name)
 
 
 @router.patch("/streams/{name}/options")
@@ -176,7 +174,7 @@ async def set_stream_options(
     """Change options; unnamed options keep their values."""
     found = streams_of(request)
     async with recorded(request, caller, "stream.options", name, {"options": len(wanted.options)}):
-        return _view(await found.set_options(name, wanted.options))
+        return await found.set_options(name, wanted.options)
 
 
 @router.delete("/streams/{name}", status_code=204)
@@ -186,10 +184,6 @@ async def delete_stream(request: Request, caller: CallerOf, name: ResourceName) 
     found = streams_of(request)
     async with recorded(request, caller, "stream.delete", name):
         await found.delete(name)
-
-
-def _view(state: StreamFacts) -> StreamView:
-    return StreamView.model_validate(state)
 
 
 @router.put("/streams/{name}/camera")

@@ -14,6 +14,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -814,7 +815,7 @@ def health(
     if json:
         typer.echo(ready.model_dump_json(indent=2))
     else:
-        rows = [{"name": name, **check.model_dump()} for name, check in (ready.checks or {}).items()]
+        rows = [{"name": name, **asdict(check)} for name, check in (ready.checks or {}).items()]
         typer.echo("\n".join([f"the service is {ready.status}", *table(HEALTH, rows)]))
     if ready.status == "not ready":
         raise InvalidSetting("the service is not ready; the checks above say why")

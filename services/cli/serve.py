@@ -15,9 +15,9 @@ import typer
 from gsplat_core.errors import UserError
 from services.api.app import AUDIT_FILE, KEYS_FILE, new_app
 from services.api.assembly import assembled
-from services.api.health import bind_probe
 from services.api.observability import log_to_stderr, say_start
 from services.api.server import bind, certificate_of, serve
+from services.api.service import bind_probe
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verify
 from services.auth.keys import ApiKey, KeyConflict, KeyStore, append_key_change
 from services.auth.roles import Role

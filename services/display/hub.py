@@ -107,7 +107,7 @@ class Viewer(AsyncIterator[EncodedPicture]):
         self._closed = False
         self._taken_s = asyncio.get_running_loop().time()
         self.given = 0
-        """Pictures taken by the viewer."""
+        """PictureKind taken by the viewer."""
 
     def offer(self, picture: EncodedPicture) -> None:
         """Replace the pending picture by the newest one."""
@@ -151,8 +151,8 @@ class Viewer(AsyncIterator[EncodedPicture]):
 
 
 log = logging.getLogger(__name__)
-Pictures = Literal["raw", "shown", Layer]
-KINDS: tuple[Pictures, ...] = ("raw", "shown", *LAYERS)
+PictureKind = Literal["raw", "shown", Layer]
+KINDS: tuple[PictureKind, ...] = ("raw", "shown", *LAYERS)
 """Picture kinds; each has a socket of the same name."""
 QUALITY = 80
 STALE_S, FROZEN_S = 0.5, 1.0
@@ -168,10 +168,10 @@ class DisplayHub:
 
     def __init__(self, folder: StreamFolder) -> None:
         self._folder = folder
-        self._channels: dict[Pictures, _Channel] = {}
+        self._channels: dict[PictureKind, _Channel] = {}
         self._encoders = ThreadPoolExecutor(max_workers=2, thread_name_prefix="jpeg")
 
-    def subscribe(self, kind: Pictures, quality: int = QUALITY) -> Viewer:
+    def subscribe(self, kind: PictureKind, quality: int = QUALITY) -> Viewer:
         """Add a viewer, active until closed.
 
         Raises:
@@ -183,17 +183,17 @@ class DisplayHub:
             channel = self._channels[kind] = _Channel(self._folder.endpoint(kind), kind, self._encoders)
         return channel.add(quality)
 
-    def viewers(self, kind: Pictures) -> int:
+    def viewers(self, kind: PictureKind) -> int:
         """Return the number of viewers."""
         channel = self._channels.get(kind)
         return 0 if channel is None else len(channel.viewers)
 
-    def counts(self, kind: Pictures) -> dict[str, int]:
+    def counts(self, kind: PictureKind) -> dict[str, int]:
         """Return the number of `encoded` pictures, and of pictures that viewers missed, by reason."""
         channel = self._channels.get(kind)
         return {} if channel is None else dict(channel.counts)
 
-    def ages(self, kind: Pictures) -> Mapping[str, Any]:
+    def ages(self, kind: PictureKind) -> Mapping[str, Any]:
         """Return the distribution of picture ages at encoding, since frame arrival."""
         channel = self._channels.get(kind)
         return {} if channel is None else channel.ages.as_json()
@@ -208,7 +208,7 @@ class DisplayHub:
 class _Channel:
     """Viewers of one kind of picture. Subscribes only while there are viewers."""
 
-    def __init__(self, endpoint: str, kind: Pictures, encoders: ThreadPoolExecutor) -> None:
+    def __init__(self, endpoint: str, kind: PictureKind, encoders: ThreadPoolExecutor) -> None:
         self._endpoint, self._kind, self._encoders = endpoint, kind, encoders
         self._stale_s, self._frozen_s = (LAYER_STALE_S, LAYER_FROZEN_S) if kind in LAYERS else (STALE_S, FROZEN_S)
         self.viewers: set[Viewer] = set()
@@ -285,7 +285,7 @@ class _Channel:
             self.ages.add((time.monotonic_ns() - arrived_ns) * 1e-9)
 
 
-def _header(picture: Picture, kind: Pictures) -> dict[str, object]:
+def _header(picture: Picture, kind: PictureKind) -> dict[str, object]:
     """Return the header for viewers, with the current age."""
     header = {name: value for name, value in picture.header.items() if name not in ("pixels", "run")}
     arrived_ns = header.get("arrived_ns")

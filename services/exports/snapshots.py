@@ -23,8 +23,7 @@ from typing import Any
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.files import sync_folder, write_durably
-from services.api.problems import Conflicting, Unprocessable
-from services.errors import CommandRefused, ExportFailed, NoSnapshot
+from services.errors import CommandRefused, Conflict, ExportFailed, NoSnapshot, Rejected
 from services.exports.cache import ExportCache, Exported
 from services.registry.bundle_file import SUFFIX, pack
 from services.registry.models import ModelRegistry
@@ -177,20 +176,20 @@ class StreamSnapshots:
             The snapshot's record, and the version record or None.
 
         Raises:
-            Missing: if the stream does not exist.
-            Conflicting: if the stream is stopped or just starting.
+            NotFound: if the stream does not exist.
+            Conflict: if the stream is stopped or just starting.
             BusError: if the engine does not answer.
             ExportFailed: if the snapshot cannot be stored.
             RegistryError: if the registry does not take it.
         """
-        supervisor = self._streams.with_engine(stream)
+        engine = self._streams.engine(stream)
         with self._store.new() as new:
             folder = new / "model"
             try:
-                said = await supervisor.command("engine", "snapshot", timeout_s=WRITE_S, folder=str(folder))
+                said = await engine.command("snapshot", timeout_s=WRITE_S, folder=str(folder))
             except CommandRefused as error:
                 # The engine names its folder, which is a path of the server.
-                raise Conflicting(str(error).replace(str(folder), "the snapshot")) from error
+                raise Conflict(str(error).replace(str(folder), "the snapshot")) from error
             taken = await asyncio.to_thread(described, folder, stream, by, said)
             if model is None:
                 await asyncio.to_thread(self._store.keep, folder, taken)
@@ -216,13 +215,13 @@ def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
     """Refuse times outside the model's window before an export process is started.
 
     Raises:
-        Unprocessable: if a time is outside.
+        Rejected: if a time is outside.
     """
     start_s, end_s = window_s
     try:
         wish.times_in((start_s, end_s))
     except InvalidSetting as error:
-        raise Unprocessable(str(error)) from error
+        raise Rejected(str(error)) from error
 
 
 class ModelExports:
@@ -245,11 +244,11 @@ class ModelExports:
         Raises:
             RegistryError: if the version does not exist.
             ExportsError: if the export fails.
-            Conflicting: if the version was not checked.
+            Conflict: if the version was not checked.
         """
         version: Any = self._registry.version(name, number)
         if version.state not in CHECKED:
-            raise Conflicting(f"{name}/{number} is {version.state}; only a version that passed its check is exported")
+            raise Conflict(f"{name}/{number} is {version.state}; only a version that passed its check is exported")
         refuse_outside(wish, version.description["time_window_s"])
         return self._cache.get(version.digest, lambda: self._registry.folder_of(name, number), wish)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Literal
 
@@ -45,12 +46,13 @@ def _in_utc(moment: datetime) -> datetime:
 Moment = Annotated[AwareDatetime, Strict(False), BeforeValidator(_text), AfterValidator(_in_utc)]
 
 
-class CheckView(BaseModel):
-    """Result of one health check."""
+@dataclass(frozen=True)
+class CheckResult:
+    """Result of one health check. The service is ready if all needed checks are ok, and degraded if another check is not."""
 
     ok: bool
-    detail: str
-    needed: bool
+    detail: str = ""
+    needed: bool = True
 
 
 class Readiness(BaseModel):
@@ -58,7 +60,7 @@ class Readiness(BaseModel):
     such as a camera, has a problem."""
 
     status: Literal["ready", "degraded", "not ready"]
-    checks: dict[str, CheckView] | None = None
+    checks: dict[str, CheckResult] | None = None
 
 
 class Alive(BaseModel):

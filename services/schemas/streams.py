@@ -44,7 +44,6 @@ class StreamView(BaseModel):
     """Stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason`
     explains it."""
 
-    model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["endoscope"])
     source: str = Field(examples=["rtsp://10.0.0.5/stream"])
     show: str = Field(examples=["live"])

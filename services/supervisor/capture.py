@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import zmq
@@ -37,8 +38,7 @@ from services.bus.runtime import StreamFolder
 from services.errors import BadMessage, BusError, CommandRefused
 from services.private_files import keep_files_private
 from services.supervisor.launcher import FAILED, NO_USE
-from services.supervisor.specs import SourceSpec
-from services.supervisor.worker import Worker, stream_folder_of
+from services.supervisor.worker import ProcessSpec, SourceSpec, Worker
 
 LOOK_MS = 50
 ASK_AGAIN_S = 0.1
@@ -290,8 +290,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--spec", required=True, help="file with the specification")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
-        folder, spec = stream_folder_of(parser.parse_args(arguments).spec, "capture")
+        path = Path(os.path.abspath(parser.parse_args(arguments).spec))
+        spec = ProcessSpec.read(path, "capture")
         assert spec.capture is not None
+        folder = StreamFolder(path.parent)
         capture = Capture(spec.capture)
         with Worker(folder, spec, {"describe": capture.describe}) as worker:
             worker.tell_figures("capture", capture.figures)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,15 +40,14 @@ from operators.settings import EngineOptions, check_option
 from operators.sources.source import SourceDescription
 from services.bus.messages import BOUNDS_S, text_of
 from services.bus.pictures import PicturePublisher
-from services.bus.runtime import read_json, write_json
+from services.bus.runtime import StreamFolder, read_json, write_json
 from services.errors import BadMessage, CommandRefused
 from services.private_files import keep_files_private
 from services.supervisor.capture import CapturedSource
 from services.supervisor.launcher import NO_USE
 from services.supervisor.model_show import ModelShow
 from services.supervisor.screen import Layers, LayerScene, Screen, header_of
-from services.supervisor.specs import EngineSpec
-from services.supervisor.worker import ENGINE_ON_CPU, Worker, scratch_folder, step_back, stream_folder_of
+from services.supervisor.worker import ENGINE_ON_CPU, EngineSpec, ProcessSpec, Worker, scratch_folder, step_back
 
 SHARE_OF_INTERVAL = 0.5
 """Largest share of the frame interval that processing one frame may take without viewers. Viewers,
@@ -346,8 +346,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
-        folder, spec = stream_folder_of(given.spec, "engine")
+        path = Path(os.path.abspath(given.spec))
+        spec = ProcessSpec.read(path, "engine")
         assert spec.engine is not None
+        folder = StreamFolder(path.parent)
         if spec.engine.device == "cpu":
             step_back(ENGINE_ON_CPU)
         with scratch_folder(), Worker(folder, spec) as worker:

@@ -11,7 +11,6 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from services.bus.messages import cumulative
-from services.bus.runtime import ROLES
 from services.display.hub import KINDS
 from services.supervisor.process import StreamEvent
 
@@ -160,25 +159,25 @@ class StreamMeasures(Collector):
             labels=["stream", "picture"],
         )
         graphs = GraphFamilies()
-        for facts in [] if self.streams is None else self.streams.now():
+        for stream in [] if self.streams is None else self.streams.streams():
+            name, view, hub, processes = stream.name, stream.view(), stream.hub, stream.processes
             for each in STATES:
-                state.add_metric([facts.name, each], float(facts.state == each))
-            hub = self.streams.hub(facts.name) if self.streams is not None else None
-            if hub is None or self.streams is None:
+                state.add_metric([name, each], float(view.state == each))
+            if hub is None:
                 continue
-            graphs.add(facts.name, facts.processes, self.streams.measures(facts.name, "engine"))
-            for role in ROLES:
-                for cause, count in self.streams.causes(facts.name, role).items():
-                    restarts.add_metric([facts.name, role, cause], count)
+            graphs.add(name, view.processes, processes["engine"].measures)
+            for role, process in processes.items():
+                for cause, count in process.causes.items():
+                    restarts.add_metric([name, role, cause], count)
             for kind in KINDS:
-                viewers.add_metric([facts.name, kind], hub.viewers(kind))
+                viewers.add_metric([name, kind], hub.viewers(kind))
                 if (found := cumulative(hub.ages(kind))) is not None:
-                    ages.add_metric([facts.name, kind], *found)
+                    ages.add_metric([name, kind], *found)
                 for reason, count in hub.counts(kind).items():
                     if reason == "encoded":
-                        encoded.add_metric([facts.name, kind], count)
+                        encoded.add_metric([name, kind], count)
                     else:
-                        dropped.add_metric([facts.name, kind, reason], count)
-        for (stream, of_role, what), count in self._events.items():
-            events.add_metric([stream, of_role, what], count)
+                        dropped.add_metric([name, kind, reason], count)
+        for (name, of_role, what), count in self._events.items():
+            events.add_metric([name, of_role, what], count)
         return [state, restarts, events, encoded, dropped, viewers, ages, *graphs.families()]

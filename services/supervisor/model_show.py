@@ -28,8 +28,7 @@ from services.bus.runtime import read_json, write_json
 from services.errors import BadMessage, BusError, CommandRefused
 from services.supervisor.capture import CapturedSource
 from services.supervisor.screen import SCORES, Layers, LayerScene, Screen
-from services.supervisor.specs import EngineSpec
-from services.supervisor.worker import Worker
+from services.supervisor.worker import EngineSpec, Worker
 
 
 class NotFinite(InvalidInput):

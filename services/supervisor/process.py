@@ -14,12 +14,12 @@ from typing import Any, Literal
 import zmq
 import zmq.asyncio
 
-from services.bus.messages import ask_async, parsed_json
+from services.bus.messages import ANSWER_S, ask_async, parsed_json
 from services.bus.pictures import subscribe
 from services.bus.runtime import ProcessIdentity, Role, StreamFolder
 from services.errors import BadMessage, BusError, NoAnswer
 from services.supervisor.launcher import Start, cause_of, is_of_no_use, last_words
-from services.supervisor.specs import StreamSpec
+from services.supervisor.worker import ProcessSpec
 
 FIRST_S = 0.25
 MOST_WORKED_S = 1.0
@@ -95,7 +95,7 @@ SOURCE_GONE = ("opening", "stalled", "reconnecting", "lost", "ended")
 LOST_AFTER_S = 2.0
 """Seconds without frames after which the source counts as lost. Shorter gaps appear in the metrics
 only."""
-Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left", "lost", "recovered"]
+Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "lost", "recovered"]
 
 
 @dataclass(frozen=True)
@@ -162,13 +162,12 @@ class ManagedProcess:
 
     def __init__(
         self,
-        spec: StreamSpec,
-        role: Role,
+        spec: ProcessSpec,
         folder: StreamFolder,
         start: Start,
         on_event: Callable[[StreamEvent], None],
     ) -> None:
-        self._spec, self._role, self._folder = spec, role, folder
+        self._spec, self._role, self._folder = spec, spec.role, folder
         self._start, self._on_event = start, on_event
         self._restarts = Restarts()
         self._identity: ProcessIdentity | None = None
@@ -224,13 +223,12 @@ class ManagedProcess:
         if not self._tasks:
             self._gone_s, self._lost = None, False
             each = (self._keep, self._listen, self._ping)
-            self._tasks = [asyncio.create_task(task(), name=f"{self._spec.name} {self._role}") for task in each]
+            self._tasks = [asyncio.create_task(task(), name=f"{self._spec.stream} {self._role}") for task in each]
 
-    async def close(self, *, stop: bool, reason: str) -> None:
-        """Stop supervising the process.
+    async def close(self, reason: str) -> None:
+        """End the process, by SIGKILL if it does not finish in time, and its supervision.
 
         Args:
-            stop: also end the process, by SIGKILL if it does not finish in time.
             reason: text for the log and the state.
         """
         tasks, self._tasks = self._tasks, []
@@ -239,9 +237,6 @@ class ManagedProcess:
         await asyncio.gather(*tasks, return_exceptions=True)
         identity, self._identity = self._identity, None
         self._down = "stopped", reason
-        if not stop:
-            self._say("left", reason, identity)
-            return
         record = self._folder.record(self._role)
         for each in {identity, None if record is None else record.identity} - {None}:
             assert each is not None
@@ -249,21 +244,15 @@ class ManagedProcess:
         self._folder.clean(self._role)
         self._say("stopped", reason, identity)
 
-    async def restart(self, reason: str) -> None:
-        """End the process; the supervision starts a new one."""
-        if self._identity is not None:
-            log.info("%s %s is started again: %s", self._spec.name, self._role, reason)
-            await self._end(self._identity)
-
-    async def command(self, command: str, timeout_s: float, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Send a command to the process.
+    async def command(self, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any) -> dict[str, Any]:
+        """Send a command to the process (docs/design/processes.md lists them).
 
         Raises:
             NoAnswer: if the process does not run or does not answer.
             CommandRefused: if the process refuses the command.
         """
         if self._identity is None:
-            raise NoAnswer(f"the {self._role} process of {self._spec.name} does not run: {self._down[1]}")
+            raise NoAnswer(f"the {self._role} process of {self._spec.stream} does not run: {self._down[1]}")
         return await ask_async(self._folder.commands(self._role), command, timeout_s=timeout_s, **arguments)
 
     async def _keep(self) -> None:
@@ -290,7 +279,7 @@ class ManagedProcess:
         """Return the process for this role: the running one if its settings match, otherwise a new
         one. None if the start failed."""
         record = self._folder.record(self._role)
-        digest = self._spec.digest(self._role)
+        digest = self._spec.digest
         if record is not None and record.spec_digest != digest:
             self._say("replaced", "it was started for other settings", record.identity)
             await self._end(record.identity)
@@ -308,7 +297,7 @@ class ManagedProcess:
         output = self._folder.log(self._role)
         if output.exists() and output.stat().st_size > MOST_LOG_BYTES:
             output.unlink()
-        arguments = ["--spec", str(self._spec.write(self._role, self._folder))]
+        arguments = ["--spec", str(self._spec.write(self._folder))]
         if self._role == "engine" and self._restarts.total:
             arguments.append("--again")
         self._down = "starting", "it is being started"
@@ -324,8 +313,8 @@ class ManagedProcess:
         return self._identity
 
     def _environment(self) -> dict[str, str]:
-        gpu = self._spec.engine.gpu
-        return {"CUDA_VISIBLE_DEVICES": str(gpu)} if self._role == "engine" and gpu is not None else {}
+        engine = self._spec.engine
+        return {} if engine is None or engine.gpu is None else {"CUDA_VISIBLE_DEVICES": str(engine.gpu)}
 
     async def _watched(self, identity: ProcessIdentity) -> str:
         """Wait for the end of the process; kill it if it hangs.
@@ -379,7 +368,7 @@ class ManagedProcess:
                 try:
                     said = parsed_json(await socket.recv())
                 except BadMessage as error:
-                    log.warning("%s %s: %s", self._spec.name, self._role, error)
+                    log.warning("%s %s: %s", self._spec.stream, self._role, error)
                     continue
                 if self._identity is not None and said.get("pid") == self._identity.pid:
                     self._take(said)
@@ -424,7 +413,7 @@ class ManagedProcess:
                     await ask_async(self._folder.commands(self._role), "ping")
                 except BusError as error:
                     # hang detection relies on the heartbeats, not on this ping
-                    log.info("%s %s: %s", self._spec.name, self._role, error)
+                    log.info("%s %s: %s", self._spec.stream, self._role, error)
 
     async def _end(self, identity: ProcessIdentity) -> None:
         """Ask a process to finish; kill it after `drain_s`."""
@@ -438,5 +427,5 @@ class ManagedProcess:
     def _say(self, kind: Kind, reason: str, identity: ProcessIdentity | None) -> None:
         pid = None if identity is None else identity.pid
         level = logging.WARNING if kind == "lost" else logging.INFO
-        log.log(level, "%s %s %s (%s): %s", self._spec.name, self._role, kind, pid, reason)
-        self._on_event(StreamEvent(self._spec.name, self._role, kind, reason, pid))
+        log.log(level, "%s %s %s (%s): %s", self._spec.stream, self._role, kind, pid, reason)
+        self._on_event(StreamEvent(self._spec.stream, self._role, kind, reason, pid))

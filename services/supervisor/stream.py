@@ -1,7 +1,7 @@
-"""Streams of a server: capture and engine process of each, state, display, and the registry model that it shows.
+"""Streams of a server: capture and engine process of each, state, viewers, and the registry model that it shows.
 
-`StreamSupervisor` runs the two processes of one stream. `SupervisedStreams` holds all streams, `StreamDisplays` their viewers. `ShownModels` keeps streams in
-step with the active versions of the registry.
+`Stream` runs the two processes of one stream. `SupervisedStreams` holds all streams. `ShownModels` keeps streams in step with the active versions of the
+registry.
 """
 
 from __future__ import annotations
@@ -10,168 +10,132 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
-from services.api.parts import NewStream, PictureKind
-from services.api.problems import Conflicting, Missing, Unprocessable
 from services.audit.system_events import SystemEvents
-from services.bus.messages import ANSWER_S
 from services.bus.runtime import Role, RuntimeFolder, StreamFolder
-from services.display.hub import KINDS, DisplayHub, EncodedPicture
-from services.errors import BusError, RegistryError
+from services.display.hub import KINDS, DisplayHub, EncodedPicture, PictureKind
+from services.errors import BusError, Conflict, NotFound, RegistryError, Rejected
 from services.registry.models import ModelRegistry
+from services.schemas.streams import StreamView
+from services.settings import StreamSettings
 from services.supervisor.launcher import ByLauncher, Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent
-from services.supervisor.specs import StreamSpec, assigned
-from services.supervisor.stream_specs import gpus, spec_of
-from services.supervisor.worker import remove_dead
+from services.supervisor.worker import ProcessSpec, assigned, gpus, remove_dead, specs_of
+
+log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class StreamState:
-    """Current state of a stream."""
+class Stream:
+    """Stream, with its processes and display hub while it runs. Runs in the creator's event loop and loads no torch.
 
-    name: str
-    capture: ProcessState
-    engine: ProcessState
-
-
-class StreamSupervisor:
-    """Supervisor of one stream's processes, run in the creator's event loop. Loads no torch.
-
-        stream = StreamSupervisor(spec, RuntimeFolder(path), on_event=audit)
-        await stream.start()      # adopts running processes
-        stream.state()
-        await stream.stop("…")    # or detach(): the processes continue for the next supervisor
-
-    Raises:
-        RuntimeFolderUnusable: if the runtime folder cannot be used.
+    stream = Stream(settings, specs_of("theatre-1", settings), RuntimeFolder(path), on_event=audit)
+    await stream.start()      # adopts running processes
+    stream.engine.state
+    await stream.stop("…")
     """
 
     def __init__(
         self,
-        spec: StreamSpec,
+        settings: StreamSettings,
+        specs: Mapping[Role, ProcessSpec],
         runtime: RuntimeFolder,
         *,
         start: Start | None = None,
         on_event: Callable[[StreamEvent], None] = lambda event: None,
     ) -> None:
-        """Create a supervisor; `start` begins the supervision.
+        """Create a stopped stream.
 
         Args:
-            spec: the stream.
+            settings: settings of the stream.
+            specs: specifications of its processes.
             runtime: runtime folder of the service.
             start: process starter. `ByLauncher` restarts engines quickly and is shared by the
                 streams of a runtime folder.
             on_event: called for each state change of a process.
         """
-        self.spec = spec
-        self._runtime = runtime
-        self.folder: StreamFolder = runtime.stream(spec.name)
-        start = start or Direct()
-        self._capture = ManagedProcess(spec, "capture", self.folder, start, on_event)
-        self._engine = ManagedProcess(spec, "engine", self.folder, start, on_event)
+        self.settings, self.specs = settings, specs
+        self.name = specs["engine"].stream
+        self._runtime, self._start, self._on_event = runtime, start or Direct(), on_event
+        self.processes: dict[Role, ManagedProcess] = {}
+        """Processes by role; empty while the stream is stopped."""
+        self.hub: DisplayHub | None = None
+        """Pictures for viewers; None while the stream is stopped."""
+        self.changing = asyncio.Lock()
+        """Serialises start, stop and changes of the stream."""
 
-    async def start(self) -> None:
-        """Adopt running processes with the same settings, start the missing ones, and supervise
-        them."""
-        self.folder = self._runtime.stream(self.spec.name)
-        self._capture.open()
-        self._engine.open()
+    @property
+    def engine(self) -> ManagedProcess:
+        """Return the engine process of a running stream."""
+        return self.processes["engine"]
 
-    async def stop(self, reason: str = "it was requested") -> None:
-        """End both processes and remove the stream's runtime folder."""
-        await self._engine.close(stop=True, reason=reason)
-        await self._capture.close(stop=True, reason=reason)
-        if self.folder.path.exists():
-            self.folder.remove()
+    @property
+    def capture(self) -> ManagedProcess:
+        """Return the capture process of a running stream."""
+        return self.processes["capture"]
 
-    async def detach(self, reason: str = "the control plane ends") -> None:
-        """Stop supervising; the processes continue."""
-        await asyncio.gather(*(each.close(stop=False, reason=reason) for each in (self._engine, self._capture)))
-
-    async def restart(self, role: Role, reason: str = "it was requested") -> None:
-        """Restart one process."""
-        await self._process(role).restart(reason)
-
-    def state(self) -> StreamState:
-        """Return the current state."""
-        return StreamState(self.spec.name, self._capture.state, self._engine.state)
-
-    def measures(self, role: Role) -> Mapping[str, Any]:
-        """Return the Prometheus measures of a process."""
-        return self._process(role).measures
-
-    def causes(self, role: Role) -> Mapping[str, int]:
-        """Return the number of process ends by cause."""
-        return self._process(role).causes
-
-    async def command(
-        self, role: Role, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any
-    ) -> dict[str, Any]:
-        """Send a command to a process (docs/design/processes.md lists them).
+    @property
+    def folder(self) -> StreamFolder:
+        """Return the runtime folder of the stream, created if missing.
 
         Raises:
-            NoAnswer: if the process does not run or does not answer.
-            CommandRefused: if the process refuses the command.
+            RuntimeFolderUnusable: if the folder cannot be used.
         """
-        return await self._process(role).command(command, timeout_s, arguments)
+        return self._runtime.stream(self.name)
 
-    def _process(self, role: Role) -> ManagedProcess:
-        return self._capture if role == "capture" else self._engine
+    async def start(self) -> None:
+        """Adopt running processes with the same settings, start the missing ones, and supervise them.
+        No effect on a running stream.
 
+        Raises:
+            RuntimeFolderUnusable: if the runtime folder cannot be used.
+        """
+        if self.hub is not None:
+            return
+        folder = self.folder
+        self.processes = {
+            role: ManagedProcess(spec, folder, self._start, self._on_event) for role, spec in self.specs.items()
+        }
+        for process in self.processes.values():
+            process.open()
+        self.hub = DisplayHub(folder)
 
-log = logging.getLogger(__name__)
+    async def stop(self, reason: str = "it was requested") -> None:
+        """End both processes and remove the stream's runtime folder. No effect on a stopped stream."""
+        hub, processes = self.hub, self.processes
+        self.hub, self.processes = None, {}
+        if hub is None:
+            return
+        await hub.close()
+        for role in ("engine", "capture"):
+            await processes[role].close(reason)
+        if (self._runtime.path / self.name).exists():
+            self.folder.remove()
 
-
-@dataclass(frozen=True)
-class StreamFacts:
-    """Configuration and current state of a stream.
-
-    `state`: stopped, starting, live, stale, frozen, source lost or failed. `processes`: state, pid,
-    restarts and figures of the capture and engine process.
-    """
-
-    name: str
-    source: str
-    show: str
-    device: str
-    options: Mapping[str, Any]
-    state: str
-    reason: str | None
-    processes: Mapping[str, Mapping[str, Any]]
-    viewers: Mapping[str, int] = field(default_factory=dict)
+    def view(self) -> StreamView:
+        """Return configuration and current state."""
+        engine = self.specs["engine"].engine
+        assert engine is not None
+        state, reason = "stopped", None
+        if self.processes:
+            state, reason = overall(self.capture.state, self.engine.state)
+        return StreamView(
+            name=self.name,
+            source=self.settings.source,
+            show=self.settings.show,
+            device=engine.device if engine.gpu is None else f"{engine.device}:{engine.gpu}",
+            options=self.settings.options,
+            state=state,
+            reason=reason,
+            processes={role: asdict(process.state) for role, process in self.processes.items()},
+            viewers={} if self.hub is None else {kind: self.hub.viewers(kind) for kind in KINDS},
+        )
 
 
 OUT_OF_BODY = "out of body"
 """Reason string of frames withheld by the engine's out-of-body gate."""
-
-
-class Stream:
-    """Configured stream, with its supervisor and display hub while it runs."""
-
-    def __init__(self, wanted: NewStream, spec: StreamSpec) -> None:
-        self.wanted, self.spec = wanted, spec
-        self.supervisor: StreamSupervisor | None = None
-        self.hub: DisplayHub | None = None
-        self.changing = asyncio.Lock()
-        """Serialises start, stop and changes of the stream."""
-
-    def facts(self) -> StreamFacts:
-        """Return configuration and current state."""
-        wanted = self.wanted
-        engine = self.spec.engine
-        device = engine.device if engine.gpu is None else f"{engine.device}:{engine.gpu}"
-        about = (wanted.name, wanted.source, wanted.show, device, wanted.options)
-        if self.supervisor is None:
-            return StreamFacts(*about, "stopped", None, {})
-        now = self.supervisor.state()
-        state, reason = overall(now.capture, now.engine)
-        processes = {"capture": asdict(now.capture), "engine": asdict(now.engine)}
-        viewers: dict[str, int] = {} if self.hub is None else {str(kind): self.hub.viewers(kind) for kind in KINDS}
-        return StreamFacts(*about, state, reason, processes, viewers)
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:
@@ -203,7 +167,7 @@ def _withheld(engine: ProcessState) -> str | None:
 
 
 class SupervisedStreams:
-    """Streams and their processes. `running` is entered with the server."""
+    """Streams of a server by name. `running` is entered with the server."""
 
     def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None], most: int = 16) -> None:
         """Create the manager without streams.
@@ -218,14 +182,15 @@ class SupervisedStreams:
         self._streams: dict[str, Stream] = {}
 
     @asynccontextmanager
-    async def running(self, at_start: Sequence[NewStream], started: Sequence[str]) -> AsyncIterator[None]:
-        """Create the streams `at_start` and start those named in `started`. All streams are stopped
+    async def running(self, at_start: Mapping[str, StreamSettings]) -> AsyncIterator[None]:
+        """Create the streams `at_start`, and start those that are to start. All streams are stopped
         at the end of the block."""
         await asyncio.to_thread(remove_dead)
-        for stream in at_start:
-            await self.create(stream)
-        for name in started:
-            await self.start(name)
+        for name, settings in at_start.items():
+            self.create(name, settings)
+        for name, settings in at_start.items():
+            if settings.start:
+                await self.start(name)
         try:
             yield
         finally:
@@ -233,100 +198,80 @@ class SupervisedStreams:
             await self._launcher.close(stop=True)
             await asyncio.to_thread(remove_dead)
 
-    def hub(self, name: str) -> DisplayHub | None:
-        """Return the display hub of a stream, or None if it does not run."""
-        stream = self._streams.get(name)
-        return None if stream is None else stream.hub
+    def streams(self) -> Sequence[Stream]:
+        """Return the streams themselves, for components that work with their processes."""
+        return list(self._streams.values())
 
-    def measures(self, name: str, role: Role) -> Mapping[str, Any]:
-        """Return the Prometheus measures of a process; empty if the stream does not run."""
-        supervisor = self._streams[name].supervisor if name in self._streams else None
-        return {} if supervisor is None else supervisor.measures(role)
-
-    def causes(self, name: str, role: Role) -> Mapping[str, int]:
-        """Return the number of process ends by cause since the stream was started."""
-        supervisor = self._streams[name].supervisor if name in self._streams else None
-        return {} if supervisor is None else supervisor.causes(role)
-
-    def now(self) -> Sequence[StreamFacts]:
+    def all(self) -> Sequence[StreamView]:
         """Return the state of every stream."""
-        return [stream.facts() for stream in self._streams.values()]
+        return [stream.view() for stream in self._streams.values()]
 
-    def running_streams(self) -> Sequence[Stream]:
-        """Return the running streams."""
-        return [stream for stream in self._streams.values() if stream.supervisor is not None]
-
-    async def all(self) -> Sequence[StreamFacts]:
-        """Return every stream."""
-        return self.now()
-
-    async def get(self, name: str) -> StreamFacts:
-        """Return one stream.
+    def get(self, name: str) -> StreamView:
+        """Return the state of one stream.
 
         Raises:
-            Missing: if the stream does not exist.
+            NotFound: if the stream does not exist.
         """
-        return self._stream(name).facts()
+        return self._stream(name).view()
 
-    async def create(self, stream: NewStream) -> StreamFacts:
+    def create(self, name: str, settings: StreamSettings) -> StreamView:
         """Create a stream. It is stopped.
 
         Raises:
-            Conflicting: if the name is taken or the limit is reached.
-            Unprocessable: if the configuration is not valid.
+            Conflict: if the name is taken or the limit is reached.
+            Rejected: if the configuration is not valid.
         """
-        if stream.name in self._streams:
-            raise Conflicting(f"a stream named {stream.name} already exists; delete it first, or choose another name")
+        if name in self._streams:
+            raise Conflict(f"a stream named {name} already exists; delete it first, or choose another name")
         if len(self._streams) >= self._most:
-            raise Conflicting(f"there are {self._most} streams, which is limits.streams; delete one, or raise it")
-        made = self._streams[stream.name] = Stream(stream, self._spec(stream))
-        return made.facts()
+            raise Conflict(f"there are {self._most} streams, which is limits.streams; delete one, or raise it")
+        made = self._streams[name] = Stream(
+            settings, self._specs(name, settings), self._runtime, start=self._launcher, on_event=self._on_event
+        )
+        return made.view()
 
-    async def start(self, name: str) -> StreamFacts:
+    async def start(self, name: str) -> StreamView:
         """Start a stream. No effect on a running stream.
 
         Raises:
-            Missing: if the stream does not exist.
+            NotFound: if the stream does not exist.
         """
         stream = self._stream(name)
         async with stream.changing:
-            if stream.supervisor is None:
-                self._launcher.open()  # opened with the first stream, because its preloaded modules take memory
-                supervisor = StreamSupervisor(stream.spec, self._runtime, start=self._launcher, on_event=self._on_event)
-                await supervisor.start()
-                stream.supervisor, stream.hub = supervisor, DisplayHub(supervisor.folder)
-        return stream.facts()
+            self._launcher.open()  # opened with the first stream, because its preloaded modules take memory
+            await stream.start()
+        return stream.view()
 
-    async def stop(self, name: str) -> StreamFacts:
+    async def stop(self, name: str) -> StreamView:
         """Stop a stream, including its raw picture.
 
         Raises:
-            Missing: if the stream does not exist.
+            NotFound: if the stream does not exist.
         """
         stream = self._stream(name)
         await self._stop(stream, "it was requested")
-        return stream.facts()
+        return stream.view()
 
-    async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamFacts:
+    async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamView:
         """Change options; unnamed options keep their values. A running stream is restarted with the new options.
 
         Raises:
-            Missing: if the stream does not exist.
-            Unprocessable: if an option is not valid.
+            NotFound: if the stream does not exist.
+            Rejected: if an option is not valid.
         """
         stream = self._stream(name)
-        wanted = replace(stream.wanted, options={**stream.wanted.options, **options})
-        spec = self._spec(wanted)
-        runs = stream.supervisor is not None
+        settings = stream.settings.model_copy(update={"options": {**stream.settings.options, **options}})
+        specs = self._specs(name, settings)
+        runs = stream.hub is not None
         await self._stop(stream, "its options change")
-        stream.wanted, stream.spec = wanted, spec
-        return await self.start(name) if runs else stream.facts()
+        stream.settings, stream.specs = settings, specs
+        return await self.start(name) if runs else stream.view()
 
     async def delete(self, name: str) -> None:
         """Stop and delete a stream.
 
         Raises:
-            Missing: if the stream does not exist.
+            NotFound: if the stream does not exist.
         """
         await self._stop(self._stream(name), "it is deleted")
         self._streams.pop(name, None)
@@ -335,87 +280,71 @@ class SupervisedStreams:
         """Set the stream's virtual camera and return its resulting position.
 
         Raises:
-            Missing: if the stream does not exist.
-            Conflicting: if the stream does not run or is just starting.
+            NotFound: if the stream does not exist.
+            Conflict: if the stream does not run or is just starting.
             BusError: if the engine does not answer.
         """
-        return await self.with_engine(name).command("engine", "camera", **camera)
+        return await self.engine(name).command("camera", **camera)
 
-    def supervisor(self, name: str) -> StreamSupervisor:
-        """Return the supervisor of a running stream.
-
-        Raises:
-            Missing: if the stream does not exist.
-            Conflicting: if it is stopped.
-        """
-        supervisor = self._stream(name).supervisor
-        if supervisor is None:
-            raise Conflicting(f"the stream {name} is stopped; start it first")
-        return supervisor
-
-    def with_engine(self, name: str) -> StreamSupervisor:
-        """Return the supervisor of a stream with a running engine, for a command.
+    def engine(self, name: str) -> ManagedProcess:
+        """Return the running engine of a stream, for a command.
 
         Raises:
-            Missing: if the stream does not exist.
-            Conflicting: if the engine does not run.
+            NotFound: if the stream does not exist.
+            Conflict: if the engine does not run.
         """
-        supervisor = self.supervisor(name)
-        engine = supervisor.state().engine
-        if engine.state != "running":
-            raise Conflicting(
-                f"the engine of {name} is {engine.state}: {engine.reason}; ask again when the stream is live"
-            )
-        return supervisor
-
-    async def _stop(self, stream: Stream, reason: str) -> None:
-        async with stream.changing:
-            supervisor, hub = stream.supervisor, stream.hub
-            stream.supervisor = stream.hub = None
-            if hub is not None:
-                await hub.close()
-            if supervisor is not None:
-                await supervisor.stop(reason)
-
-    def _stream(self, name: str) -> Stream:
-        if name not in self._streams:
-            raise Missing("there is no stream with this name; GET /v1/streams lists them")
-        return self._streams[name]
-
-    def _spec(self, wanted: NewStream) -> StreamSpec:
-        try:
-            spec = spec_of(wanted)
-        except InvalidSetting as error:
-            raise Unprocessable(str(error)) from error
-        others = [stream.spec for name, stream in self._streams.items() if name != wanted.name]
-        return assigned([*others, spec], gpus())[-1]
-
-
-class StreamDisplays:
-    """Pictures of streams for viewers. Slow viewers skip pictures and get the newest."""
-
-    def __init__(self, streams: SupervisedStreams) -> None:
-        self._streams = streams
+        stream = self._stream(name)
+        if not stream.processes:
+            raise self._is_stopped(name)
+        state = stream.engine.state
+        if state.state != "running":
+            raise Conflict(f"the engine of {name} is {state.state}: {state.reason}; ask again when the stream is live")
+        return stream.engine
 
     @asynccontextmanager
     async def subscribe(
-        self, stream: str, kind: PictureKind, quality: int
+        self, name: str, kind: PictureKind, quality: int
     ) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
-        """Subscribe to the pictures of a stream. The iterator ends when the stream is deleted.
+        """Subscribe to the pictures of a stream. A slow viewer skips pictures and gets the newest. The
+        iterator ends when the stream is stopped.
 
         Args:
-            stream: name of the stream.
+            name: name of the stream.
             kind: picture to receive.
             quality: JPEG quality.
 
         Raises:
-            Conflicting: if the stream does not run.
+            NotFound: if the stream does not exist.
+            Conflict: if the stream does not run.
         """
-        hub = self._streams.hub(stream)
+        hub = self._stream(name).hub
         if hub is None:
-            raise Conflicting(f"the stream {stream} is stopped; start it first")
+            raise self._is_stopped(name)
         async with hub.subscribe(kind, quality) as viewer:
             yield viewer
+
+    def _is_stopped(self, name: str) -> Conflict:
+        return Conflict(f"the stream {name} is stopped; start it first")
+
+    async def _stop(self, stream: Stream, reason: str) -> None:
+        async with stream.changing:
+            await stream.stop(reason)
+
+    def _stream(self, name: str) -> Stream:
+        if name not in self._streams:
+            raise NotFound("there is no stream with this name; GET /v1/streams lists them")
+        return self._streams[name]
+
+    def _specs(self, name: str, settings: StreamSettings) -> dict[Role, ProcessSpec]:
+        try:
+            specs = specs_of(name, settings)
+        except InvalidSetting as error:
+            raise Rejected(str(error)) from error
+        others = [each.specs["engine"].engine for other, each in self._streams.items() if other != name]
+        engine = specs["engine"].engine
+        assert engine is not None
+        placed = assigned(engine, [each for each in others if each is not None], gpus())
+        return {**specs, "engine": specs["engine"].model_copy(update={"engine": placed})}
 
 
 LOOK_S = 0.25
@@ -462,11 +391,11 @@ class ShownModels:
 
     async def _follow(self) -> None:
         while True:
-            for stream in self._streams.running_streams():
+            for stream in self._streams.streams():
                 try:
                     await self.look_at(stream)
                 except (BusError, RegistryError) as error:
-                    log.warning("%s does not show its model: %s", stream.wanted.name, error)
+                    log.warning("%s does not show its model: %s", stream.name, error)
             await asyncio.sleep(LOOK_S)
 
     async def look_at(self, stream: Stream) -> None:
@@ -476,30 +405,30 @@ class ShownModels:
             BusError: if the engine does not answer.
             RegistryError: if the registry fails.
         """
-        kind, _, name = stream.wanted.show.partition(" ")
-        supervisor = stream.supervisor
-        if kind != "model" or supervisor is None:
+        kind, _, name = stream.settings.show.partition(" ")
+        if kind != "model" or not stream.processes:
             return
-        engine = supervisor.state().engine
+        process = stream.engine
+        engine = process.state
         if engine.state != "running":
             return
-        await self._roll_back_if_given_up(stream.wanted.name, engine.figures)
+        await self._roll_back_if_given_up(stream.name, engine.figures)
         active = await asyncio.to_thread(self._registry.active, name)
         shown = engine.figures.get("model") or {}
         if active is None or (shown.get("name"), shown.get("version")) == (name, active.version):
             return
-        now_s, which = asyncio.get_running_loop().time(), (stream.wanted.name, name, active.version)
+        now_s, which = asyncio.get_running_loop().time(), (stream.name, name, active.version)
         if now_s - self._refused.get(which, -AGAIN_S) < AGAIN_S:
             return
         folder = await asyncio.to_thread(self._registry.folder_of, name, active.version)
         wanted = {"folder": str(folder), "version": active.version, "name": name, "most_ms": MOST_MS}
         try:
-            await supervisor.command("engine", "show_model", timeout_s=PREPARE_S, **wanted)
+            await process.command("show_model", timeout_s=PREPARE_S, **wanted)
         except BusError:
             self._refused[which] = now_s
             raise
-        self._requests[stream.wanted.name] = ModelRequest(name, active.version, _given_up(engine.figures))
-        log.info("%s shows %s/%d", stream.wanted.name, name, active.version)
+        self._requests[stream.name] = ModelRequest(name, active.version, _given_up(engine.figures))
+        log.info("%s shows %s/%d", stream.name, name, active.version)
 
     async def _roll_back_if_given_up(self, stream: str, figures: Mapping[str, Any]) -> None:
         """Roll back the active version if the engine reports that it cannot be displayed."""

@@ -1,9 +1,10 @@
-"""Runtime of capture and engine processes: exclusive role, heartbeats, commands, orderly stop, priority and temporary folder."""
+"""Capture and engine processes: their specification, and their runtime with exclusive role, heartbeats, commands, orderly stop and priority."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import logging
 import os
 import shutil
@@ -13,13 +14,173 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
+
+from gsplat_core.errors import InvalidSetting
+from operators.options import Option, Section, options_for
+from operators.settings import CallerCaptureOptions, CallerEngineOptions, check_stream_options
+from operators.sources.registry import check_address
 from services.bus.messages import CommandServer, Handler, Heartbeats
-from services.bus.runtime import Role, StreamFolder
-from services.supervisor.specs import ProcessSpec
+from services.bus.runtime import Role, StreamFolder, read_json, write_json
+from services.errors import BadMessage
+from services.settings import StreamSettings
+
+StreamName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+NVIDIA = Path("/proc/driver/nvidia/gpus")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceSpec(CallerCaptureOptions):
+    """Source of a stream and the processing in the capture process."""
+
+    address: Annotated[str, Option("Source address in the format of `intrasplat live`", commands=(), least_length=1)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineSpec(CallerEngineOptions):
+    """Reconstruction settings of a stream."""
+
+    gpu: Annotated[
+        int | None,
+        Option("Index of the GPU (`CUDA_VISIBLE_DEVICES`)", commands=(), null="the first one", ge=0, le=1023),
+    ] = None
+
+
+class _Strict(BaseModel):
+    """Base class of the specifications. Rejects unknown fields and type conversions, such as true
+    for the number 1."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class ProcessLimits(_Strict):
+    """Time limits of stream processes, in seconds."""
+
+    orphan_after_s: float = Field(default=600.0, gt=0)
+    """Time without supervisor requests after which a process ends itself."""
+    drain_s: float = Field(default=10.0, gt=0)
+    """Time from a stop request to the kill."""
+    start_s: float = Field(default=120.0, gt=0)
+    """Time from the process start to the first heartbeat."""
+    heartbeat_s: float = Field(default=3.0, gt=0)
+    """Time without heartbeats after which a process counts as hung."""
+    hung_s: float = Field(default=10.0, gt=0)
+    """Time without publications after which an engine counts as hung, once it has shown a picture.
+    A working engine at least repeats its last picture."""
+
+
+class ProcessSpec(_Strict):
+    """Specification of one process of a stream, written to a file by the supervisor and read by the process.
+
+    Exactly one of `capture` and `engine` is given. Construction raises pydantic's ValidationError for invalid values.
+    """
+
+    stream: StreamName
+    capture: SourceSpec | None = None
+    engine: EngineSpec | None = None
+    limits: ProcessLimits = ProcessLimits()
+
+    @model_validator(mode="after")
+    def _for_one_role(self) -> ProcessSpec:
+        if (self.capture is None) == (self.engine is None):
+            raise ValueError("give either capture or engine")
+        return self
+
+    @property
+    def role(self) -> Role:
+        """Return the role of the process."""
+        return "engine" if self.capture is None else "capture"
+
+    @property
+    def digest(self) -> str:
+        """Return a digest that changes if the process has to be restarted."""
+        return hashlib.sha256(repr(self._content()).encode()).hexdigest()
+
+    def _content(self) -> dict[str, Any]:
+        part = self.capture or self.engine
+        assert part is not None
+        return {"stream": self.stream, self.role: asdict(part), "limits": self.limits.model_dump(mode="json")}
+
+    def write(self, folder: StreamFolder) -> Path:
+        """Write the file, readable by its owner only because the address may contain a password."""
+        path = folder.spec(self.role)
+        write_json(path, self._content())
+        return path
+
+    @staticmethod
+    def read(path: Path, role: Role) -> ProcessSpec:
+        """Read a file written by `write`.
+
+        Raises:
+            InvalidSetting: if the file is unreadable, invalid or for another role.
+        """
+        try:
+            spec = ProcessSpec.model_validate(read_json(path))
+        except OSError as error:
+            raise InvalidSetting(f"{path} cannot be read: {error.strerror}") from None
+        except BadMessage as error:
+            raise InvalidSetting(f"{path} is damaged: {error}") from None
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise InvalidSetting(f"{path}: {where}: {first['msg']}") from None
+        if spec.role != role:
+            raise InvalidSetting(f"{path} is for the {spec.role} process, and this is the {role} process")
+        return spec
+
+
+def specs_of(name: str, stream: StreamSettings, limits: ProcessLimits | None = None) -> dict[Role, ProcessSpec]:
+    """Build the specifications of a stream's processes from its settings.
+
+    Raises:
+        InvalidSetting: if an option is unknown or out of range, or the source cannot be opened.
+    """
+    options = {name: value for name, value in stream.options.items() if value is not None}
+    check_stream_options(options)
+    check_address(stream.source)
+    kind, _, number = stream.device.partition(":")
+    if kind == "auto":
+        kind = "cuda" if gpus() else "cpu"
+
+    def of(section: type[Section]) -> dict[str, Any]:
+        return {name: value for name, value in options.items() if name in options_for(section, "stream")}
+
+    device: Any = kind
+    engine = EngineSpec(device=device, gpu=int(number) if number else None, **of(EngineSpec))
+    source = SourceSpec(address=stream.source, **of(SourceSpec))
+    limits = limits or ProcessLimits()
+    return {
+        "capture": ProcessSpec(stream=name, capture=source, limits=limits),
+        "engine": ProcessSpec(stream=name, engine=engine, limits=limits),
+    }
+
+
+def gpus() -> int:
+    """Return the number of NVIDIA GPUs from the driver's files, without loading a library."""
+    return len(list(NVIDIA.iterdir())) if NVIDIA.is_dir() else 0
+
+
+def assigned(engine: EngineSpec, others: list[EngineSpec], gpus: int) -> EngineSpec:
+    """Assign the least loaded GPU to a CUDA engine that names none.
+
+    Args:
+        engine: the engine.
+        others: engines of the other streams.
+        gpus: number of GPUs.
+    """
+    if gpus < 1 or engine.device != "cuda" or engine.gpu is not None:
+        return engine
+    load = [0] * gpus
+    for each in others:
+        if each.device == "cuda" and each.gpu is not None and each.gpu < gpus:
+            load[each.gpu] += 1
+    return replace(engine, gpu=load.index(min(load)))
+
 
 ENGINE_ON_CPU = 5
 """Nice value of an engine that trains on the CPU, which uses all available time. Capture, viewers
@@ -221,24 +382,3 @@ class Worker:
                     log.error("not finished within %g s; ended", limits.drain_s)
                     self.folder.clean(self.role)
                     os._exit(1)
-
-
-def stream_folder_of(spec_file: Any, role: Role) -> tuple[StreamFolder, ProcessSpec]:
-    """Read the specification file of a process.
-
-    Returns:
-        The stream's runtime folder and the specification.
-
-    Raises:
-        InvalidSetting: if the file is invalid or for another role.
-        RuntimeFolderUnusable: if the runtime folder cannot be used.
-    """
-    from pathlib import Path
-
-    from gsplat_core.errors import InvalidSetting
-
-    path = Path(os.path.abspath(spec_file))
-    spec = ProcessSpec.read(path)
-    if spec.role != role:
-        raise InvalidSetting(f"{path} is for the {spec.role} process, and this is the {role} process")
-    return StreamFolder(path.parent), spec

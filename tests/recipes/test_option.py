@@ -30,13 +30,13 @@ sys.meta_path.sort(key=lambda finder: finder is not PathFinder)
 import services.cli.runs
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
 from services.cli.app import run
-from services.api.parts import NewStream
+from services.bus.runtime import StreamFolder
+from services.settings import StreamSettings
 from services.api.replays import ReplayRequest
 from services.api.streams import StreamRequest
-from services.supervisor.stream_specs import spec_of
 from services.settings import load_settings
 from services.supervisor.engine import live_settings
-from services.supervisor.specs import ProcessSpec
+from services.supervisor.worker import ProcessSpec, specs_of
 
 recording, folder = Path(sys.argv[1]), Path(sys.argv[2])
 values = {}
@@ -73,10 +73,9 @@ assert run(["replay", str(recording), "--out", str(folder / "a"), "--example", "
 
 
 def of_stream(name, source, device, options):
-    spec = spec_of(NewStream(name, source, "live", device, options))
-    path = folder / "spec.json"
-    path.write_text(json.dumps({**spec.part("engine"), "digest": ""}))
-    return live_at_the_operator(live_settings(ProcessSpec.read(path).engine, folder / "b", "camera"))
+    spec = specs_of(name, StreamSettings(source=source, device=device, options=options))["engine"]
+    path = spec.write(StreamFolder(folder / "stream"))
+    return live_at_the_operator(live_settings(ProcessSpec.read(path, "engine").engine, folder / "b", "camera"))
 
 
 file = folder / "settings.yaml"

@@ -15,12 +15,11 @@ from operators.options import options_for
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
 from operators.sources.registry import SOURCES
 from services.api import streams
-from services.api.parts import NewStream
 from services.cli import app as command_line
 from services.schemas.replays import ReplayRequest
 from services.schemas.streams import StreamRequest
-from services.settings import SettingsInvalid, load_settings
-from services.supervisor.stream_specs import spec_of
+from services.settings import SettingsInvalid, StreamSettings, load_settings
+from services.supervisor.worker import specs_of
 
 NAMES = [
     *(("field", name) for name in FIELDS),
@@ -93,8 +92,8 @@ def test_every_name_is_accepted_everywhere(option, name, given, network, tmp_pat
     listed = load_settings(file).streams["a"]
     asked = StreamRequest.model_validate({"name": "a", "source": "synthetic:", "options": {option: value}})
     for stream in (listed, asked):
-        spec = spec_of(NewStream("a", stream.source, "live", "cpu", stream.options))
-        assert getattr(spec.engine, option) == value
+        engine = specs_of("a", stream)["engine"].engine
+        assert getattr(engine, option) == value
 
 
 @pytest.mark.parametrize(
@@ -113,8 +112,9 @@ def test_a_name_that_there_is_not_is_refused_everywhere(option, tmp_path, capsys
     (tmp_path / "settings.yaml").write_text(json.dumps(options))
     with pytest.raises(SettingsInvalid, match=r"line 1: .*(is 'nope'; choose|has no option 'device')"):
         load_settings(tmp_path / "settings.yaml")
+    settings = StreamSettings(source="synthetic:").model_copy(update={"options": {option: "nope"}})
     with pytest.raises(InvalidSetting, match=r"nope|has no option 'device'"):
-        spec_of(NewStream("a", "synthetic:", "live", "cpu", {option: "nope"}))
+        specs_of("a", settings)
 
 
 def test_names_that_are_added_at_run_time_are_accepted_and_documented():

@@ -10,9 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from services.api.parts import NewStream, Parts
 from services.api.problems import Conflicting, Missing, Unprocessable
+from services.api.state import Parts
 from services.display.hub import EncodedPicture
+from services.schemas.streams import StreamView
+from services.settings import StreamSettings
 
 
 class NotThere(Exception):
@@ -103,60 +105,54 @@ class FakeModels:
         del self.kept[name][version]
 
 
-@dataclass(frozen=True)
-class FakeStream:
-    name: str
-    source: str
-    show: str
-    device: str
-    options: Mapping[str, Any]
-    state: str = "stopped"
-    reason: str | None = None
-    processes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+def stream_view(name: str, **values: Any) -> StreamView:
+    """Return a stream with the given values."""
+    about = {"source": "synthetic:", "show": "live", "device": "cpu", "options": {}, "state": "stopped", **values}
+    return StreamView(name=name, **about)
 
 
 class FakeStreams:
     def __init__(self) -> None:
-        self.kept: dict[str, FakeStream] = {}
+        self.kept: dict[str, StreamView] = {}
+        self.created: dict[str, StreamSettings] = {}
 
-    async def all(self) -> list[FakeStream]:
+    def all(self) -> list[StreamView]:
         return list(self.kept.values())
 
-    async def get(self, name: str) -> FakeStream:
+    def get(self, name: str) -> StreamView:
         if name not in self.kept:
             raise Missing(f"there is no stream {name}")
         return self.kept[name]
 
-    async def create(self, stream: NewStream) -> FakeStream:
-        if stream.name in self.kept:
-            raise Conflicting(f"a stream named {stream.name} already exists")
-        self.kept[stream.name] = FakeStream(stream.name, stream.source, stream.show, stream.device, stream.options)
-        return self.kept[stream.name]
-
-    async def start(self, name: str) -> FakeStream:
-        return await self._in_state(name, "live")
-
-    async def stop(self, name: str) -> FakeStream:
-        return await self._in_state(name, "stopped")
-
-    async def set_options(self, name: str, options: Mapping[str, Any]) -> FakeStream:
-        if "unknown" in options:
-            raise Unprocessable("there is no option unknown; the nearest is tool_mask")
-        stream = await self.get(name)
-        self.kept[name] = replace(stream, options={**stream.options, **options})
+    def create(self, name: str, settings: StreamSettings) -> StreamView:
+        if name in self.kept:
+            raise Conflicting(f"a stream named {name} already exists")
+        self.created[name] = settings
+        self.kept[name] = stream_view(name, **settings.model_dump(include={"source", "show", "device", "options"}))
         return self.kept[name]
 
+    async def start(self, name: str) -> StreamView:
+        return self._changed(name, state="live")
+
+    async def stop(self, name: str) -> StreamView:
+        return self._changed(name, state="stopped")
+
+    async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamView:
+        if "unknown" in options:
+            raise Unprocessable("there is no option unknown; the nearest is tool_mask")
+        return self._changed(name, options={**self.get(name).options, **options})
+
     async def delete(self, name: str) -> None:
-        await self.get(name)
+        self.get(name)
         del self.kept[name]
 
     async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
-        await self.get(name)
+        self.get(name)
         self.camera = dict(camera)
         return camera
 
-    async def _in_state(self, name: str, state: str) -> FakeStream:
-        self.kept[name] = replace(await self.get(name), state=state)
+    def _changed(self, name: str, **values: Any) -> StreamView:
+        self.kept[name] = self.get(name).model_copy(update=values)
         return self.kept[name]
 
 

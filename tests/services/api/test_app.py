@@ -14,9 +14,10 @@ from fastapi.routing import iter_route_contexts
 
 from services.api.guard import rule_of
 from services.api.pages import SWAGGER_FILES, SWAGGER_UI
-from services.api.parts import CheckResult, Parts
 from services.api.problems import PROBLEM_JSON, Problem
+from services.api.state import Parts
 from services.auth.roles import Role
+from services.schemas.service import CheckResult
 
 ROOT = Path(__file__).resolve().parents[3]
 PUBLIC = {"/livez", "/readyz", "/openapi.json", "/docs", "/docs/{file}"}

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from services.api import Parts, new_app
-from services.api.health import MOST_CONNECTIONS, MOST_HEAD_BYTES, ProbeListener, bind_probe
 from services.api.middleware import network_of_address
 from services.api.server import AddressBound, BoundedListener, DrainingServer, bind, config_of
+from services.api.service import MOST_CONNECTIONS, MOST_HEAD_BYTES, ProbeListener, bind_probe
 from services.errors import CannotServe
 from services.settings import ServiceSettings
 from tests.services.api.conftest import fakes
@@ -172,7 +172,7 @@ def test_a_head_has_a_time_whatever_trickles_in(served):
 
 
 def test_the_probe_says_what_the_service_says(served):
-    from services.api.parts import CheckResult
+    from services.schemas.service import CheckResult
 
     async def broken():
         return CheckResult(False, "no database")

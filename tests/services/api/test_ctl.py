@@ -13,17 +13,17 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 import uvicorn
-from control_fakes import FakeStream, fake_parts
+from control_fakes import fake_parts, stream_view
 
 from gsplat_core.errors import InvalidSetting
 from services.api import new_app
-from services.api.parts import CheckResult
 from services.cli import ctl as ctl_module
 from services.cli.app import run
 from services.cli.ctl import moment, stream_row
 from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.terminal import table
 from services.client import Client
+from services.schemas.service import CheckResult
 from services.schemas.streams import StreamView
 from services.settings import ServiceSettings
 
@@ -42,9 +42,7 @@ def service(tmp_path, monkeypatch) -> Iterator[Client]:
     for name in [name for name in os.environ if name.startswith("INTRASPLAT_")]:
         monkeypatch.delenv(name)
     parts = fake_parts(checks={"camera": lambda: answered(CheckResult(False, "theatre-1: its source is lost", False))})
-    parts.streams.kept["theatre-1"] = FakeStream(
-        "theatre-1", "synthetic:", "live", "cpu", {}, state="live", processes=PROCESSES
-    )
+    parts.streams.kept["theatre-1"] = stream_view("theatre-1", state="live", processes=PROCESSES)
     app = new_app(ServiceSettings(paths={"data": tmp_path / "data"}), parts)
     server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, ws="none"))
     thread = threading.Thread(target=server.run)

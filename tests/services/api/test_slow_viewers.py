@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from control_fakes import FakeDisplay, FakeStream, fake_parts
+from control_fakes import FakeDisplay, fake_parts, stream_view
 
 from services.api import new_app
 from services.api.server import DrainingServer, bind, config_of
@@ -23,7 +23,7 @@ PICTURE = 300_000
 def served(tmp_path) -> Iterator[tuple[int, str, FakeDisplay, DrainingServer]]:
     display = FakeDisplay(jpeg=bytes(PICTURE))
     parts = fake_parts(display=display)
-    parts.streams.kept["endoscope"] = FakeStream("endoscope", "synthetic:", "live", "cpu", {}, "live")
+    parts.streams.kept["endoscope"] = stream_view("endoscope", state="live")
     settings = ServiceSettings(
         paths={"data": tmp_path}, server={"port": 0, "drain_s": 2}, limits={"viewer_stall_s": 0.5}
     )

@@ -35,7 +35,7 @@ def test_passwords_of_sources_are_shown_to_nobody(new_plane):
     )
     made = plane.ask("POST", "/v1/streams", json={"name": "camera", "source": address})
     assert made.status_code == 201
-    assert plane.parts.streams.kept["camera"].source == address
+    assert plane.parts.streams.created["camera"].source == address
     for answer in (made, plane.ask("GET", "/v1/streams/camera"), plane.ask("GET", "/v1/config")):
         assert not any(secret in answer.text for secret in ("pa55", "s3cret", "dbpass", "s3key"))
         assert "10.0.0.5" in answer.text

@@ -8,8 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from services.api.problems import Conflicting
-from services.errors import CommandRefused, NoSnapshot
+from services.errors import CommandRefused, Conflict, NoSnapshot
 from services.exports.snapshots import Snapshot, SnapshotStore, StreamSnapshots, described
 
 SAID = {"seq": 7, "model_version": 3, "gaussians": 12, "time_window_s": [1.0, 2.0], "pause_ms": 0.4, "more": 1}
@@ -100,9 +99,9 @@ def test_a_refused_snapshot_does_not_show_a_path_of_the_server(tmp_path):
     async def refuse(*_: object, folder: str, **__: object) -> None:
         raise CommandRefused(f"cannot write the model to {folder}: No space left on device; free space")
 
-    streams = SimpleNamespace(with_engine=lambda stream: SimpleNamespace(command=refuse))
+    streams = SimpleNamespace(engine=lambda stream: SimpleNamespace(command=refuse))
     snapshots = StreamSnapshots(cast(Any, streams), cast(Any, None), SnapshotStore(tmp_path))
-    with pytest.raises(Conflicting, match="No space left") as caught:
+    with pytest.raises(Conflict, match="No space left") as caught:
         asyncio.run(snapshots.take("a", None, "somebody"))
     assert str(tmp_path) not in str(caught.value)
     assert list(tmp_path.iterdir()) == []

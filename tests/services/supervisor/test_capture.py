@@ -19,7 +19,7 @@ from operators.sources.source import SourceState
 from services.supervisor import capture as capture_module
 from services.supervisor.capture import Capture
 from services.supervisor.launcher import FAILED
-from services.supervisor.specs import SourceSpec
+from services.supervisor.worker import SourceSpec
 
 
 class FakeWorker:
@@ -76,7 +76,7 @@ def video_url(tmp_path):
 CAPTURE_COUNTED = """
 import os, sys, threading
 from services.supervisor.capture import Capture
-from services.supervisor.specs import SourceSpec
+from services.supervisor.worker import SourceSpec
 from tests.services.supervisor.test_capture import FakePublisher, FakeWorker
 
 started = []

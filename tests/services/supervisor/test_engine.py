@@ -11,8 +11,7 @@ from gsplat_core.errors import InvalidSetting
 from operators.errors import SourceUnavailable
 from services.supervisor import engine as engines
 from services.supervisor.launcher import NO_USE
-from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
-from services.supervisor.worker import ENGINE_ON_CPU
+from services.supervisor.worker import ENGINE_ON_CPU, EngineSpec, ProcessSpec
 
 
 def test_every_setting_of_the_specification_reaches_the_session(tmp_path):
@@ -228,8 +227,7 @@ def test_figures_of_a_graph_before_and_while_it_runs():
 )
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_the_exit_code_tells_the_supervisor_if_a_restart_is_of_use(runtime, monkeypatch, error, code, device):
-    spec = StreamSpec(name="a", source=SourceSpec(address="synthetic:"), engine=EngineSpec(device=device))
-    path = spec.write("engine", runtime.stream("a"))
+    path = ProcessSpec(stream="a", engine=EngineSpec(device=device)).write(runtime.stream("a"))
     publisher, seen = Recorder(), {}
 
     def show(worker, engine, screen, layers, again):

@@ -10,7 +10,7 @@ from gsplat_core.scene.cameras import Camera
 from operators.applications.working_size import choose_working_size
 from operators.sources.source import SourceDescription
 from services.supervisor.engine import SHARE_OF_INTERVAL, engine_scale
-from services.supervisor.specs import EngineSpec
+from services.supervisor.worker import EngineSpec
 
 
 def stream(width_px=640, height_px=512, fps=30.0):

@@ -20,7 +20,7 @@ from services.errors import BadMessage, CommandRefused
 from services.supervisor import model_show
 from services.supervisor.model_show import LATE_IN_A_ROW, FinishedModel, ModelShow, NotFinite
 from services.supervisor.screen import Screen
-from services.supervisor.specs import EngineSpec
+from services.supervisor.worker import EngineSpec
 
 COLOURS = {1: (0.9, 0.1, 0.1), 2: (0.1, 0.9, 0.1), 3: (0.1, 0.1, 0.9)}
 SOON_S = 300.0

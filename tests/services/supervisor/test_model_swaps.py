@@ -14,9 +14,10 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from services.bus.pictures import picture_from, subscribe
+from services.settings import StreamSettings
 from services.supervisor.launcher import Direct
-from services.supervisor.specs import SourceSpec, StreamSpec
-from services.supervisor.stream import StreamSupervisor
+from services.supervisor.stream import Stream
+from services.supervisor.worker import specs_of
 
 pytestmark = pytest.mark.slow
 
@@ -49,19 +50,19 @@ async def watch(endpoint: str, seen: list[tuple[str, int, str]]) -> None:
 
 def test_no_picture_is_of_two_models_and_none_of_another_than_it_says(runtime, bundles):
     async def scenario() -> None:
-        spec = StreamSpec(name="a", source=SourceSpec(address="synthetic:?width=64&height=64&frames=3&fps=20"))
-        stream = StreamSupervisor(spec, runtime, start=Direct())
+        settings = StreamSettings(source="synthetic:?width=64&height=64&frames=3&fps=20", device="cpu")
+        stream = Stream(settings, specs_of("a", settings), runtime, start=Direct())
         await stream.start()
         seen: list[tuple[str, int, str]] = []
         watching = asyncio.create_task(watch(stream.folder.pictures("engine"), seen))
         try:
             async with asyncio.timeout(SOON_S):
-                while stream.state().engine.state != "running":
+                while stream.engine.state.state != "running":
                     await asyncio.sleep(0.02)
 
                 async def show(version: int) -> None:
                     where = {"folder": str(bundles[version]), "version": version, "name": "wall"}
-                    await stream.command("engine", "show_model", timeout_s=30.0, **where)
+                    await stream.engine.command("show_model", timeout_s=30.0, **where)
                     while not seen or seen[-1][:2] != ("model", version):
                         await asyncio.sleep(0.005)
 
@@ -69,7 +70,7 @@ def test_no_picture_is_of_two_models_and_none_of_another_than_it_says(runtime, b
                 began = next(index for index, each in enumerate(seen) if each[0] == "model")
                 for swap in range(SWAPS):
                     if swap % 3 == 2:  # back to the one before, which is still in memory
-                        version = (await stream.command("engine", "show_previous"))["version"]
+                        version = (await stream.engine.command("show_previous"))["version"]
                         while seen[-1][:2] != ("model", version):
                             await asyncio.sleep(0.005)
                     else:

@@ -13,7 +13,7 @@ from services.errors import NoAnswer
 from services.supervisor import process as processes
 from services.supervisor.launcher import Direct
 from services.supervisor.process import ManagedProcess, Rate
-from services.supervisor.specs import EngineSpec, ProcessLimits, SourceSpec, StreamSpec
+from services.supervisor.worker import EngineSpec, ProcessLimits, ProcessSpec, SourceSpec
 
 
 @pytest.fixture
@@ -24,9 +24,10 @@ def clock(monkeypatch):
 
 
 def managed(runtime, role="engine", start=None, **spec: Any) -> ManagedProcess:
-    values = {"name": "theatre", "source": SourceSpec(address="synthetic:"), **spec}
+    part = {"capture": SourceSpec(address="synthetic:")} if role == "capture" else {"engine": EngineSpec()}
     events: list[Any] = []
-    process = ManagedProcess(StreamSpec(**values), role, runtime.stream("theatre"), start or Direct(), events.append)
+    spec = {"stream": "theatre", **part, **spec}
+    process = ManagedProcess(ProcessSpec(**spec), runtime.stream("theatre"), start or Direct(), events.append)
     process.events = events  # type: ignore[attr-defined]
     return process
 
@@ -146,7 +147,7 @@ def test_an_engine_gets_its_gpu_alone(runtime):
     assert managed(runtime, engine=EngineSpec(gpu=1))._environment() == {"CUDA_VISIBLE_DEVICES": "1"}
     assert managed(runtime, engine=EngineSpec(gpu=0))._environment() == {"CUDA_VISIBLE_DEVICES": "0"}
     assert managed(runtime)._environment() == {}
-    assert managed(runtime, "capture", engine=EngineSpec(gpu=1))._environment() == {}
+    assert managed(runtime, "capture")._environment() == {}
 
 
 class Identity:
@@ -271,21 +272,20 @@ def test_a_log_that_has_grown_too_long_is_begun_anew(runtime, size, kept):
 
 def test_a_process_that_does_not_run_takes_no_command(runtime):
     with pytest.raises(NoAnswer, match="the engine process of theatre does not run: it was not started"):
-        asyncio.run(managed(runtime).command("ping", 1.0, {}))
+        asyncio.run(managed(runtime).command("ping"))
 
 
-@pytest.mark.parametrize("stop", [True, False])
-def test_closing_ends_the_process_only_when_asked(runtime, stop):
+def test_closing_ends_the_process(runtime):
     async def close() -> tuple[Any, Identity]:
         process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
         process._identity = identity  # type: ignore[assignment]
-        await process.close(stop=stop, reason="why")
+        await process.close("why")
         return process, identity
 
     process, identity = asyncio.run(close())
-    assert bool(identity.signals) is stop
+    assert identity.signals
     ((event),) = process.events
     assert (event.stream, event.role, event.kind, event.reason, event.pid) == (
-        "theatre", "engine", "stopped" if stop else "left", "why", 7,
+        "theatre", "engine", "stopped", "why", 7,
     )  # fmt: skip
     assert (process.state.state, process.state.reason, process.state.pid) == ("stopped", "why", None)

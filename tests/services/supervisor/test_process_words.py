@@ -12,7 +12,7 @@ from services.supervisor import process as processes
 from services.supervisor.launcher import Direct, last_words
 from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import SOURCE_GONE, ManagedProcess
-from services.supervisor.specs import SourceSpec, StreamSpec
+from services.supervisor.worker import ProcessSpec, SourceSpec
 
 LOGGED = "2026-11-23 19:00:00,123 {} services.supervisor.capture: {}\n"
 
@@ -42,8 +42,8 @@ def capture(runtime, monkeypatch):
     """A capture process of which only heartbeats are heard, its events, and a clock."""
     events, now_s = [], [100.0]
     monkeypatch.setattr(processes.time, "monotonic", lambda: now_s[0])
-    spec = StreamSpec(name="theatre", source=SourceSpec(address="synthetic:"))
-    managed = ManagedProcess(spec, "capture", runtime.stream("theatre"), Direct(), events.append)
+    spec = ProcessSpec(stream="theatre", capture=SourceSpec(address="synthetic:"))
+    managed = ManagedProcess(spec, runtime.stream("theatre"), Direct(), events.append)
 
     def beat(state: str, seconds: float = 0.25) -> list[str]:
         now_s[0] += seconds

@@ -1,3 +1,5 @@
+"""Specifications of stream processes, and the assignment of GPUs."""
+
 from __future__ import annotations
 
 import stat
@@ -7,34 +9,37 @@ from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
 from services.bus.runtime import write_json
-from services.supervisor.specs import EngineSpec, ProcessSpec, SourceSpec, StreamSpec, assigned
+from services.supervisor.worker import EngineSpec, ProcessLimits, ProcessSpec, SourceSpec, assigned
 
 
-def spec(**changes) -> StreamSpec:
-    return StreamSpec(**{"name": "a", "source": SourceSpec(address="synthetic:"), **changes})
+def spec(**changes) -> ProcessSpec:
+    return ProcessSpec(**{"stream": "a", "capture": SourceSpec(address="synthetic:"), **changes})
 
 
-def test_a_process_reads_its_part(runtime):
-    folder = runtime.stream("a")
-    wanted = spec(engine=EngineSpec(device="cuda", gpu=3))
-    path = wanted.write("engine", folder)
+def test_a_process_reads_its_specification(runtime):
+    wanted = ProcessSpec(stream="a", engine=EngineSpec(device="cuda", gpu=3))
+    path = wanted.write(runtime.stream("a"))
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    read = ProcessSpec.read(path)
-    assert (read.engine, read.capture, read.digest) == (wanted.engine, None, wanted.digest("engine"))
-    assert b"synthetic" not in path.read_bytes()
+    read = ProcessSpec.read(path, "engine")
+    assert (read, read.digest, read.role) == (wanted, wanted.digest, "engine")
 
 
-def test_the_digest_changes_with_the_part_alone():
-    one, other = spec(), spec(engine=EngineSpec(seed=1))
-    assert one.digest("capture") == other.digest("capture")
-    assert one.digest("engine") != other.digest("engine")
-    assert one.digest("capture") != one.digest("engine")
+def test_the_digest_changes_with_the_settings():
+    changed = spec(capture=SourceSpec(address="synthetic:", fps=5.0)), spec(limits=ProcessLimits(drain_s=1.0))
+    assert spec().digest == spec().digest
+    assert len({each.digest for each in (spec(), *changed, spec(stream="b"))}) == 4
 
 
 @pytest.mark.parametrize("name", ["", "A", "../x", "a/b", ".", "-a", "x" * 33, "a\n", "ä"])
 def test_names_that_are_no_names(name):
     with pytest.raises(ValidationError):
-        spec(name=name)
+        spec(stream=name)
+
+
+@pytest.mark.parametrize("parts", [{"capture": None}, {"engine": EngineSpec()}])
+def test_a_process_has_one_role(parts):
+    with pytest.raises(ValidationError, match="either capture or engine"):
+        spec(**parts)
 
 
 @pytest.mark.parametrize(
@@ -47,34 +52,28 @@ def test_sources_that_are_none(wrong):
 
 def test_a_file_that_is_none_is_refused_in_one_sentence(runtime):
     with pytest.raises(InvalidSetting, match="cannot be read"):
-        ProcessSpec.read(runtime.path / "none")
+        ProcessSpec.read(runtime.path / "none", "capture")
     path = runtime.path / "wrong"
-    write_json(path, {**spec().part("capture"), "digest": "", "capture": {"address": "x", "scale": 9}})
+    write_json(path, {"stream": "a", "capture": {"address": "x", "scale": 9}})
     with pytest.raises(InvalidSetting, match=r"capture\.scale"):
-        ProcessSpec.read(path)
+        ProcessSpec.read(path, "capture")
+    path.write_text("{")
+    with pytest.raises(InvalidSetting, match="is damaged"):
+        ProcessSpec.read(path, "capture")
+    with pytest.raises(InvalidSetting, match="is for the capture process, and this is the engine process"):
+        ProcessSpec.read(spec().write(runtime.stream("a")), "engine")
 
 
 def test_streams_are_spread_over_gpus():
     cuda, fixed, cpu = EngineSpec(device="cuda"), EngineSpec(device="cuda", gpu=0), EngineSpec()
-    streams = [spec(engine=engine) for engine in (cuda, cpu, fixed, cuda, cuda)]
-    assert [each.engine.gpu for each in assigned(streams, 2)] == [1, None, 0, 0, 1]
-    assert assigned(streams, 0) == streams
+    placed: list[EngineSpec] = []
+    for engine in (cpu, fixed, cuda, cuda, cuda):
+        placed.append(assigned(engine, placed, 2))
+    assert [each.gpu for each in placed] == [None, 0, 1, 0, 1]
+    assert assigned(cuda, placed, 0) == cuda
 
 
 def test_an_address_that_is_refused_is_not_repeated():
     with pytest.raises(InvalidSetting, match=r"^address is not valid; ") as refused:
         SourceSpec(address="rtsp://user:swordfish@camera/" + 5000 * "x")
     assert "swordfish" not in str(refused.value)
-
-
-def test_a_file_of_an_earlier_version_loads(runtime):
-    engine = {
-        "device": "cuda", "gpu": 1, "engine_scale": None, "field": "auto", "renderer": "alpha", "seed": 7, "budget_ms": 20.0,
-        "tool_mask": "none", "depth": "stereo", "eyes": "left", "poses": "given", "out_of_body": "off",
-    }  # fmt: skip
-    capture = {"address": "synthetic:", "scale": 0.5, "fps": None, "loop": True}
-    for role, part in (("engine", engine), ("capture", capture)):
-        path = runtime.path / role
-        write_json(path, {**spec().part(role), "digest": "", role: part})
-        read = getattr(ProcessSpec.read(path), role)
-        assert {name: getattr(read, name) for name in part} == part

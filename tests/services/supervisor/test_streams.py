@@ -21,19 +21,20 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from services.bus.pictures import split, subscribe
 from services.bus.runtime import ProcessIdentity, RuntimeFolder
+from services.settings import StreamSettings
 from services.supervisor.launcher import ByLauncher, Direct
 from services.supervisor.process import ManagedProcess, StreamEvent
-from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
-from services.supervisor.stream import StreamSupervisor
+from services.supervisor.stream import Stream
+from services.supervisor.worker import ProcessLimits, ProcessSpec, SourceSpec, specs_of
 
 pytestmark = pytest.mark.slow
 
-SMALL = SourceSpec(address="synthetic:?width=64&height=64&frames=3&fps=20")
+SMALL = "synthetic:?width=64&height=64&frames=3&fps=20"
 SOON_S = 300.0
 
 
-def spec(**limits) -> StreamSpec:
-    return StreamSpec(name="a", source=SMALL, limits=ProcessLimits(**limits))
+def spec(address: str = SMALL, **limits) -> ProcessSpec:
+    return ProcessSpec(stream="a", capture=SourceSpec(address=address), limits=ProcessLimits(**limits))
 
 
 async def until(what) -> None:
@@ -70,14 +71,12 @@ def without_gaps(headers: list[dict]) -> bool:
 async def capturing(runtime: RuntimeFolder, events: list[StreamEvent] | None = None, **limits):
     """A capture process that is kept running."""
     folder = runtime.stream("a")
-    process = ManagedProcess(
-        spec(**limits), "capture", folder, Direct(), [].append if events is None else events.append
-    )
+    process = ManagedProcess(spec(**limits), folder, Direct(), [].append if events is None else events.append)
     process.open()
     try:
         yield process
     finally:
-        await process.close(stop=True, reason="over")
+        await process.close("over")
 
 
 def kill(pid: int | None, number: int = signal.SIGKILL) -> None:
@@ -119,19 +118,19 @@ def test_a_process_that_hangs_is_replaced(runtime):
 
 def test_an_address_that_cannot_work_is_said_and_tried_seldom(runtime):
     async def scenario() -> None:
-        wrong = StreamSpec(name="a", source=SourceSpec(address="/nowhere/to/be/found.mp4"))
-        process = ManagedProcess(wrong, "capture", runtime.stream("a"), Direct(), lambda event: None)
+        wrong = spec("/nowhere/to/be/found.mp4")
+        process = ManagedProcess(wrong, runtime.stream("a"), Direct(), lambda event: None)
         process.open()
         await until(lambda: process.state.state == "failed")
         assert "/nowhere/to/be/found.mp4" in process.state.reason
-        await process.close(stop=True, reason="over")
+        await process.close("over")
 
     asyncio.run(scenario())
 
 
 def test_a_process_that_nobody_looks_after_ends(runtime):
     folder = runtime.stream("a")
-    path = spec(orphan_after_s=1.0).write("capture", folder)
+    path = spec(orphan_after_s=1.0).write(folder)
     command = [sys.executable, "-m", "services.supervisor.capture", "--spec", str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=SOON_S)
     assert done.returncode == 0, done.stderr
@@ -162,15 +161,17 @@ import asyncio, sys
 from pathlib import Path
 from services.bus.runtime import RuntimeFolder
 from services.supervisor.launcher import ByLauncher
-from services.supervisor.specs import StreamSpec
-from services.supervisor.stream import StreamSupervisor
+from services.settings import StreamSettings
+from services.supervisor.stream import Stream
+from services.supervisor.worker import specs_of
 
 async def run():
     runtime = RuntimeFolder(Path(sys.argv[1]))
     launcher = ByLauncher(runtime)
     launcher.open()
     await launcher.ready.wait()
-    await StreamSupervisor(StreamSpec.model_validate_json(sys.argv[2]), runtime, start=launcher).start()
+    settings = StreamSettings(source=sys.argv[2], device="cpu")
+    await Stream(settings, specs_of("a", settings), runtime, start=launcher).start()
     await asyncio.sleep(600)
 
 assert "torch" not in sys.modules and "cv2" not in sys.modules
@@ -182,14 +183,14 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
     """A single long scenario, because an engine takes seconds to start."""
 
     async def scenario() -> None:
-        wanted = spec()
-        command = [sys.executable, "-c", CONTROL_PLANE, str(runtime.path), wanted.model_dump_json()]
+        command = [sys.executable, "-c", CONTROL_PLANE, str(runtime.path), SMALL]
         control = subprocess.Popen(command)
         folder = runtime.stream("a")
         raw, shown = Headers(folder.pictures("capture")), Headers(folder.pictures("engine"))
         events: list[StreamEvent] = []
         launcher = ByLauncher(runtime)
-        stream = StreamSupervisor(wanted, runtime, start=launcher, on_event=events.append)
+        settings = StreamSettings(source=SMALL, device="cpu")
+        stream = Stream(settings, specs_of("a", settings), runtime, start=launcher, on_event=events.append)
         try:
             await until(lambda: len(shown.seen) > 3)
 
@@ -201,52 +202,52 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
             await until(lambda: len(shown.seen) > seen + 3)
             launcher.open()
             await stream.start()
-            await until(lambda: stream.state().engine.state == "running" and stream.state().capture.state == "live")
+            await until(lambda: stream.engine.state.state == "running" and stream.capture.state.state == "live")
             assert {event.role: event.kind for event in events} == {"capture": "adopted", "engine": "adopted"}
             for role, record in before.items():
-                assert record is not None and getattr(stream.state(), role).pid == record.identity.pid
-            assert (await stream.command("engine", "ping"))["pid"] == stream.state().engine.pid
+                assert record is not None and stream.processes[role].state.pid == record.identity.pid
+            assert (await stream.engine.command("ping"))["pid"] == stream.engine.state.pid
             await until(launcher.ready.is_set)
 
             # The engine is killed twice: no raw picture is missing, and it comes back.
             raw.seen.clear()
             for _ in range(2):
-                pid = stream.state().engine.pid
+                pid = stream.engine.state.pid
                 kill(pid)
                 at_ns = time.monotonic_ns()
                 await until(lambda at_ns=at_ns: shown.seen[-1]["arrived_ns"] > at_ns)
-                assert stream.state().engine.pid != pid
+                assert stream.engine.state.pid != pid
             assert without_gaps(raw.seen)
             assert [event.kind for event in events if event.role == "engine"][1:] == ["ended", "started"] * 2
             assert "SIGKILL" in events[-2].reason
 
             # Capture is killed: the engine stays, and goes on with the next one. That one is killed as soon as it is there, and now the next one is
             # started only after a while: the engine says that the source is lost.
-            pid, seen = stream.state().engine.pid, len(shown.seen)
+            pid, seen = stream.engine.state.pid, len(shown.seen)
             for _ in range(2):
                 run = raw.seen[-1]["run"]
-                kill(stream.state().capture.pid)
+                kill(stream.capture.state.pid)
                 await until(lambda run=run: raw.seen[-1]["run"] != run)
             await until(lambda: any(header["state"] == "source lost" for header in shown.seen[seen:]))
             await until(lambda: shown.seen[-1]["state"] != "source lost")
-            assert stream.state().engine.pid == pid
+            assert stream.engine.state.pid == pid
             numbers = [header["seq"] for header in shown.seen[seen:] if header["new"]]
             assert numbers == sorted(numbers)
 
             # A finished model takes over from the live reconstruction, outlasts the engine, and gives way again.
-            answer = await stream.command("engine", "show_model", timeout_s=30.0, folder=str(bundle), version=7)
+            answer = await stream.engine.command("show_model", timeout_s=30.0, folder=str(bundle), version=7)
             assert answer["version"] == 7
             await until(lambda: shown.seen[-1]["show"] == "model")
-            kill(stream.state().engine.pid)
+            kill(stream.engine.state.pid)
             at_ns, seen = time.monotonic_ns(), len(shown.seen)
             await until(lambda: shown.seen[-1]["arrived_ns"] > at_ns)
             assert {(each["show"], each["model_version"]) for each in shown.seen[seen:]} == {("model", 7)}
-            await until(lambda: stream.state().engine.state == "running")
-            await stream.command("engine", "show_live")
+            await until(lambda: stream.engine.state.state == "running")
+            await stream.engine.command("show_live")
             await until(lambda: shown.seen[-1]["show"] == "live")
 
             # Everything is ended: nothing is left.
-            pids = [stream.state().engine.pid, stream.state().capture.pid]
+            pids = [stream.engine.state.pid, stream.capture.state.pid]
             await stream.stop("the test is over")
             await launcher.close(stop=True)
             assert all(ProcessIdentity.of(pid) is None for pid in pids if pid is not None)
@@ -264,17 +265,15 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
 
 @pytest.mark.parametrize("what", ["said", "log"])
 def test_nothing_that_is_said_names_the_address(runtime, what):
-    secret = SourceSpec(address="rtsp://user:swordfish@127.0.0.1:1/stream")
+    secret = spec("rtsp://user:swordfish@127.0.0.1:1/stream")
 
     async def scenario() -> None:
-        process = ManagedProcess(
-            StreamSpec(name="a", source=secret), "capture", runtime.stream("a"), Direct(), lambda event: None
-        )
+        process = ManagedProcess(secret, runtime.stream("a"), Direct(), lambda event: None)
         process.open()
         await until(lambda: process.state.state == "opening")
         said = json.dumps([process.state.reason, *map(str, process.state.figures.items())])
         log = runtime.stream("a").log("capture").read_text()
-        await process.close(stop=True, reason="over")
+        await process.close("over")
         assert "swordfish" not in (said if what == "said" else log)
 
     asyncio.run(scenario())

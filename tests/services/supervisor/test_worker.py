@@ -8,20 +8,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from gsplat_core.errors import InvalidSetting
 from services.bus.messages import ask
 from services.errors import AlreadyRunning
 from services.supervisor import worker as workers
-from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
-from services.supervisor.worker import MEASURED_EVERY_S, SIGNALS, Worker, stream_folder_of
+from services.supervisor.worker import MEASURED_EVERY_S, SIGNALS, ProcessLimits, ProcessSpec, SourceSpec, Worker
 
 
 @pytest.fixture
 def new_worker(runtime):
     def make(handlers=None, **limits) -> Worker:
-        spec = StreamSpec(name="a", source=SourceSpec(address="synthetic:"), limits=ProcessLimits(**limits))
-        folder, own = stream_folder_of(spec.write("capture", runtime.stream("a")), "capture")
-        return Worker(folder, own, handlers)
+        spec = ProcessSpec(stream="a", capture=SourceSpec(address="synthetic:"), limits=ProcessLimits(**limits))
+        return Worker(runtime.stream("a"), spec, handlers)
 
     return make
 
@@ -163,12 +160,3 @@ def test_a_process_that_does_not_finish_in_time_ends_itself(new_worker, watch):
     object.__setattr__(worker, "folder", SimpleNamespace(clean=cleaned.append))
     assert watch(worker, 200.0, 204.0, 205.1, 300.0) == 205.1
     assert cleaned == ["capture"] and socket_file.exists()
-
-
-def test_a_specification_for_another_role_is_refused(runtime):
-    spec = StreamSpec(name="a", source=SourceSpec(address="synthetic:"))
-    path = spec.write("engine", runtime.stream("a"))
-    with pytest.raises(InvalidSetting, match="is for the engine process, and this is the capture process"):
-        stream_folder_of(path, "capture")
-    folder, read = stream_folder_of(os.path.relpath(path), "engine")
-    assert folder.path == path.parent and read.role == "engine"

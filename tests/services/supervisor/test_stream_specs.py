@@ -5,22 +5,29 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.api.parts import NewStream
-from services.supervisor import stream_specs
+from services.settings import StreamSettings
+from services.supervisor import worker as workers
 from services.supervisor.engine import live_settings
 from services.supervisor.process import ProcessState
 from services.supervisor.stream import overall
-from services.supervisor.stream_specs import spec_of
+from services.supervisor.worker import specs_of
+
+
+def engine_of(device="cpu", **options):
+    return specs_of("theatre-1", wanted(device, **options))["engine"].engine
 
 
 def wanted(device="cpu", **options):
-    return NewStream("theatre-1", "synthetic:?width=64", "live", device, options)
+    settings = StreamSettings(source="synthetic:?width=64", device=device)
+    return settings.model_copy(update={"options": options})  # not checked yet
 
 
 def test_each_option_goes_to_the_process_that_it_is_for():
-    spec = spec_of(wanted(scale=0.5, tool_mask="none", seed=None))
-    assert (spec.name, spec.source.address, spec.source.scale) == ("theatre-1", "synthetic:?width=64", 0.5)
-    assert (spec.engine.device, spec.engine.gpu, spec.engine.tool_mask, spec.engine.seed) == ("cpu", None, "none", 0)
+    specs = specs_of("theatre-1", wanted(scale=0.5, tool_mask="none", seed=None))
+    capture, engine = specs["capture"].capture, specs["engine"].engine
+    assert {spec.stream for spec in specs.values()} == {"theatre-1"}
+    assert (capture.address, capture.scale) == ("synthetic:?width=64", 0.5)
+    assert (engine.device, engine.gpu, engine.tool_mask, engine.seed) == ("cpu", None, "none", 0)
 
 
 @pytest.mark.parametrize(
@@ -28,8 +35,8 @@ def test_each_option_goes_to_the_process_that_it_is_for():
     [("cpu", 2, ("cpu", None)), ("cuda", 2, ("cuda", None)), ("cuda:1", 2, ("cuda", 1)), ("auto", 0, ("cpu", None)), ("auto", 1, ("cuda", None))],
 )  # fmt: skip
 def test_devices(monkeypatch, device, found, expected):
-    monkeypatch.setattr(stream_specs, "gpus", lambda: found)
-    engine = spec_of(wanted(device)).engine
+    monkeypatch.setattr(workers, "gpus", lambda: found)
+    engine = engine_of(device)
     assert (engine.device, engine.gpu) == expected
 
 
@@ -44,7 +51,7 @@ def test_devices(monkeypatch, device, found, expected):
 )
 def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
     with pytest.raises(InvalidSetting, match=said):
-        spec_of(wanted(**options))
+        engine_of(**options)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +62,7 @@ def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
 )  # fmt: skip
 def test_a_value_of_another_type_or_range_is_refused_and_not_converted(option, value):
     with pytest.raises(InvalidSetting, match=option):
-        spec_of(wanted(**{option: value}))
+        engine_of(**{option: value})
 
 
 @pytest.mark.parametrize("option", ["tool_mask", "depth"])
@@ -65,13 +72,13 @@ def test_a_value_of_another_type_or_range_is_refused_and_not_converted(option, v
 )
 def test_only_networks_are_followed_by_a_file_and_it_must_be_there(option, value):
     with pytest.raises(InvalidSetting, match=option):
-        spec_of(wanted(**{option: value}))
+        engine_of(**{option: value})
 
 
 def test_a_network_of_the_server_is_taken(tmp_path):
     network = tmp_path / "tools.onnx"
     network.write_bytes(b"")
-    assert spec_of(wanted(tool_mask=f"onnx:{network}")).engine.tool_mask == f"onnx:{network}"
+    assert engine_of(tool_mask=f"onnx:{network}").tool_mask == f"onnx:{network}"
 
 
 def test_a_source_that_never_opened_counts_as_lost():
@@ -128,10 +135,10 @@ def test_a_stream_whose_frames_are_all_withheld_says_why_nothing_is_shown():
 
 
 def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_path):
-    asked = spec_of(wanted(depth="stereo", eyes="both", poses="estimated")).engine
+    asked = engine_of(depth="stereo", eyes="both", poses="estimated")
     settings = live_settings(asked, tmp_path, "a source")
     assert (settings.depth, settings.eyes, settings.poses) == ("stereo", "both", "estimated")
-    usual = live_settings(spec_of(wanted()).engine, tmp_path, "a source")
+    usual = live_settings(engine_of(), tmp_path, "a source")
     assert (usual.depth, usual.trained_eyes, usual.poses) == ("auto", "left", "given")
     with pytest.raises(InvalidSetting, match="eyes"):
-        spec_of(wanted(eyes="right"))
+        engine_of(eyes="right")

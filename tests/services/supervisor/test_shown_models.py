@@ -32,18 +32,19 @@ class Registry:
         return SimpleNamespace(version=1)
 
 
-class Supervisor:
+class Engine:
     """An engine that shows what it is asked for."""
 
     def __init__(self) -> None:
         self.figures: dict = {"model": None, "gave_way": []}
         self.engine_state, self.asked, self.refuses = "running", [], False
 
+    @property
     def state(self):
-        return SimpleNamespace(engine=SimpleNamespace(state=self.engine_state, figures=self.figures))
+        return SimpleNamespace(state=self.engine_state, figures=self.figures)
 
-    async def command(self, role, command, *, timeout_s, **arguments):
-        self.asked.append((role, command, arguments["folder"]))
+    async def command(self, command, *, timeout_s, **arguments):
+        self.asked.append((command, arguments["folder"]))
         if self.refuses:
             raise CommandRefused("no room")
         self.figures = {**self.figures, "model": {"name": arguments["name"], "version": arguments["version"]}}
@@ -56,10 +57,11 @@ class Supervisor:
 
 @pytest.fixture
 def parts():
-    registry, supervisor = Registry(), Supervisor()
-    stream = SimpleNamespace(wanted=SimpleNamespace(name="theatre", show="model wall"), supervisor=supervisor)
+    registry, engine = Registry(), Engine()
+    settings = SimpleNamespace(show="model wall")
+    stream = SimpleNamespace(name="theatre", settings=settings, engine=engine, processes={"engine": engine})
     return SimpleNamespace(
-        registry=registry, engine=supervisor, stream=stream, models=ShownModels(SimpleNamespace(), registry)
+        registry=registry, engine=engine, stream=stream, models=ShownModels(SimpleNamespace(), registry)
     )
 
 
@@ -73,10 +75,10 @@ def looks(parts, times=1):
 
 def test_the_active_version_is_asked_for_once_and_again_when_it_changes_or_the_engine_is_new(parts):
     looks(parts, 3)
-    assert parts.engine.asked == [("engine", "show_model", "/models/wall/1")]
+    assert parts.engine.asked == [("show_model", "/models/wall/1")]
     parts.registry.current = 2
     looks(parts, 2)
-    assert parts.engine.asked[1:] == [("engine", "show_model", "/models/wall/2")]
+    assert parts.engine.asked[1:] == [("show_model", "/models/wall/2")]
     parts.engine.figures = {"model": None, "gave_way": []}
     looks(parts, 2)
     assert len(parts.engine.asked) == 3
@@ -85,9 +87,9 @@ def test_the_active_version_is_asked_for_once_and_again_when_it_changes_or_the_e
 @pytest.mark.parametrize("why", ["live", "stopped", "starting", "none active"])
 def test_nothing_is_asked_for_where_nothing_is_to_be_shown(parts, why):
     if why == "live":
-        parts.stream.wanted.show = "live"
+        parts.stream.settings.show = "live"
     elif why == "stopped":
-        parts.stream.supervisor = None
+        parts.stream.processes = {}
     elif why == "starting":
         parts.engine.engine_state = "starting"
     else:
@@ -105,7 +107,7 @@ def test_a_version_that_an_engine_gives_up_is_rolled_back_once_and_can_be_activa
     assert parts.registry.current == 1 and len(parts.engine.asked) == 1
     parts.registry.current = 2
     looks(parts, 3)
-    assert len(parts.registry.rolled_back) == 1 and parts.engine.asked[-1][2] == "/models/wall/2"
+    assert len(parts.registry.rolled_back) == 1 and parts.engine.asked[-1][1] == "/models/wall/2"
     parts.engine.gives_up(2, "it took 300.0 ms", instead=1)
     looks(parts)
     assert len(parts.registry.rolled_back) == 2

@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.api.problems import Conflicting, Unprocessable
-from services.errors import CommandRefused
+from services.errors import CommandRefused, Conflict, Rejected
 from services.exports import snapshots as parts
 from services.exports.cache import ALL, ExportWish
 from services.exports.snapshots import ModelExports, StreamSnapshots
@@ -26,14 +25,14 @@ def taking(tmp_path, monkeypatch):
     def new():
         yield tmp_path
 
-    async def command(role, name, **arguments):
-        calls.append((role, name, arguments))
+    async def command(name, **arguments):
+        calls.append((name, arguments))
         if refusal:
             raise CommandRefused(refusal[0])
         return "said"
 
     refusal: list[str] = []
-    streams = SimpleNamespace(with_engine=lambda stream: SimpleNamespace(command=command))
+    streams = SimpleNamespace(engine=lambda stream: SimpleNamespace(command=command))
     store = SimpleNamespace(
         new=new, keep=lambda *kept: calls.append(("keep", *kept)), delete=lambda *a: calls.append(a)
     )
@@ -47,8 +46,8 @@ def test_a_snapshot_is_kept_or_becomes_a_version_of_a_model(taking, tmp_path):
     folder = tmp_path / "model"
     taken = (folder, "a", "nurse", "said")
     assert asyncio.run(taking.snapshots.take("a", None, "nurse")) == (taken, None)
-    role, name, arguments = taking.calls.pop(0)
-    assert (role, name, arguments["folder"]) == ("engine", "snapshot", str(folder)) and arguments["timeout_s"] > 10
+    name, arguments = taking.calls.pop(0)
+    assert (name, arguments["folder"]) == ("snapshot", str(folder)) and arguments["timeout_s"] > 10
     assert taking.calls == [("keep", folder, taken)]
     del taking.calls[:]
     assert asyncio.run(taking.snapshots.take("a", "liver", "nurse")) == (taken, "version")
@@ -60,7 +59,7 @@ def test_a_snapshot_is_kept_or_becomes_a_version_of_a_model(taking, tmp_path):
 
 def test_an_engine_that_refuses_is_a_conflict(taking):
     taking.refusal.append("nothing was learned yet")
-    with pytest.raises(Conflicting, match="nothing was learned yet"):
+    with pytest.raises(Conflict, match="nothing was learned yet"):
         asyncio.run(taking.snapshots.take("a", None, "nurse"))
 
 
@@ -85,7 +84,7 @@ def test_exports_of_versions_and_snapshots_within_their_time(exports):
     assert exports.of_version("liver", 2, wish(1.5)) == ("d", ("liver", 2), 1.5)
     assert exports.of_snapshot("a", "7", wish(3.5)) == ("s", ("a", "7"), 3.5)
     for ask in (lambda: exports.of_version("liver", 2, wish(3.5)), lambda: exports.of_snapshot("a", "7", wish(1.5))):
-        with pytest.raises(Unprocessable) as error:
+        with pytest.raises(Rejected) as error:
             ask()
         assert isinstance(error.value.__cause__, InvalidSetting)
 
@@ -96,7 +95,7 @@ def test_only_checked_versions_are_exported(exports, state):
     if state in (State.READY, State.ACTIVE, State.RETIRED):
         assert exports.of_version("liver", 2, ExportWish(ALL["ply"], 1.5, None))
     else:
-        with pytest.raises(Conflicting, match="only a version that passed its check"):
+        with pytest.raises(Conflict, match="only a version that passed its check"):
             exports.of_version("liver", 2, ExportWish(ALL["ply"], 1.5, None))
 
 

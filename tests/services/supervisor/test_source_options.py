@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED as SYNTHESIZED
@@ -10,8 +11,8 @@ from operators.settings import MAX_SEED
 from operators.sources.address import PROTOCOLS
 from operators.sources.address_options import PARSERS
 from operators.sources.registry import SOURCES, check_address
-from services.api.parts import NewStream
-from services.supervisor.stream_specs import spec_of
+from services.settings import StreamSettings
+from services.supervisor.worker import specs_of
 
 
 @pytest.mark.parametrize(
@@ -30,7 +31,7 @@ from services.supervisor.stream_specs import spec_of
 )  # fmt: skip
 def test_what_a_source_would_refuse_is_refused_with_its_name(address, option):
     with pytest.raises(InvalidSetting, match=option):
-        spec_of(NewStream("theatre-1", address, "live", "cpu", {}))
+        specs_of("theatre-1", StreamSettings(source=address))
 
 
 @pytest.mark.parametrize(
@@ -53,5 +54,5 @@ def test_addresses_of_every_scheme_with_options_are_checked():
 
 @pytest.mark.parametrize("name", ["field", "renderer", "tool_mask", "depth"])
 def test_names_that_the_engine_does_not_know_are_refused(name):
-    with pytest.raises(InvalidSetting, match=f"{name} is 'nope'"):
-        spec_of(NewStream("theatre-1", "synthetic:", "live", "cpu", {name: "nope"}))
+    with pytest.raises(ValidationError, match=f"{name} is 'nope'"):
+        StreamSettings(source="synthetic:", options={name: "nope"})

@@ -9,10 +9,11 @@ import pytest
 
 from services.api.assembly import assembled, event_receiver
 from services.audit.system_events import SystemEvents
+from services.schemas.streams import StreamView
 from services.settings import ServiceSettings
 from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent
-from services.supervisor.stream import StreamFacts, SupervisedStreams
+from services.supervisor.stream import SupervisedStreams
 
 
 @pytest.mark.parametrize(
@@ -37,8 +38,11 @@ def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
 )
 def test_a_lost_camera_is_degraded(tmp_path, monkeypatch, state, ready):
     """The reason is left out: /readyz needs no key, and a reason may name a source."""
-    facts = StreamFacts("theatre", "rtsp://10.0.0.5/x", "live", "cpu", {}, state, "rtsp://10.0.0.5/x is gone", {})
-    monkeypatch.setattr(SupervisedStreams, "now", lambda self: [facts])
+    source = "rtsp://10.0.0.5/x"
+    view = StreamView(
+        name="theatre", source=source, show="live", device="cpu", options={}, state=state, reason=f"{source} is gone"
+    )
+    monkeypatch.setattr(SupervisedStreams, "all", lambda self: [view])
     with tempfile.TemporaryDirectory(prefix="isp-") as runtime:
         settings = ServiceSettings(paths={"data": tmp_path, "runtime": runtime}, streams={})
         check = assembled(settings).checks["streams"]
