@@ -4,7 +4,7 @@ Usage: python benchmarks/geometry_light.py [--pictures DIR]
 
 A line of JSON for each recording. `error` is the root mean square after one factor per frame, in shares of the median depth. `level` and `plane` are those of the level
 plane and of the best-fit plane (`gsplat_core.evaluation.depth`). `believed` is the share of the pixels with a confidence of at least 0.5. `doubted` is the share of the
-frames without an answer, which count as a level plane. `whole` is the error where all frames are looked at together, as `reconstruct` does it.
+frames without an answer, which count as a level plane.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.light import LightDepth, frames_with_light
-from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
+from gsplat_core.experimental.light import LightDepth
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED
+from gsplat_core.scene.frames import Frame
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared/recordings"
 SEEDS = 6
@@ -47,19 +47,6 @@ def known_tissue(frame: Frame) -> NDArray[np.bool_]:
     """Return the mask of tissue pixels with known true depth."""
     assert frame.depth is not None
     return (frame.depth > 0) if frame.mask is None else (frame.depth > 0) & (frame.mask != 0)
-
-
-def whole(frames: Sequence[Frame], camera: Camera) -> float | None:
-    """The error where all frames are looked at together; None: their tissue could not be followed."""
-    asked = [bare(frame).with_fields(depth_origin=DepthOrigin.LIGHT) for frame in frames]
-    found, moves = frames_with_light(asked, [camera] * len(frames))
-    if not moves:
-        return None
-    errors = []
-    for one, frame in zip(found, frames, strict=True):
-        assert one.depth is not None and frame.depth is not None
-        errors.append(error(one.depth, frame.depth, known_tissue(frame) & (one.depth > 0)))
-    return round(float(np.mean(errors)), 4)
 
 
 def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path | None) -> dict[str, object]:
@@ -89,8 +76,6 @@ def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path |
         means = {"error": errors, "level": levels, "plane": planes}
         figures |= {name: round(float(np.mean(each)), 4) for name, each in means.items()}
         figures["worst_beside_level"] = round(float(np.max(np.subtract(errors, levels))), 4)
-    if errors:
-        figures["whole"] = whole(frames, camera)
     figures |= {"believed": round(float(np.mean(believed)), 3), "doubted": round(float(np.mean(doubted)), 3)}
     return figures | {
         "cpu_ms_per_look": round(1e3 * max(spent), 1),

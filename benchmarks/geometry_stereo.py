@@ -20,11 +20,12 @@ import cv2
 import numpy as np
 import torch
 
-from gsplat_core.depth.maps import BELIEVED, DepthMap
+from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.stereo import StereoDepth, grey
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
 
 DEVICE = "cpu"

@@ -13,7 +13,7 @@ from gsplat_core.registry import Registry
 
 if TYPE_CHECKING:
     from gsplat_core.deformation.field import FieldKind
-    from gsplat_core.depth.registry import Estimator
+    from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.renderer import RendererKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
@@ -38,7 +38,7 @@ DEPTHS: Registry[Callable[..., Estimator]] = Registry(
     {
         "recorded": "gsplat_core.depth.registry:RecordedDepth",
         "stereo": "gsplat_core.depth.stereo:StereoDepth",
-        "light": "gsplat_core.depth.light:LightDepth",
+        "light": "gsplat_core.experimental.light:LightDepth",
         "parallax": "gsplat_core.depth.multiview:ParallaxDepth",
         "onnx": "gsplat_core.depth.learned:LearnedDepth",
         "none": "gsplat_core.depth.registry:NoDepth",

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
 
 from gsplat_core.registry import Registry
 
 if TYPE_CHECKING:
-    from operators.sinks.registry import SinkFactory
-    from operators.tool_mask import ToolMaskFactory
+    from operators.graph import Operator
 
-TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
+TOOL_MASKS: Registry[Callable[[Any, str, str], Operator]] = Registry(
     "tool mask",
     {
         "recorded": "operators.tool_mask:recorded_tool_mask",
@@ -19,18 +19,26 @@ TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
         "none": "operators.tool_mask:no_tool_mask",
     },
 )
-"""Factories of tool mask operators, by method."""
+"""Factories of tool mask operators, by method.
+
+A factory takes the fragment, the operator's name and the text after the colon of the setting, or "". It raises a
+UserError for an invalid text. Input and output of the operator are named `frame`.
+"""
 TOOL_MASKS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
 """Methods that are followed by a colon and an address, with an example of the syntax."""
 
-SINKS: Registry[SinkFactory] = Registry(
+SINKS: Registry[Callable[[Any, str, Any], Operator]] = Registry(
     "sink",
     {
         "video": "operators.sinks.video:video_sink",
         "keyframes": "operators.sinks.keyframes:keyframes_sink",
     },
 )
-"""Factories of sinks for the frames of a run, by name."""
+"""Factories of sinks for the frames of a run, by name.
+
+A factory takes the fragment, the operator's name and `SinkOptions`. The input of the operator takes `RenderedFrame` or
+`ScoredFrame`.
+"""
 
 Device = Literal["cpu", "cuda"]
 """Processors that train and render."""

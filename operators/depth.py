@@ -15,10 +15,10 @@ from typing import Any, Protocol
 
 import cv2
 
-from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.depth.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED
+from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import use_one_thread
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.placement import LateDepth
@@ -34,7 +34,7 @@ class FoundDepth:
     """Origins and coverage of the depth maps of one run."""
 
     frames: Mapping[str, int]
-    """Frames with depth, by origin (a value of `DepthOrigin`)."""
+    """Frames with depth, by origin (a name in `DEPTH_ORIGINS`)."""
     known_share: float
     """Share of pixels with trusted depth, 0..1; mean over the frames that have depth."""
     metric: bool
@@ -54,6 +54,7 @@ class DepthCounts:
         self.passed_over = 0
         self._frames: Counter[str] = Counter()
         self._known, self._relative, self._dropped = 0.0, 0, 0
+        self._estimated = 0
 
     def __add__(self, other: DepthCounts) -> DepthCounts:
         both = DepthCounts()
@@ -61,6 +62,7 @@ class DepthCounts:
         both._frames = self._frames + other._frames
         both._known, both._relative = self._known + other._known, self._relative + other._relative
         both._dropped = self._dropped + other._dropped
+        both._estimated = self._estimated + other._estimated
         return both
 
     def take(self, frame: Frame, given: Frame) -> None:
@@ -70,9 +72,9 @@ class DepthCounts:
             frame: the frame as it arrived, with its recorded depth if any.
             given: the same frame with the depth that is passed on downstream.
         """
-        if given.depth is not None:
-            origin = given.depth_origin or DepthOrigin.MEASURED
-            self._frames[origin.value] += 1
+        if given.depth is not None and given.depth_origin is not None:
+            self._frames[given.depth_origin.name] += 1
+            self._estimated += not given.depth_origin.is_recorded
             sure = given.depth if given.depth_confidence is None else given.depth * (given.depth_confidence >= BELIEVED)
             self._known += cv2.countNonZero(sure) / sure.size
             self._relative += not given.depth_is_metric
@@ -91,10 +93,11 @@ class DepthCounts:
         doubts = finder.doubts.counted() if finder else {}
         share, metric = self._known / total if total else 0.0, self._relative == 0
         outcome.add(FoundDepth(dict(sorted(self._frames.items())), share, metric, doubts, self.passed_over))
-        found = total - self._frames[DepthOrigin.MEASURED.value]
-        if found:
+        if self._estimated:
             unit = "its unit is that of the calibration" if metric else "it is relative: its unit is not known"
-            outcome.note(f"the depth of {found} frames was found in them, of {share:.0%} of their pixels; {unit}")
+            outcome.note(
+                f"the depth of {self._estimated} frames was found in them, of {share:.0%} of their pixels; {unit}"
+            )
         if self.passed_over:
             outcome.note(f"depth was not looked for in {self.passed_over} frames, for newer ones that had come")
         for remark in finder.remarks.counted() if finder else ():

@@ -10,8 +10,8 @@ from typing import Any, get_args
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
-from gsplat_core.poses.odometry import DISTANCE
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
 from operators.choices import Poses
 from operators.graph import Operator, OperatorSpec
@@ -82,7 +82,7 @@ class PoseOp(Operator):
         unit = (
             "lengths have the unit of the depth that frames came with"
             if found.is_measured
-            else f"lengths have no scale: the first frame's tissue is taken to be {DISTANCE:g} away"
+            else f"lengths have no scale: the first frame's tissue is taken to be {RELATIVE_DISTANCE:g} away"
         )
         outcome.note(
             f"the scope's poses were estimated from the pictures, frame by frame, and explain {found.explained:.0%} of how these move; {unit}."

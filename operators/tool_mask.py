@@ -245,15 +245,7 @@ def all_tissue(frame: Frame) -> NDArray[np.uint8]:
     return np.ones(frame.image.shape[:2], np.uint8)
 
 
-ToolMaskFactory = Callable[[Any, str, str], Operator]
-"""Creates an operator with the input and output `frame` from the fragment, the operator's name and
-the method's argument.
-
-The argument is the text after the colon, or "". Raises a UserError if it is invalid.
-"""
-
-
-def _plain(kind: type[Operator], method: str) -> ToolMaskFactory:
+def _plain(kind: type[Operator], method: str) -> Callable[[Any, str, str], Operator]:
     def make(fragment: Any, name: str, argument: str) -> Operator:
         if argument:
             raise InvalidSetting(f"tool mask {method!r} takes nothing after its name, got {argument!r}")

@@ -70,6 +70,18 @@ def test_every_way_to_import_the_reference_is_seen(tmp_path, line):
     assert imports_reference(tmp_path / "module.py")
 
 
+def test_experimental_methods_are_named_by_registries_only():
+    """An import path in a registry is a string. An import statement would make an experimental method part of another module."""
+    folder = ROOT / "gsplat_core/experimental"
+    others = [path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py") if folder not in path.parents]
+    wrong = [
+        str(path.relative_to(ROOT))
+        for path in others
+        if any(name.startswith("gsplat_core.experimental") for name in imported_modules(path))
+    ]
+    assert list(folder.glob("*.py")) and wrong == []
+
+
 def test_geometry_knows_nothing_of_training():
     files = sorted((ROOT / "gsplat_core/geometry").rglob("*.py"))
     assert files

@@ -22,12 +22,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.light import DISTANCE
-from gsplat_core.depth.maps import BELIEVED, DepthMap, doubted
+from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.endoscope.onnx import Finite, OnnxNetwork, PictureSettings, Positive
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, LEARNED, RELATIVE_DISTANCE
+from gsplat_core.scene.frames import Frame
 
 Plane = NDArray[np.float64]
 MOST_SPAN = 5.0
@@ -247,15 +247,15 @@ class LearnedDepth:
         output = self._network.run(frame.image)
         values = np.asarray(output.reshape(output.shape[-2:]), np.float32)
         if not np.isfinite(values).all():
-            return doubted(size, DepthOrigin.LEARNED, NOT_FINITE)
+            return doubted(size, LEARNED, NOT_FINITE)
         grid, seen = _on_grid(values, size, cv2.INTER_AREA), _on_grid(_tissue(frame), size) > 0
         if seen.mean() < LEAST_SEEN:
-            return doubted(size, DepthOrigin.LEARNED, UNSEEN)
+            return doubted(size, LEARNED, UNSEEN)
         if is_constant(grid[seen]):
-            return doubted(size, DepthOrigin.LEARNED, FLAT)
+            return doubted(size, LEARNED, FLAT)
         solved = self._by_given(grid, seen, frame)
         if isinstance(solved, str):
-            return doubted(size, DepthOrigin.LEARNED, solved)
+            return doubted(size, LEARNED, solved)
         remark = None if solved is None else GIVEN
         solved = solved or self._by_before(grid, seen) or self._assumed(grid[seen])
         self._before = solved.of(grid)
@@ -268,7 +268,7 @@ class LearnedDepth:
         return DepthMap(
             depth,
             np.where(found > least, BELIEVED, 0).astype(np.float32),
-            DepthOrigin.LEARNED,
+            LEARNED,
             metric=False,
             remark=remark,
         )
@@ -304,7 +304,7 @@ class LearnedDepth:
         """Return the alignment that is assumed without any reference depth."""
         zero = with_assumed_zero(values)
         positive = np.clip(zero.of(values), *np.percentile(zero.of(values), ENDS))
-        factor = self._kind(np.array(DISTANCE)) / np.exp(np.log(positive).mean())
+        factor = self._kind(np.array(RELATIVE_DISTANCE)) / np.exp(np.log(positive).mean())
         return Affine(float(factor), float(factor) * zero.summand, 1.0)
 
 

@@ -1,25 +1,20 @@
-"""Depth maps with confidence, as depth estimators return them, and checks of them.
+"""Depth maps with confidence, the estimators that return them, and checks of them.
 
-Measured depth is doubted at edges and where it is noisy. Estimated depth is compared with that of other views of the same tissue.
+Depth of sensors, renderers and resized maps has edge pixels that belong to neither side, near-zero values next to
+unknown depth, and wrong rows or columns along the border. Gaussians initialised there float in front of the tissue and
+occlude it when they move (`measured_confidence`).
 
-Confidence of measured depth maps.
-
-Sensors, renderers and resizing produce edge pixels that belong to neither side, near-zero values next to unknown
-depth, and wrong rows or columns along the border. Gaussians initialised there float in front of the tissue and
-occlude it when they move.
-
-Validation of depth by parallax: two depth maps of the same tissue, from other poses and times, must show the same
-relief.
-
-The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a while looks like
-static tissue at another distance, and a warp by the wrong depth fits as well as one by the true depth. The tissue's
-motion changes over time, however, and so does the depth error that it causes. If two depth maps differ by a fair
-share of the relief that they show, a level plane is as accurate as they are.
+Depth by parallax is validated by a second map of the same tissue from another pose and time, which must show the same
+relief (`agree`). The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a
+while looks like static tissue at another distance, and a warp by the wrong depth fits as well as one by the true depth.
+The tissue's motion changes over time, however, and so does the depth error that it causes. If two depth maps differ by
+a fair share of the relief that they show, a level plane is as accurate as they are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -27,15 +22,9 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import BELIEVED, DepthOrigin
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.projection import moved, pixel_rays, pixels_of
-
-BELIEVED = 0.5
-"""Confidence from which a depth is used where it can only be used or rejected."""
-POSSIBLE = 0.03
-"""Confidence from which a stereo depth is a better start value than one extrapolated from its
-neighbourhood.
-"""
 
 
 @dataclass(frozen=True)
@@ -81,17 +70,41 @@ class DepthMap:
 
     @property
     def kept(self) -> NDArray[np.float32]:
-        """Depth that is stored with the frame, 0 elsewhere: confident depth, for stereo also depth
-        of at least `POSSIBLE` confidence.
-        """
-        least = POSSIBLE if self.origin is DepthOrigin.STEREO else BELIEVED
-        return np.where(self.confidence >= least, self.depth, np.float32(0))
+        """Depth that is stored with the frame: that of at least its origin's `least_confidence`, 0 elsewhere."""
+        return np.where(self.confidence >= self.origin.least_confidence, self.depth, np.float32(0))
 
 
 def doubted(shape: tuple[int, int], origin: DepthOrigin, doubt: str) -> DepthMap:
     """Return a rejected depth map [H, W] without depth, with the reason."""
     nothing = np.zeros(shape, np.float32)
     return DepthMap(nothing, nothing, origin, metric=False, doubt=doubt)
+
+
+class Estimator(Protocol):
+    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The
+    same frames give the same bytes.
+    """
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """Estimate the depth of a frame.
+
+        Args:
+            frame: frame; `new_scene` marks a cut after which earlier frames are unrelated.
+            camera: camera of the frame, with its pose if known.
+
+        Returns:
+            The depth map, or None if the frame contains nothing to estimate depth from.
+        """
+        ...
+
+
+@runtime_checkable
+class OnDevice(Protocol):
+    """Estimator that can run on a device other than the CPU."""
+
+    def work_on(self, device: str) -> None:
+        """Run on this device from now on, concurrently with other work there."""
+        ...
 
 
 ALIKE = 0.1
@@ -142,6 +155,38 @@ def _median(values: NDArray[np.float32]) -> float:
         if np.any(some):
             return float(np.median(some[some > 0]))
     return 0.0
+
+
+def believed_depth(frame: Frame) -> NDArray[np.float32]:
+    """Return the frame's confident depth [H, W], 0 elsewhere and within the edge margin of its origin."""
+    return _depth_from(frame, BELIEVED, 1.0)
+
+
+def possible_depth(frame: Frame) -> NDArray[np.float32]:
+    """Return depth [H, W] of tissue that is a better start value than extrapolation, 0 elsewhere."""
+    depth = _depth_from(frame, None, 0.5)
+    if frame.mask is None or frame.depth_origin is None:
+        return depth
+    return np.where(_inner(frame.mask > 0, frame.depth_origin.tool_margin_px), depth, np.float32(0))
+
+
+def _depth_from(frame: Frame, least: float | None, margin: float) -> NDArray[np.float32]:
+    """Return depth of at least the confidence `least` (None: that of its origin), outside of a share of the edge margin."""
+    origin = frame.depth_origin
+    if frame.depth is None or origin is None:
+        return np.zeros(frame.image.shape[:2], np.float32)
+    if frame.depth_confidence is None:
+        return frame.depth
+    known = frame.depth_confidence >= (origin.least_confidence if least is None else least)
+    return np.where(_inner(known, int(margin * origin.edge_margin_px)), frame.depth, np.float32(0))
+
+
+def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
+    """Erode a mask [H, W] by a margin."""
+    if margin_px == 0:
+        return where
+    side = 2 * margin_px + 1
+    return np.asarray(cv2.erode(where.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 LONGEST_PX = 160

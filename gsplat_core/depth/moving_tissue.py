@@ -39,7 +39,8 @@ from gsplat_core.depth.periodic_motion import (
 from gsplat_core.depth.plane_fits import surface_through
 from gsplat_core.geometry.grid_tracks import GridTracks, TexturedPicture, follow_grids, seen_by, small_camera
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import PARALLAX
+from gsplat_core.scene.frames import Frame
 
 MOVES_PX = 2.0
 """Error against the periodic motion in pixels from which a point may be pulled."""
@@ -195,7 +196,7 @@ class MovingTissue:
         frame, time_s = self._frames[number], self._times[number]
         near = [each for each in self._windows if each.tracks.times_s[0] <= time_s <= each.tracks.times_s[-1]]
         if not near:
-            return doubted(frame.image.shape[:2], DepthOrigin.PARALLAX, (*self.doubts, TOO_FEW)[0])
+            return doubted(frame.image.shape[:2], PARALLAX, (*self.doubts, TOO_FEW)[0])
         small = small_camera(frame, self._cameras[number])
         maps = [(_share(each, time_s), *_surface(each, small, time_s)) for each in near]
         weights = np.stack([share * (confidence + 1e-3) for share, _, confidence in maps])
@@ -210,7 +211,7 @@ class MovingTissue:
         for mask in (frame.mask, frame.loss_mask):
             if mask is not None:
                 confidence = np.where(mask != 0, confidence, np.float32(0))
-        return DepthMap(depth, confidence, DepthOrigin.PARALLAX, metric=False)
+        return DepthMap(depth, confidence, PARALLAX, metric=False)
 
 
 def _windows(

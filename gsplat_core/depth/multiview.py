@@ -26,10 +26,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import BELIEVED, UNCONFIRMED, DepthMap, Look, agree, doubted
+from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Look, agree, doubted
 from gsplat_core.geometry.tracks import followed
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, PARALLAX
+from gsplat_core.scene.frames import Frame
 
 WINDOW_PX = 7
 """Side of the correlation window in pixels."""
@@ -450,10 +451,10 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     """
     others = chosen_views(reference, candidates)
     if not others:
-        return doubted(size, DepthOrigin.PARALLAX, "the scope does not move")
+        return doubted(size, PARALLAX, "the scope does not move")
     found = explained_by_poses(reference, others)
     if isinstance(found, str):
-        return doubted(size, DepthOrigin.PARALLAX, found)
+        return doubted(size, PARALLAX, found)
     inverse_depths = _distances(found)
     cost, votes = sweep(reference, [others[number] for number in found.views], inverse_depths)
     labels, unique = best_labels(aggregated(cost))
@@ -509,7 +510,7 @@ def _at_full_size(inverse: NDArray[np.float32], confidence: NDArray[np.float32],
     full = size[1], size[0]
     depth = 1 / np.asarray(cv2.resize(inverse, full, interpolation=cv2.INTER_LINEAR), np.float32)
     sure = np.asarray(cv2.resize(confidence, full, interpolation=cv2.INTER_LINEAR), np.float32)
-    return DepthMap(depth.astype(np.float32), sure, DepthOrigin.PARALLAX, metric=False)
+    return DepthMap(depth.astype(np.float32), sure, PARALLAX, metric=False)
 
 
 STREAM_PX = 160

@@ -21,9 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.stereo import reach_of, variance_px2
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 
 Sums = NDArray[np.floating[Any]]
 
@@ -227,19 +228,22 @@ pictures. It is added to the variance that the matcher estimates.
 """
 
 
-def with_matched_surface(frame: Frame, camera: Camera, tissue: NDArray[np.bool_]) -> Frame:
-    """Replace the stereo depth of a frame by a reconstructed surface; frames with other depth are
-    returned unchanged.
+def with_matched_surface(frame: Frame, camera: Camera) -> Frame:
+    """Replace the stereo depth of a frame by a reconstructed surface.
+
+    Pixels without possible depth, such as tools and their surroundings, keep their depth and are
+    ignored by the fit.
 
     Args:
         frame: frame with stereo depth and confidence.
         camera: left camera.
-        tissue: bool [H, W], pixels whose depth belongs to the tissue surface. Other pixels, such as
-            tools and their surroundings, keep their depth and are ignored by the fit.
+
+    Returns:
+        The frame, unchanged without depth or confidence.
     """
-    if frame.depth is None or frame.depth_confidence is None or frame.depth_origin is not DepthOrigin.STEREO:
+    if frame.depth is None or frame.depth_confidence is None:
         return frame
-    known = tissue & (frame.depth > 0) & (frame.depth_confidence > 0)
+    known = (possible_depth(frame) > 0) & (frame.depth > 0) & (frame.depth_confidence > 0)
     if not known.any():
         return frame
     reach = reach_of(frame, camera)

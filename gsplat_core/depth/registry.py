@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from gsplat_core.choices import DEPTHS
 from gsplat_core.choices import DEPTHS_WITH_ADDRESS as WITH_ADDRESS
-from gsplat_core.depth.maps import DepthMap, measured_confidence
+from gsplat_core.depth.maps import DepthMap, Estimator, OnDevice, measured_confidence
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
-
-
-class Estimator(Protocol):
-    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The
-    same frames give the same bytes.
-    """
-
-    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Estimate the depth of a frame.
-
-        Args:
-            frame: frame; `new_scene` marks a cut after which earlier frames are unrelated.
-            camera: camera of the frame, with its pose if known.
-
-        Returns:
-            The depth map, or None if the frame contains nothing to estimate depth from.
-        """
-        ...
-
-
-@runtime_checkable
-class OnDevice(Protocol):
-    """Estimator that can run on a device other than the CPU."""
-
-    def work_on(self, device: str) -> None:
-        """Run on this device from now on, concurrently with other work there."""
-        ...
+from gsplat_core.scene.frames import Frame, FrameStatus
 
 
 class RecordedDepth:
@@ -56,7 +29,8 @@ class RecordedDepth:
         confidence = frame.depth_confidence
         if confidence is None:
             confidence = measured_confidence(frame.depth)
-        return DepthMap(frame.depth, confidence, frame.depth_origin or DepthOrigin.MEASURED, frame.depth_is_metric)
+        assert frame.depth_origin is not None
+        return DepthMap(frame.depth, confidence, frame.depth_origin, frame.depth_is_metric)
 
 
 class NoDepth:
@@ -100,6 +74,15 @@ def check_depth(choice: str) -> None:
         raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(names)}")
     if name in WITH_ADDRESS:
         new_estimator(choice)
+
+
+def with_surface(frame: Frame, camera: Camera) -> Frame:
+    """Return the frame with its depth smoothed by the `surface` function of the depth's origin, if there is one."""
+    if frame.depth is None or frame.depth_origin is None or frame.depth_origin.surface is None:
+        return frame
+    module, function = frame.depth_origin.surface.split(":")
+    smoothed: Frame = getattr(importlib.import_module(module), function)(frame, camera)
+    return smoothed
 
 
 def depth_inputs(choice: str) -> tuple[Path, ...]:

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.depth.maps import BELIEVED, DepthMap, doubted
+from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
 from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
@@ -41,7 +41,8 @@ from gsplat_core.ops.stereo_matching.stereo_matching import (
     match_disparities,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, STEREO
+from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import HostCopy, tensor_of
 
 EDGE_ERROR_PX = 1.5
@@ -393,19 +394,19 @@ class StereoDepth:
             self._forget(shape)
         why = _why_not_rectified(camera, frame.right_camera)
         if why is not None:
-            return doubted(shape, DepthOrigin.STEREO, why)
+            return doubted(shape, STEREO, why)
         left, right = grey(frame.image), grey(frame.right_image)
         # Disparity of points at infinity, since principal points may differ.
         parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
         if self._look_in == 0:
             why = self._look(left, right, frame, parallel_px)
             if why is not None:
-                return doubted(shape, DepthOrigin.STEREO, why)
+                return doubted(shape, STEREO, why)
         self._look_in -= 1
         span = self._span_of(frame.width_px)
         if span.count > MOST_DISPARITIES:
             why = f"the range of distances is too large: {span.count} disparities would have to be searched, at most {MOST_DISPARITIES} are supported"
-            return doubted(shape, DepthOrigin.STEREO, why)
+            return doubted(shape, STEREO, why)
         is_first = self._seen is None
         planes = self._planes(left, right, frame, camera, span, parallel_px)
         found = self._as_depth(planes, frame, camera, parallel_px)
@@ -485,7 +486,7 @@ class StereoDepth:
         if believed < LEAST_BELIEVED:
             self._look_in = 0
             why = f"too little of the picture could be matched between the eyes: {believed:.1%} of its pixels, {LEAST_BELIEVED:.0%} are needed"
-            return doubted(depth.shape, DepthOrigin.STEREO, why)
+            return doubted(depth.shape, STEREO, why)
         step = max(1, frame.width_px // SAMPLED_PX)
         some = planes[:, ::step, ::step]
         reach = reach_of(frame, camera)
@@ -496,10 +497,8 @@ class StereoDepth:
         middle = float(np.median(believed_depth))
         if frame.right_camera is not None and not PLAUSIBLE_MM[0] <= middle <= PLAUSIBLE_MM[1]:
             why = f"the distances are implausible for a scope: {middle:.3g} mm in the middle; check the baseline and its unit"
-            return doubted(depth.shape, DepthOrigin.STEREO, why)
-        return DepthMap(
-            depth, confidence, DepthOrigin.STEREO, frame.right_camera is not None, remark=self._remark(middle, reach)
-        )
+            return doubted(depth.shape, STEREO, why)
+        return DepthMap(depth, confidence, STEREO, frame.right_camera is not None, remark=self._remark(middle, reach))
 
     def _remark(self, middle: float, reach: float) -> str | None:
         """Return a remark about corrected row offsets. Their cause may have shifted columns as

@@ -30,7 +30,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.depth.maps import BELIEVED, measured_confidence
+from gsplat_core.depth.maps import measured_confidence
 from gsplat_core.evaluation.depth import DepthShare, DepthShareSums, NormalErrors, NormalSums
 from gsplat_core.evaluation.motion import FlowErrors, FlowSums, FollowedPoints, Tracking
 from gsplat_core.evaluation.scores import why_left_out
@@ -39,6 +39,7 @@ from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model

@@ -2,7 +2,7 @@
 
 The standard error of a point has three parts that are treated as independent: the spread of z along
 the ray (`Surface.spread`), the depth ambiguity of partly transparent pixels, and the error of the
-depth source used in training (`ORIGIN_ERROR`). The last part is largely common to the whole scene.
+depth source used in training (`DepthOrigin.relative_error`). The last part is largely common to the whole scene.
 Treating it as independent between two points overestimates the error. The camera is assumed exact.
 """
 
@@ -18,21 +18,10 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.surface import in_world, rays_of
 from gsplat_core.rendering.surface import COVERED, Surface
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import UNKNOWN_ERROR
 from gsplat_core.scene.model import Model
 from gsplat_core.transfers import HostCopy
 
-ORIGIN_ERROR: dict[DepthOrigin | None, float] = {
-    DepthOrigin.MEASURED: 0.005,
-    DepthOrigin.STEREO: 0.015,
-    DepthOrigin.PARALLAX: 0.05,
-    DepthOrigin.LIGHT: 0.15,
-    DepthOrigin.LEARNED: 0.2,
-    None: 0.3,
-}
-"""Assumed relative standard error of depth for each depth source, in addition to the errors visible
-in the model.
-"""
 MOST_STEPS = 4096
 """Largest number of steps of a length along the surface."""
 
@@ -107,7 +96,8 @@ class Measurement:
         # In half-transparent pixels the point may as well be at the median depth.
         median = float(surface["median_depth"][row, column])
         split = abs(depth - median) if median > 0 else spread
-        error = math.hypot(spread, (1 - opacity) * depth, split, ORIGIN_ERROR[self.origin] * depth)
+        relative_error = UNKNOWN_ERROR if self.origin is None else self.origin.relative_error
+        error = math.hypot(spread, (1 - opacity) * depth, split, relative_error * depth)
         return SurfacePoint(
             pixel=(column + 0.5, row + 0.5),
             position=_triple(in_world(start + step * depth, camera)),

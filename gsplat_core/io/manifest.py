@@ -14,8 +14,8 @@ from gsplat_core.deformation.registry import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.value_ranges import IntegerIn, NumberIn
@@ -41,8 +41,6 @@ ROTATION_TOLERANCE = 2e-3
 """Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
-DEPTH_ORIGINS = tuple(origin.value for origin in DepthOrigin)
-UNITLESS = (DepthOrigin.PARALLAX, DepthOrigin.LIGHT, DepthOrigin.LEARNED)
 """Depth origins that are never metric."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
@@ -123,10 +121,10 @@ def parse_manifest(text: bytes, name: str) -> Manifest:
 
 
 def _depth_source(reader: JsonObject) -> DepthSource:
-    origin = DepthOrigin(reader.choice("origin", DEPTH_ORIGINS))
+    origin = DEPTH_ORIGINS[reader.choice("origin", tuple(DEPTH_ORIGINS))]
     metric = reader.boolean("metric")
-    if metric and origin in UNITLESS:
-        raise BundleCorrupt(f"{reader.name}: depth of origin {origin.value!r} has no unit, and metric is true")
+    if metric and not origin.is_metric(eyes_calibrated=True):
+        raise BundleCorrupt(f"{reader.name}: depth of origin {origin.name!r} has no unit, and metric is true")
     return DepthSource(origin, metric)
 
 

@@ -3,7 +3,7 @@
 Tissue corners are tracked on reduced pictures (`stream_tracks`). Each frame's camera starts at the pose predicted by
 constant motion and is optimised until the points fit. A key frame is added once the pictures have moved far enough;
 its new corners get the depth of known ones around them. A few bundle adjustment steps over the newest key frames
-refine poses and points with every frame (`local_map`). As in `odometry`, the scene starts as a plane at `DISTANCE`
+refine poses and points with every frame (`local_map`). As in `odometry`, the scene starts as a plane at `RELATIVE_DISTANCE`
 unless the first frame has depth.
 
 A returned pose is never revised. The tissue is assumed static, so global motion by breathing or the heart is part of
@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.stream_tracks import LEVELS, PATCH_PX, Numbers, SmallPicture, SmallPictures, StreamTracks
 from gsplat_core.geometry.tracks import Points, followed
@@ -33,9 +32,9 @@ from gsplat_core.poses.local_map import (
     seen_again,
     unprojected,
 )
-from gsplat_core.poses.odometry import DISTANCE
 from gsplat_core.poses.se3 import inverse
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import BELIEVED, RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 RETURN_PX, ROWS_PX = 0.5, 1.5
@@ -206,7 +205,7 @@ class LiveOdometry:
         self.map = LocalMap()
         seen = self._seen_depth(frame, picture, self._tracks.pixels)
         self.is_measured = bool((seen > 0).sum() >= FEWEST_POINTS)
-        middle = float(seen[seen > 0].median()) if self.is_measured else DISTANCE
+        middle = float(seen[seen > 0].median()) if self.is_measured else RELATIVE_DISTANCE
         depth = torch.where((seen > 0) & self.is_measured, seen, middle)
         self.map.add_points(new, unprojected(self._pose, picture.rays(self._tracks.pixels), depth))
         self._take_key(picture, frame)

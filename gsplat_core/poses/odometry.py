@@ -8,7 +8,7 @@ an essential matrix is ill-conditioned there.
 
 Tissue motion that is rigid as a whole is indistinguishable from scope motion. Other tissue motion is suppressed by a
 robust loss. Periodic motion, such as breathing, is modelled explicitly if the recording is long enough
-(`breathing_trajectory`). The scale is unknown: the median depth of the first frame's points is set to `DISTANCE`.
+(`breathing_trajectory`). The scale is unknown: the median depth of the first frame's points is set to `RELATIVE_DISTANCE`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import one_thread
 
@@ -43,10 +44,6 @@ FARTHEST_APART = 10
 NEIGHBOURS = 5
 """Known points around a new one whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
-DISTANCE = 60.0
-"""Distance of the tissue in the first frame, equal to `ReconstructorConfig.default_depth_mm`, the
-start depth of a scene without depth.
-"""
 GROWTH = 1.3
 """Growth factor of the number of key frames from one bundle adjustment to the next."""
 
@@ -86,7 +83,7 @@ class Trajectory:
 
     @property
     def path(self) -> float:
-        """Length of the trajectory, in the unit in which the first frame's tissue is `DISTANCE`
+        """Length of the trajectory, in the unit in which the first frame's tissue is `RELATIVE_DISTANCE`
         away.
         """
         centres = -np.einsum("nji,nj->ni", self.poses[:, :3, :3], self.poses[:, :3, 3])
@@ -256,13 +253,13 @@ class _Odometry:
 
     def _result(self, moving: BreathingTrajectory | None) -> Trajectory:
         poses = self._poses.clone()
-        poses[:, :3, 3] *= DISTANCE
+        poses[:, :3, 3] *= RELATIVE_DISTANCE
         still_error_px = float(self._still_errors_px().median())
         if moving is not None:
-            breathing = Breathing(moving.frequencies_hz, moving.uncertain * DISTANCE)
-            tissue, error_px = (moving.points * DISTANCE).numpy(), moving.error * self._focal
+            breathing = Breathing(moving.frequencies_hz, moving.uncertain * RELATIVE_DISTANCE)
+            tissue, error_px = (moving.points * RELATIVE_DISTANCE).numpy(), moving.error * self._focal
             return Trajectory(poses.numpy(), tissue, error_px, still_error_px, tuple(self._lost), breathing)
-        chosen, points = self._known[self._point], self._points * DISTANCE
+        chosen, points = self._known[self._point], self._points * RELATIVE_DISTANCE
         whole = Bundle(poses, points, self._frame[chosen], self._point[chosen], self._rays[chosen], self._focal)
         return Trajectory(
             poses.numpy(),

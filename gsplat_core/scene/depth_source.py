@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DepthOrigin
+from gsplat_core.scene.frames import Frame
 
 
 @dataclass(frozen=True)
@@ -22,9 +23,9 @@ class DepthSource:
 
         None without depth; the scene then starts on a plane at an arbitrary distance.
         """
-        if frame.depth is None:
+        if frame.depth is None or frame.depth_origin is None:
             return None
-        return DepthSource(frame.depth_origin or DepthOrigin.MEASURED, frame.depth_is_metric)
+        return DepthSource(frame.depth_origin, frame.depth_is_metric)
 
     @staticmethod
     def after(source: DepthSource | None, frame: Frame) -> DepthSource | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import MEASURED, DepthOrigin
 
 
 class FrameStatus(Enum):
@@ -24,21 +25,6 @@ class FrameStatus(Enum):
     """Parts may be the decoder's guess. The frame is displayed, but neither trained on
     nor scored.
     """
-
-
-class DepthOrigin(Enum):
-    """Origin of a frame's depth, which determines its permitted uses."""
-
-    MEASURED = "measured"
-    """Depth sensor, or depth supplied with the recording."""
-    STEREO = "stereo"
-    """Stereo matching between the two eyes; metric if the baseline is known."""
-    PARALLAX = "parallax"
-    """Matching across times with different scope poses, in the unit of the poses."""
-    LIGHT = "light"
-    """Estimated from brightness under the scope's own light: relative, never metric."""
-    LEARNED = "learned"
-    """Predicted from one picture by a user-supplied network: relative, never metric."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +48,7 @@ class Frame:
     depth_confidence: NDArray[np.float32] | None = None
     """Confidence of each pixel's depth [H, W], 0 to 1; None for full confidence."""
     depth_origin: DepthOrigin | None = None
-    """Origin of `depth`; None without depth."""
+    """Origin of `depth`; None without depth. Depth without an origin counts as recorded with the frame (`MEASURED`)."""
     mask: NDArray[np.uint8] | None = None
     """[H, W]; 1 = tissue (keep), 0 = tool."""
     pose: NDArray[np.float64] | None = None
@@ -94,6 +80,8 @@ class Frame:
     """Scene id; lets a consumer that missed the first frame of a scene detect the change."""
 
     def __post_init__(self) -> None:
+        if self.depth is not None and self.depth_origin is None:
+            object.__setattr__(self, "depth_origin", MEASURED)
         image = self.image
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise InvalidInput(
@@ -129,14 +117,10 @@ class Frame:
     def depth_is_metric(self) -> bool:
         """True if the unit of `depth` is known.
 
-        Stereo depth is metric if the baseline between the eyes is known. Measured depth is metric.
         The answer stays valid after `depth` was dropped to save memory, because `depth_origin` is
         kept.
         """
-        if self.depth_origin is None:
-            return self.depth is not None
-        matched = self.depth_origin is DepthOrigin.STEREO and self.right_camera is not None
-        return self.depth_origin is DepthOrigin.MEASURED or matched
+        return self.depth_origin is not None and self.depth_origin.is_metric(self.right_camera is not None)
 
     @property
     def height_px(self) -> int:

@@ -173,7 +173,7 @@ class Model:
         """Return everything except tensors and version as JSON-serialisable values."""
         source = self.depth_source
         # Omitted if unknown, which preserves the digest of models of earlier versions.
-        depth = {} if source is None else {"depth": {"origin": source.origin.value, "metric": source.metric}}
+        depth = {} if source is None else {"depth": {"origin": source.origin.name, "metric": source.metric}}
         right = {} if self.gaussians.right_sh is None else {"right_eye": True}
         return {
             "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree, **right},

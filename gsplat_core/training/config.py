@@ -10,7 +10,8 @@ from typing import get_args
 from gsplat_core.choices import FIELDS, Eyes
 from gsplat_core.deformation.field import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 
@@ -23,17 +24,6 @@ def check_eyes(eyes: str) -> None:
     """
     if eyes not in get_args(Eyes):
         raise InvalidSetting(f"eyes is {eyes!r}; choose {' or '.join(get_args(Eyes))}")
-
-
-MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE = 10.0, 3.0
-"""Factors of the depth loss for measured depth relative to estimated depth, offline and online.
-Lower values let colours move Gaussians along the line of sight by more than the depth's error;
-higher values leave less of a frame's few steps to its picture.
-"""
-MATCHED_WEIGHS = 10.0
-"""Factor of the depth loss for stereo depth offline, where it is reconstructed as a surface
-(`matched_surface`) that colours would roughen.
-"""
 
 
 @dataclass(frozen=True)
@@ -53,7 +43,7 @@ class LearningRates:
     right_share: float = 0.1
     """Factor of the rate `sh` for the right eye's own colours. Without depth, the colour difference
     between the eyes is what moves Gaussians to the right depth, so these colours must follow
-    slowly. With stereo depth (`MATCHED_WEIGHS`) the factor is 1.
+    slowly. A scene that starts from stereo depth offline uses 1.
     """
     field: FieldRates | None = None
     """Rates of the deformation field, of type `FIELDS[name].rates`; None for its defaults."""
@@ -112,10 +102,10 @@ class ReconstructorConfig:
     """Weight of 1 - SSIM relative to L1 or squared error, 0 to 1."""
     depth_weight: float = 0.1
     """Weight of the inverse-depth loss of frames with depth, multiplied by the scene's initial
-    distance so that it does not depend on the unit. It is scaled by `MEASURED_WEIGHS` or
-    `MEASURED_WEIGHS_ONLINE` for measured depth and by `MATCHED_WEIGHS` for stereo depth offline.
+    distance so that it does not depend on the unit, and by a factor of the depth's origin
+    (`DEPTH_ORIGINS`).
     """
-    default_depth_mm: float = 60.0
+    default_depth_mm: float = RELATIVE_DISTANCE
     """Distance of the plane on which a scene without depth starts, in millimetres."""
     eyes: Eyes = "left"
     """Eyes trained on: `left`, or `both` for frames with a calibrated right eye."""
@@ -193,15 +183,13 @@ class ReconstructorConfig:
             frame: first frame of the scene.
             all_known: True offline, where all frames are available.
         """
-        if frame.depth is None or self.history_s is not None:
+        origin = frame.depth_origin
+        if frame.depth is None or origin is None or self.history_s is not None:
             return self
-        if frame.depth_origin in (None, DepthOrigin.MEASURED):
-            factor = MEASURED_WEIGHS if all_known else MEASURED_WEIGHS_ONLINE
-            return dataclasses.replace(self, depth_weight=factor * self.depth_weight)
-        if frame.depth_origin is DepthOrigin.STEREO and all_known:
-            rates = dataclasses.replace(self.rates, right_share=1.0)
-            return dataclasses.replace(self, depth_weight=MATCHED_WEIGHS * self.depth_weight, rates=rates)
-        return self
+        factor = origin.loss_weight_offline if all_known else origin.loss_weight_online
+        share = origin.right_share_offline if all_known else None
+        rates = self.rates if share is None else dataclasses.replace(self.rates, right_share=share)
+        return dataclasses.replace(self, depth_weight=factor * self.depth_weight, rates=rates)
 
     @property
     def chosen_field(self) -> str:

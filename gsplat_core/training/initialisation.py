@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import BELIEVED, POSSIBLE
+from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 SIGMA_IN_SPACINGS = 0.7
@@ -25,12 +25,6 @@ THICKNESS = 0.3
 FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
 """Margin around tools that is in-painted with them, since masks end slightly early, in pixels."""
-HOLE_MARGIN_PX = 2
-"""Margin around unmatched stereo pixels, in pixels, within which depth is not learned. Half of it
-applies to start depths.
-"""
-BESIDE_TOOL_PX = 4
-"""Margin around tools, in pixels, within which stereo depth may belong to the tool."""
 
 MAX_ANGLE_RAD = math.radians(85)
 """Largest angle to the axis at which a fisheye pixel is placed; larger ones are clamped."""
@@ -191,43 +185,6 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
     filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), small_hole, 3, cv2.INPAINT_TELEA)
     large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.where(hole[..., None] > 0, large, image).astype(np.uint8)
-
-
-def believed_depth(frame: Frame) -> NDArray[np.float32]:
-    """Return the frame's confident depth [H, W], 0 elsewhere. Stereo depth next to unmatched or
-    unconfident pixels is excluded, because it is inaccurate at edges.
-    """
-    return _depth_from(frame, BELIEVED, HOLE_MARGIN_PX)
-
-
-def possible_depth(frame: Frame) -> NDArray[np.float32]:
-    """Return depth [H, W] of tissue that is a better start value than extrapolation, 0 elsewhere.
-
-    For stereo this includes less confident depth, but excludes pixels near a tool, which may have
-    the tool's depth.
-    """
-    if frame.depth_origin is not DepthOrigin.STEREO:
-        depth = believed_depth(frame)
-        return depth if frame.mask is None else np.where(frame.mask > 0, depth, np.float32(0))
-    depth = _depth_from(frame, POSSIBLE, HOLE_MARGIN_PX // 2)
-    return depth if frame.mask is None else np.where(_inner(frame.mask > 0, BESIDE_TOOL_PX), depth, np.float32(0))
-
-
-def _depth_from(frame: Frame, least: float, margin_px: int) -> NDArray[np.float32]:
-    if frame.depth is None:
-        return np.zeros(frame.image.shape[:2], np.float32)
-    if frame.depth_confidence is None:
-        return frame.depth
-    kept = frame.depth_confidence >= least
-    if frame.depth_origin is DepthOrigin.STEREO:
-        kept = _inner(kept, margin_px)
-    return np.where(kept, frame.depth, np.float32(0))
-
-
-def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
-    """Erode a mask [H, W] by a margin."""
-    side = 2 * margin_px + 1
-    return np.asarray(cv2.erode(where.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     {
         "bumps": "gsplat_core.training.motion_prior:no_prior",
         "flow": "gsplat_core.training.motion_prior:FlowPrior",
-        "learned": "gsplat_core.training.learned_prior:LearnedPrior",
+        "learned": "gsplat_core.experimental.learned_prior:LearnedPrior",
     },
 )
 """Factories that take a `ReconstructorConfig`. `bumps` uses no prior, only the field's own

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.depth.maps import believed_depth
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
-from gsplat_core.training.initialisation import believed_depth
+from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import HostCopy, tensor_of
 
 
@@ -123,7 +123,7 @@ def learned_depth(frame: Frame, device: torch.device | str = "cpu") -> Tensor | 
     Shading and network depth only initialise the scene. They are inaccurate, and their scale may
     differ between frames.
     """
-    if frame.depth is None or frame.depth_origin in (DepthOrigin.LIGHT, DepthOrigin.LEARNED):
+    if frame.depth is None or frame.depth_origin is None or frame.depth_origin.initialises_only:
         return None
     return known_depth(believed_depth(frame), device)
 

@@ -13,14 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsplat_core.depth.light import frames_with_light
 from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Look, agree
 from gsplat_core.depth.moving_tissue import MovingTissue
 from gsplat_core.depth.multiview import CONTRADICTED, DEFORMS, depth_of_view, view_of
-from gsplat_core.depth.plane_fits import with_matched_surface
+from gsplat_core.depth.registry import with_surface
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
-from gsplat_core.training.initialisation import possible_depth
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import observed
 
@@ -136,15 +134,13 @@ class ToFit(NamedTuple):
     doubts: Mapping[str, int]
     """Results of `frames_with_parallax`: reasons for rejected depth, and `at_rest`."""
     at_rest: bool = False
-    light_shows_motion: bool = False
-    """Result of `frames_with_light`: True if shading depth shows the tissue's motion."""
 
 
 def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], finds_depth: bool) -> ToFit:
     """Prepare frames for offline training; `frames` is modified.
 
-    Stereo depth is replaced by a reconstructed surface, shading depth is re-estimated from all
-    frames, and with `finds_depth` parallax depth is estimated if there is no other.
+    Stereo depth is replaced by a reconstructed surface. With `finds_depth`, parallax depth is
+    estimated if there is no other.
 
     Raises:
         InvalidInput: if there are no frames, or if they are out of temporal order.
@@ -152,16 +148,15 @@ def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], 
     seen = observed(frames, observation_of)
     cameras = [each.camera for each in seen]
     for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
-        surface = with_matched_surface(frame, camera, possible_depth(frame) > 0)
+        surface = with_surface(frame, camera)
         if surface is not frame:
             frames[number], seen[number] = surface, observation_of(surface)
-    frames, light_shows_motion = frames_with_light(frames, cameras)
     if not finds_depth:
-        return ToFit(frames, seen, {}, light_shows_motion=light_shows_motion)
+        return ToFit(frames, seen, {})
     found = frames_with_parallax(frames, cameras)
     # Unconfident depth is an extrapolation: it initialises the scene but is not trained on.
     start = [
-        frame.with_fields(depth_confidence=None) if frame.depth_origin is DepthOrigin.PARALLAX else frame
-        for frame in found.frames
+        frame if frame is given else frame.with_fields(depth_confidence=None)
+        for given, frame in zip(frames, found.frames, strict=True)
     ]
-    return ToFit(start, observed(found.frames, observation_of), found.doubts, found.at_rest, light_shows_motion)
+    return ToFit(start, observed(found.frames, observation_of), found.doubts, found.at_rest)

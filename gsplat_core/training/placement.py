@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from gsplat_core.deformation.basis import BasisField
+from gsplat_core.depth.maps import possible_depth
 from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, FrameMode, View, render_frame
 from gsplat_core.rendering.frame_renderer import (
     CapturedSequence,
@@ -29,12 +30,12 @@ from gsplat_core.rendering.frame_renderer import (
 )
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import BASIS_CHANNELS, LOG_SCALE, POSITION, Gaussians
 from gsplat_core.training.growth import UNCOVERED_ALPHA
 from gsplat_core.training.hole_filling import filled
 from gsplat_core.training.image_motion import NEAREST, Seen, beside
-from gsplat_core.training.initialisation import possible_depth, tissue_depth
+from gsplat_core.training.initialisation import tissue_depth
 from gsplat_core.training.observations import Observation, known_depth, learned_depth
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import tensor_of
@@ -207,13 +208,6 @@ class CapturedCorrection:
         self._field.move_to_at(controls.rates, moved)
 
 
-CORRECTS_ALL_TIMES = (DepthOrigin.PARALLAX,)
-CORRECTS_ONE_TIME = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
-"""Depth sources trusted to refine geometry after initialisation, at all times or at the frame's
-time. None is an unspecified source, treated as measured. Other sources only initialise the scene.
-"""
-
-
 class Placement:
     """Depth corrections of consecutive scenes: the first depth places the whole scene, later ones
     refine it.
@@ -266,11 +260,12 @@ class Placement:
         if self._postpones and self.is_placed and shown_s is None:
             self._postponed = frame, observation
             return
-        if frame is self._first or frame.depth is None:
+        origin = frame.depth_origin
+        if frame is self._first or frame.depth is None or origin is None:
             return
         if observation.camera.model != "pinhole" or not step.field.takes_positions:
             return
-        if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
+        if self.is_placed and origin.initialises_only:
             return
         # The loss ignores shading depth, so observations do not contain it.
         late = late or LateDepth.for_placement(frame, observation.image.device)
@@ -278,12 +273,12 @@ class Placement:
         if possible is None:
             return
         with torch.no_grad():
-            if self.is_placed and frame.depth_origin in CORRECTS_ONE_TIME:
-                self._correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
-            elif self.is_placed:
+            if not self.is_placed:
+                self.is_placed = _place(step, frame, observation, late)
+            elif origin.is_of_still_tissue:
                 _correct_all_times(step, observation, possible)
             else:
-                self.is_placed = _place(step, frame, observation, late)
+                self._correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
 
     def _correct(self, step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
         """Move the scene at one time towards a frame's depth [H, W] (0 = unknown)."""

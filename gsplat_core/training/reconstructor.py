@@ -310,7 +310,7 @@ class Reconstructor:
         self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
-        tracks = SurfaceTracks(frames, seen, given.at_rest, given.light_shows_motion)
+        tracks = SurfaceTracks(frames, seen, given.at_rest)
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
             first_new = self.gaussians if number else 0

@@ -19,12 +19,13 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.choices import Eyes
+from gsplat_core.depth.maps import believed_depth
 from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.initialisation import believed_depth, unprojected
+from gsplat_core.training.initialisation import unprojected
 from gsplat_core.training.observations import Observation, RightEye, scene_colours
 from gsplat_core.training.unseen import pixels_of
 from gsplat_core.transfers import tensor_of

@@ -18,19 +18,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
-from gsplat_core.training.initialisation import possible_depth
 from gsplat_core.training.motion_prior import followed
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
-OF_ONE_PICTURE = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
-"""Depth sources whose differences between frames are not motion, because their scale varies from
-frame to frame. Shading depth is an exception if the tissue was tracked (`light_of_recording`).
-"""
 EDGE_PX = 1
 """Margin around tools and holes in pixels where depth is not read, since tracks are inaccurate."""
 ROWS_AT_ONCE = 1 << 14
@@ -45,7 +41,6 @@ class SurfaceTracks:
         frames: Sequence[Frame],
         observations: Sequence[Observation],
         at_rest: bool = False,
-        light_shows_motion: bool = False,
     ) -> None:
         """Prepare the trajectories.
 
@@ -53,9 +48,8 @@ class SurfaceTracks:
             frames: all frames.
             observations: the same frames as tensors.
             at_rest: depth was estimated for static tissue, see `WithParallax`.
-            light_shows_motion: shading depth was estimated by tracking tissue through all frames.
         """
-        self._at_rest, self._followed = at_rest, (DepthOrigin.LIGHT,) if light_shows_motion else ()
+        self._at_rest = at_rest
         self._frames, self._seen = frames, observations
         self._device = observations[0].image.device
         self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
@@ -116,16 +110,11 @@ class SurfaceTracks:
 
     @cached_property
     def _depths(self) -> list[SurfaceDepth | None]:
-        """Depth of each frame; None if it is not confident or shows no motion."""
+        """Depth of each frame; None if it is not confident or its scale varies, so that the loss ignores it."""
         return [
-            None if not self._shows_surface(frame, one) else SurfaceDepth.of(possible_depth(frame), self._device)
+            None if one.depth is None or not one.depth.any() else SurfaceDepth.of(possible_depth(frame), self._device)
             for frame, one in zip(self._frames, self._seen, strict=True)
         ]
-
-    def _shows_surface(self, frame: Frame, one: Observation) -> bool:
-        if frame.depth_origin in self._followed:  # the loss ignores this depth, so no observation contains it
-            return frame.depth is not None and bool(frame.depth.any())
-        return frame.depth_origin not in OF_ONE_PICTURE and one.depth is not None and bool(one.depth.any())
 
     @cached_property
     def _ahead(self) -> list[SurfaceMotion]:

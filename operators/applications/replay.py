@@ -51,6 +51,7 @@ from operators.applications.session import (
     saves_model,
 )
 from operators.applications.warm_reconstructor import warm_reconstructor
+from operators.choices import SINKS
 from operators.compare_shown import CompareShownOp
 from operators.depth import DepthOp, without_depth
 from operators.frame_log import FRAMES_FILE, FrameLog
@@ -63,7 +64,7 @@ from operators.rasterize import DeformOp, RasterizeOp
 from operators.reconstruct import ReconstructOp, ScheduledReconstructOp
 from operators.settings import ReplayOptions, check_option
 from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.registry import SINKS, SinkOptions, input_of
+from operators.sinks.registry import SinkOptions, input_of
 from operators.sources.recording import SessionSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription

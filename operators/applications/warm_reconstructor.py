@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget
@@ -56,7 +56,7 @@ def warm_reconstructor(
             model = reconstructor.publish()
             drawn.append((model, draw(frame, model)))
             # Steps with depth are captured as a separate graph.
-            reconstructor.take_depth(frame.with_fields(depth=depth, depth_origin=DepthOrigin.STEREO))
+            reconstructor.take_depth(frame.with_fields(depth=depth))
             reconstructor.rehearse(2)
             reconstructor.grow(frame)
         reconstructor.look_after_once()

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gsplat_core.errors import InvalidInput
-from operators.choices import SINKS
 from operators.graph import Operator
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from operators.sources.source import SourceDescription
 from operators.storage import StorageReserve
-
-__all__ = ["SINKS", "SinkFactory", "SinkOptions", "input_of"]
 
 
 @dataclass(frozen=True)
@@ -27,12 +22,6 @@ class SinkOptions:
     source: SourceDescription
     reserve: StorageReserve
     """Free disk space to be kept."""
-
-
-SinkFactory = Callable[[Any, str, SinkOptions], Operator]
-"""Creates a sink from the fragment, the operator's name and the options. Its input takes
-`RenderedFrame` or `ScoredFrame`.
-"""
 
 
 def input_of(sink: Operator) -> tuple[str, type]:

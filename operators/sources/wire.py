@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.options import SourceOptions
 from operators.sources.source import SourceDescription
 
@@ -231,7 +232,7 @@ def frame_header(frame: Frame) -> dict[str, Any]:
         "arrived_ns": frame.arrived_ns,
         "status": frame.status.value,
         "damage": frame.damage,
-        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.value,
+        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.name,
         "right_camera": None if frame.right_camera is None else camera_to(frame.right_camera),
     }
 
@@ -250,7 +251,7 @@ def frame_from(header: Mapping[str, Any], planes: Mapping[str, Any]) -> Frame:
             arrived_ns=arrived_ns,
             status=FrameStatus(header["status"]),
             damage=damage,
-            depth_origin=None if origin is None else DepthOrigin(origin),
+            depth_origin=None if origin is None else DEPTH_ORIGINS[origin],
             right_camera=None if right_camera is None else Camera(**right_camera),
             **planes,
         )

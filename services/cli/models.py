@@ -138,7 +138,7 @@ def measure_command(model: Path, time_s: float | None, start: str, end: str | No
     measurement = Measurement(loaded, time_s)
     points = [measurement.point(*pixel) for pixel in pixels]
     said: dict[str, Any] = {"time_s": time_s, "unit": measurement.unit, "metric": measurement.metric}
-    said["depth_origin"] = None if measurement.origin is None else measurement.origin.value
+    said["depth_origin"] = None if measurement.origin is None else measurement.origin.name
     said["points"] = [_point(point) for point in points]
     if len(points) == 2:
         said["distance"] = _length(measurement.distance(*points))

@@ -15,8 +15,9 @@ from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.recording import FileRecording
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.poses.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
-from gsplat_core.poses.odometry import DISTANCE, Trajectory, trajectory_of
+from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
 from operators.applications.progress import Progress
 from operators.errors import OutputError
@@ -138,7 +139,10 @@ def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
 
 
 def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording, out: Path, as_json: bool) -> None:
-    notes = [f"lengths have no scale: the first frame's tissue is taken to be {DISTANCE:g} away", *recording.notes]
+    notes = [
+        f"lengths have no scale: the first frame's tissue is taken to be {RELATIVE_DISTANCE:g} away",
+        *recording.notes,
+    ]
     if recording.camera_is_assumed:
         notes.append(_about_focal_length(focal, recording.camera))
     if found.explained < MOSTLY:

@@ -14,7 +14,7 @@ from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.training.placement import LateDepth
 from operators.depth import FEW_CORES, BackgroundDepth, BackgroundDepthOp, FoundDepth, share_of
 from operators.outcome import OutcomeBuilder
@@ -38,8 +38,8 @@ class Gated:
         if self.fails:
             raise ZeroDivisionError("the estimator")
         if frame.seq == 99:
-            return doubted((16, 24), DepthOrigin.STEREO, "the eyes are swapped")
-        return DepthMap(PLANE + 50 + frame.seq, SURE, DepthOrigin.STEREO, metric=True)
+            return doubted((16, 24), DEPTH_ORIGINS["stereo"], "the eyes are swapped")
+        return DepthMap(PLANE + 50 + frame.seq, SURE, DEPTH_ORIGINS["stereo"], metric=True)
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_the_newest_frame_is_next_and_the_others_are_counted(beside, estimator, 
     assert beside.take() is None
     estimator.gate.release()
     first = taken(beside)
-    assert (first.seq, first.depth[0, 0], first.depth_origin) == (0, 100, DepthOrigin.STEREO)
+    assert (first.seq, first.depth[0, 0], first.depth_origin) == (0, 100, DEPTH_ORIGINS["stereo"])
     assert first.depth_confidence is SURE and first.image.tobytes() == frame(0).image.tobytes()
     at_work(estimator)
     estimator.gate.release()
@@ -202,7 +202,7 @@ def test_few_cores_are_left_to_training():
 def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, choice, kept):
     operator = BackgroundDepthOp(None, beside=BackgroundDepth(choice, CAMERA))
     operator.start()
-    given = frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED)
+    given = frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"])
     (passed,) = compute(operator, frame=given)
     operator.stop()
     outcome = OutcomeBuilder()
@@ -217,7 +217,7 @@ def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, c
 def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute):
     operator = BackgroundDepthOp(None, beside=BackgroundDepth("gated", CAMERA))
     operator.start()
-    compute(operator, frame=frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED))
+    compute(operator, frame=frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"]))
     estimator.gate.release()
     operator.beside.offer(frame(1))
     taken(operator.beside)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from gsplat_core.depth import registry
-from gsplat_core.depth.maps import BELIEVED, DepthMap, doubted
+from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, FrameStatus
+from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
+from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
 from operators.depth import DepthCounts, DepthOp, FoundDepth, without_depth
 from operators.outcome import OutcomeBuilder
@@ -62,7 +63,7 @@ def outcome_of(operator):
 
 @pytest.mark.parametrize("choice", ["auto", "recorded"])
 def test_recorded_depth_goes_through_as_it_is(frame, compute, choice):
-    given = frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED)
+    given = frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"])
     operator = started(choice)
     (passed,) = compute(operator, frame=given)
     assert passed is given
@@ -73,7 +74,7 @@ def test_recorded_depth_goes_through_as_it_is(frame, compute, choice):
 
 def test_none_drops_recorded_depth_and_says_so(frame, compute):
     operator = started("none")
-    (passed,) = compute(operator, frame=frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED))
+    (passed,) = compute(operator, frame=frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"]))
     assert (passed.depth, passed.depth_confidence, passed.depth_origin) == (None, None, None)
     assert outcome_of(operator).notes == ("the depth that 1 frames came with was not used (depth is 'none')",)
 
@@ -88,11 +89,11 @@ def test_a_frame_with_nothing_to_find_depth_from_has_none(frame, compute, choice
 def test_what_is_found_counts_where_it_is_believed(frame, compute, registered):
     confidence = np.ones((16, 24), np.float32)
     confidence[:8] = 0.4
-    registered("half", DepthMap(PLANE, confidence, DepthOrigin.LIGHT, metric=False))
+    registered("half", DepthMap(PLANE, confidence, DEPTH_ORIGINS["light"], metric=False))
     operator = started("half")
     (passed,) = compute(operator, frame=frame(0))
     assert (passed.depth[:8] == 0).all() and (passed.depth[8:] == 50).all()
-    assert passed.depth_confidence is confidence and passed.depth_origin is DepthOrigin.LIGHT
+    assert passed.depth_confidence is confidence and passed.depth_origin is DEPTH_ORIGINS["light"]
     outcome = outcome_of(operator)
     assert outcome.find(FoundDepth) == FoundDepth({"light": 1}, 0.5, False, {})
     assert outcome.notes == (
@@ -101,7 +102,7 @@ def test_what_is_found_counts_where_it_is_believed(frame, compute, registered):
 
 
 def test_a_doubted_depth_is_not_used_and_the_doubt_is_said(frame, compute, registered):
-    registered("wrong", doubted((16, 24), DepthOrigin.STEREO, "the eyes are swapped"))
+    registered("wrong", doubted((16, 24), DEPTH_ORIGINS["stereo"], "the eyes are swapped"))
     operator = started("wrong")
     for seq in range(3):
         (passed,) = compute(operator, frame=frame(seq))
@@ -191,7 +192,7 @@ def test_counts_of_depth_are_shares_and_sentences(frame):
     first, second, outcome = DepthCounts(), DepthCounts(), OutcomeBuilder()
     measured = frame(depth=half)
     first.take(measured, measured)
-    found = frame(depth=PLANE, depth_confidence=sure, depth_origin=DepthOrigin.STEREO)
+    found = frame(depth=PLANE, depth_confidence=sure, depth_origin=DEPTH_ORIGINS["stereo"])
     second.take(frame(), found)
     second.take(frame(depth=PLANE), frame())
     second.take(frame(), frame())

@@ -10,7 +10,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from operators.outcome import OutcomeBuilder
 from operators.pose import EstimatedPoses, PoseOp, check_poses, pose_operators
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
@@ -79,7 +79,7 @@ def test_the_report_says_that_poses_are_relative(frames, compute):
 def test_depth_of_the_frames_gives_lengths_their_unit_where_it_may_be_used(frames, compute, measured):
     plane = np.full((HEIGHT, WIDTH), 75, np.float32)
     operator = started(measured=measured)
-    compute(operator, frame=frames[0].with_fields(depth=plane, depth_origin=DepthOrigin.MEASURED))
+    compute(operator, frame=frames[0].with_fields(depth=plane, depth_origin=DEPTH_ORIGINS["measured"]))
     outcome = outcome_of(operator)
     assert outcome.find(EstimatedPoses).measured == measured
     assert ("the unit of the depth" in outcome.notes[0]) == measured

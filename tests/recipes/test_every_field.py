@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.deformation import FIELDS
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
@@ -89,7 +89,7 @@ def test_everything_that_a_live_scene_goes_through_takes_the_field(recording, fi
         made.observe(frame, budget=Budget.of_steps(30 if k in (0, 5, 8) else 4))
         made.publish()
         depth = np.full(frame.image.shape[:2], 55.0, np.float32)
-        made.take_depth(frame.with_fields(depth=depth, depth_origin=DepthOrigin.STEREO))
+        made.take_depth(frame.with_fields(depth=depth, depth_origin=DEPTH_ORIGINS["stereo"]))
         made.grow(frame)
         made.rehearse(2)
     counted = made._step.steps

@@ -23,7 +23,7 @@ from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
 from gsplat_core.io.recordings.plain_files import Picture, UnreadableFile, open_plain
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+from gsplat_core.scene.frames import Frame, FrameStatus
 
 
 class FrameImages(Protocol):
@@ -156,7 +156,6 @@ class Contents:
             right_image=other,
             right_camera=self.right_camera,
             depth=depth,
-            depth_origin=None if depth is None else DepthOrigin.MEASURED,
             mask=mask,
             loss_mask=outside,
             pose=None if poses is None else poses[index],

@@ -45,7 +45,7 @@ from gsplat_core.io.recordings.plain_files import (
 )
 from gsplat_core.io.recordings.sidecars import Beside
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 
 VIEWS_FILE = "views.json"
 VIEWS_FORMAT = "intrasplat-views"
@@ -81,7 +81,6 @@ class RecordedView:
             image=picture.image,
             mask=None if self.masks is None else self.masks.read(index, findings),
             depth=None if self.depth is None else self.depth.read(index, findings),
-            depth_origin=None if self.depth is None else DepthOrigin.MEASURED,
         )
         return resized_frame(frame, self.camera.width_px, self.camera.height_px)
 

@@ -29,7 +29,8 @@ from gsplat_core.io.sessions.records import (
     read_session_file,
 )
 from gsplat_core.io.sessions.segments import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame, FrameStatus
 
 MOST_ARRIVED = 64
 """Maximum number of received frames that may still be prepared for training."""
@@ -218,7 +219,7 @@ def late_depth_of(line: DepthTaken, pictures: SegmentPictures) -> dict[str, Any]
     planes, damage = pictures.of(line)
     if damage is not None or "depth" not in planes:
         return None
-    confidence, origin = planes.get("depth_confidence"), DepthOrigin(line.origin)
+    confidence, origin = planes.get("depth_confidence"), DEPTH_ORIGINS[line.origin]
     return {"depth": planes["depth"], "depth_confidence": confidence, "depth_origin": origin}
 
 
@@ -239,7 +240,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
             right_camera=None if line.right_camera is None else camera_of(line.right_camera),
             depth=planes.get("depth"),
             depth_confidence=planes.get("depth_confidence"),
-            depth_origin=None if line.depth_origin is None else DepthOrigin(line.depth_origin),
+            depth_origin=None if line.depth_origin is None else DEPTH_ORIGINS[line.depth_origin],
             mask=planes.get("mask"),
             loss_mask=planes.get("loss_mask"),
             rehearsal_mask=planes.get("rehearsal_mask"),

@@ -19,6 +19,7 @@ from gsplat_core.io.files import PartialFile
 from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 
 MOST_NS = 2**62
 MAX_SIDE_PX = 65_536
@@ -43,8 +44,15 @@ Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
 """Timestamp in milliseconds within the track's file, for each track with a picture of this line."""
-Origin = Literal["measured", "stereo", "parallax", "light"]
-"""See `gsplat_core.scene.frames.DepthOrigin`."""
+
+
+def _is_origin(name: str) -> str:
+    DEPTH_ORIGINS.check(name)
+    return name
+
+
+Origin = Annotated[str, AfterValidator(_is_origin)]
+"""Name in `DEPTH_ORIGINS`."""
 
 
 class Record(BaseModel):

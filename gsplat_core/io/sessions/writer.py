@@ -37,7 +37,7 @@ from gsplat_core.io.sessions.records import (
 )
 from gsplat_core.io.sessions.segments import SegmentWriter, Stage
 from gsplat_core.io.sessions.tracks import Coding
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 
 DELETING = ".deleted-"
 """Name prefix of folders that are being deleted."""
@@ -272,11 +272,13 @@ class SessionWriter:
     def late_depth(self, frame: Frame) -> None:
         """Record the depth of a frame that was passed to training after the frame."""
         self._go_on()
-        origin: Any = (frame.depth_origin or DepthOrigin.MEASURED).value
+        assert frame.depth_origin is not None
         tracks = self._pictures("late_", _planes(frame, _DEPTHS), frame.pts_ns)
         width_px, height_px = frame.width_px, frame.height_px
         self._segment.line(
-            DepthTaken(seq=frame.seq, origin=origin, width_px=width_px, height_px=height_px, tracks=tracks)
+            DepthTaken(
+                seq=frame.seq, origin=frame.depth_origin.name, width_px=width_px, height_px=height_px, tracks=tracks
+            )
         )
 
     def shown(self, shown: Shown) -> None:
@@ -390,7 +392,7 @@ def _said(frame: Frame) -> dict[str, Any]:
         "damage": _short(frame.damage),
         "pose": None if frame.pose is None else tuple(frame.pose.ravel().tolist()),
         "right_camera": None if frame.right_camera is None else camera_record(frame.right_camera),
-        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.value,
+        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.name,
         "arrived_ns": frame.arrived_ns,
         "exposure": None if frame.exposure == (1.0, 1.0, 1.0) else tuple(map(float, frame.exposure)),
         "withheld": _short(frame.withheld),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.placement import CapturedCorrection, _correct_at
@@ -40,7 +40,7 @@ def sloping(gpu, hole=False):
 @pytest.mark.parametrize("hole", [False, True])
 @pytest.mark.parametrize("later_s", [0.0, 0.1])
 def test_one_launch_corrects_as_many_do(gpu, step, hole, later_s):
-    observation = Observation.of(found(FRAME, origin=DepthOrigin.STEREO), CAMERA, gpu)
+    observation = Observation.of(found(FRAME, origin=DEPTH_ORIGINS["stereo"]), CAMERA, gpu)
     weights, depth = step.field.weights.data, sloping(gpu, hole)
     before = weights.clone()
     captured = CapturedCorrection(step.fixed_rows, step.field, CAMERA)
@@ -58,7 +58,7 @@ def test_one_launch_corrects_as_many_do(gpu, step, hole, later_s):
 
 
 def test_a_frame_that_does_not_fit_changes_nothing_and_the_next_one_does(gpu, step):
-    observation = Observation.of(found(FRAME, origin=DepthOrigin.STEREO), CAMERA, gpu)
+    observation = Observation.of(found(FRAME, origin=DEPTH_ORIGINS["stereo"]), CAMERA, gpu)
     weights, depth = step.field.weights.data, sloping(gpu)
     captured = CapturedCorrection(step.fixed_rows, step.field, CAMERA)
     captured._capacity = 1

@@ -12,7 +12,8 @@ from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, 
 from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.parallax import _confirmed
 from tests.gsplat_core.geometry.test_key_frames import answers, stream
 
@@ -116,7 +117,7 @@ def test_offline_all_depth_is_kept_where_most_looks_are_confirmed(factors: tuple
             number,
             np.zeros((HEIGHT, WIDTH, 3), np.uint8),
             depth=factor * true_depth(camera),
-            depth_origin=DepthOrigin.PARALLAX,
+            depth_origin=DEPTH_ORIGINS["parallax"],
         )
         for number, (camera, factor) in enumerate(zip(cameras, factors, strict=True))
     ]

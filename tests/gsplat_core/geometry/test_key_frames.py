@@ -7,10 +7,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import BELIEVED, DepthMap
+from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.multiview import MOST_KEY_FRAMES, ParallaxDepth
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, camera_at, video
 

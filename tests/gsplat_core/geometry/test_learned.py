@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from gsplat_core.depth.learned import AGAINST, DISTANCE, FLAT, GIVEN, NOT_FINITE, UNLIKE, UNSEEN, LearnedDepth
-from gsplat_core.depth.maps import BELIEVED
+from gsplat_core.depth.learned import AGAINST, FLAT, GIVEN, NOT_FINITE, UNLIKE, UNSEEN, LearnedDepth
 from gsplat_core.depth.registry import DepthFinder, check_depth, new_estimator
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS, RELATIVE_DISTANCE
+from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.endoscope.networks import conv, external_weights, write
 
 HEIGHT, WIDTH = 96, 128
@@ -67,10 +67,10 @@ def off(found: np.ndarray, depth: np.ndarray) -> float:
 def test_inverse_depth_becomes_depth_around_the_distance_of_a_scene_without_depth(network):
     found = LearnedDepth(str(network())).estimate(seen(inverse(surface())), CAMERA)
     assert found is not None and found.doubt is None and found.remark is None
-    assert (found.origin, found.metric) == (DepthOrigin.LEARNED, False)
+    assert (found.origin, found.metric) == (DEPTH_ORIGINS["learned"], False)
     assert found.depth.shape == (HEIGHT, WIDTH) and (found.confidence == BELIEVED).all()
     assert off(found.depth, surface()) < 0.03
-    assert np.exp(np.log(found.depth).mean()) == pytest.approx(DISTANCE, rel=0.01)
+    assert np.exp(np.log(found.depth).mean()) == pytest.approx(RELATIVE_DISTANCE, rel=0.01)
 
 
 @pytest.mark.parametrize("stated", ["address", "metadata"])
@@ -145,7 +145,7 @@ def test_depth_that_frames_came_with_says_the_factor_and_the_zero(network):
     depth = np.zeros((HEIGHT, WIDTH), np.float32)
     depth[::3, ::4] = surface()[::3, ::4]
     depth[:20, :20] = 500
-    frame = seen(inverse(surface(), 8, 0.3), depth=depth, depth_origin=DepthOrigin.MEASURED)
+    frame = seen(inverse(surface(), 8, 0.3), depth=depth, depth_origin=DEPTH_ORIGINS["measured"])
     estimator = LearnedDepth(str(network()))
     found = estimator.estimate(frame, CAMERA)
     assert found is not None and np.median(np.abs(found.depth / surface() - 1)) < 0.02
@@ -159,7 +159,11 @@ def test_depth_that_is_not_believed_says_nothing(network):
     wrong = np.full((HEIGHT, WIDTH), 500, np.float32) + np.arange(WIDTH, dtype=np.float32)
     frame = seen(inverse(surface()), depth=wrong, depth_confidence=np.full_like(wrong, 0.4))
     found = LearnedDepth(str(network())).estimate(frame, CAMERA)
-    assert found is not None and found.remark is None and np.median(found.depth) == pytest.approx(DISTANCE, rel=0.1)
+    assert (
+        found is not None
+        and found.remark is None
+        and np.median(found.depth) == pytest.approx(RELATIVE_DISTANCE, rel=0.1)
+    )
 
 
 def test_another_scene_starts_anew(network, rng):
@@ -287,4 +291,4 @@ def test_it_is_found_by_its_address(network):
     check_depth(choice)
     assert isinstance(new_estimator(choice), LearnedDepth)
     frame = DepthFinder(choice, CAMERA).with_depth(seen(inverse(surface())))
-    assert frame.depth_origin is DepthOrigin.LEARNED and (frame.depth > 0).all() and not frame.depth_is_metric
+    assert frame.depth_origin is DEPTH_ORIGINS["learned"] and (frame.depth > 0).all() and not frame.depth_is_metric

@@ -15,8 +15,8 @@ from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, Rend
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry, local_map
 from gsplat_core.poses.live_odometry import LiveOdometry
-from gsplat_core.poses.odometry import DISTANCE
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 COUNT = 24
@@ -187,4 +187,4 @@ def test_the_unit_without_depth_is_that_of_a_scene_without_depth(rigid):
     odometry = LiveOdometry(rigid.camera)
     placed(blind(rigid), odometry)
     first = odometry.map.keys[0]
-    assert float(odometry.map.points(first.numbers)[:, 2].median()) == pytest.approx(DISTANCE, rel=0.02)
+    assert float(odometry.map.points(first.numbers)[:, 2].median()) == pytest.approx(RELATIVE_DISTANCE, rel=0.02)

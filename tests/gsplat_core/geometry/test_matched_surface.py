@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from gsplat_core.depth.plane_fits import ALIKE_PX2, smooth_disparity, with_matched_surface
+from gsplat_core.depth.registry import with_surface
 from gsplat_core.depth.stereo import variance_px2
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 
 HEIGHT, WIDTH = 128, 160
 NOISE_PX = 0.1
@@ -89,7 +91,7 @@ def test_any_size_is_taken(size):
 
 def frame(depth: np.ndarray, **fields: object) -> Frame:
     image = np.zeros((*depth.shape, 3), np.uint8)
-    origin = {"depth_origin": DepthOrigin.STEREO, "depth_confidence": np.full(depth.shape, 0.9, np.float32)}
+    origin = {"depth_origin": DEPTH_ORIGINS["stereo"], "depth_confidence": np.full(depth.shape, 0.9, np.float32)}
     return Frame(seq=0, pts_ns=0, image=image, depth=depth, **{**origin, **fields})
 
 
@@ -97,27 +99,29 @@ def test_depth_of_a_frame_becomes_the_surface_on_tissue_alone():
     camera = Camera.from_focal(150.0, WIDTH, HEIGHT)
     reach = 150.0 * 4.0
     given = frame((reach / (plane() + noise())).astype(np.float32), right_camera=camera.right_eye(4.0))
-    tissue = EVERYWHERE.copy()
-    tissue[:, :30] = False
-    found = with_matched_surface(given, camera, tissue)
+    tissue = EVERYWHERE.astype(np.uint8)
+    tissue[:, : 30 - DEPTH_ORIGINS["stereo"].tool_margin_px] = 0
+    given = given.with_fields(mask=tissue)
+    found = with_matched_surface(given, camera)
     assert found.depth.dtype == np.float32
     np.testing.assert_array_equal(found.depth[:, :30], given.depth[:, :30])
     true = reach / plane()
     assert rms((found.depth / true - 1)[:, 34:]) < 0.5 * rms((given.depth / true - 1)[:, 34:])
     # The unit plays no part: a pair without a calibration comes out alike.
-    relative = with_matched_surface(given.with_fields(depth=given.depth / 4, right_camera=None), camera, tissue)
+    relative = with_matched_surface(given.with_fields(depth=given.depth / 4, right_camera=None), camera)
     np.testing.assert_allclose(4 * relative.depth, found.depth, rtol=1e-5)
 
 
 def test_depth_that_was_not_matched_stays_as_it_is():
     camera = Camera.from_focal(150.0, WIDTH, HEIGHT)
     depth = (600 / plane()).astype(np.float32)
-    measured = frame(depth, depth_origin=DepthOrigin.MEASURED)
-    assert with_matched_surface(measured, camera, EVERYWHERE) is measured
+    measured = frame(depth, depth_origin=DEPTH_ORIGINS["measured"])
+    assert with_surface(measured, camera) is measured
+    assert with_surface(frame(depth), camera).depth is not depth
     nothing = frame(np.zeros_like(depth))
-    assert with_matched_surface(nothing, camera, EVERYWHERE) is nothing
-    outside = frame(depth)
-    assert with_matched_surface(outside, camera, ~EVERYWHERE) is outside
+    assert with_surface(nothing, camera) is nothing
+    outside = frame(depth, mask=np.zeros(depth.shape, np.uint8))
+    assert with_surface(outside, camera) is outside
 
 
 def test_a_variance_is_what_its_confidence_says():

@@ -11,13 +11,13 @@ import torch
 
 from gsplat_core import Camera, Frame, Gaussians, Model, Reconstructor, ReconstructorConfig
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.measure import ORIGIN_ERROR, Measurement
+from gsplat_core.geometry.measure import Measurement
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
-MEASURED = DepthSource(DepthOrigin.MEASURED, metric=True)
+MEASURED = DepthSource(DEPTH_ORIGINS["measured"], metric=True)
 
 
 def slope(gradient: float, distance: float = 50.0, source: DepthSource | None = MEASURED) -> Model:
@@ -74,12 +74,16 @@ def test_a_pose_moves_points_and_not_distances():
 
 def test_relative_models_say_so_and_are_less_sure():
     errors = []
-    for source in (MEASURED, DepthSource(DepthOrigin.STEREO, True), DepthSource(DepthOrigin.LIGHT, False), None):
+    for source in (
+        MEASURED,
+        DepthSource(DEPTH_ORIGINS["stereo"], True),
+        DepthSource(DEPTH_ORIGINS["light"], False),
+        None,
+    ):
         found = Measurement(slope(0.0, source=source), 0.0)
         assert found.unit == ("mm" if source is not None and source.metric else "relative")
         errors.append(found.point(32, 24).depth_error)
     assert errors == sorted(errors) and errors[-1] > 0.2 * 50
-    assert set(ORIGIN_ERROR) == {*DepthOrigin, None}
 
 
 def test_what_was_never_observed_is_refused():
@@ -112,7 +116,7 @@ def test_error_bars_hold_on_a_trained_model():
     learning = Reconstructor(ReconstructorConfig(gaussians=2000, max_gaussians=2500), recording.camera)
     learning.observe(frame, steps=20)
     model = learning.snapshot()
-    assert model.metric and model.depth_source is not None and model.depth_source.origin is DepthOrigin.MEASURED
+    assert model.metric and model.depth_source is not None and model.depth_source.origin is DEPTH_ORIGINS["measured"]
     found = Measurement(model, 0.0)
     rng = np.random.default_rng(0)
     places = [(x, y) for x, y in rng.integers((4, 4), (92, 76), (200, 2)) if frame.mask is None or frame.mask[y, x]]
@@ -126,10 +130,10 @@ def test_error_bars_hold_on_a_trained_model():
 @pytest.mark.parametrize(
     ("first", "second", "wanted"),
     [
-        (DepthOrigin.MEASURED, DepthOrigin.MEASURED, True),
-        (DepthOrigin.MEASURED, DepthOrigin.LIGHT, False),
-        (DepthOrigin.PARALLAX, DepthOrigin.MEASURED, False),
-        (None, DepthOrigin.MEASURED, False),
+        (DEPTH_ORIGINS["measured"], DEPTH_ORIGINS["measured"], True),
+        (DEPTH_ORIGINS["measured"], DEPTH_ORIGINS["light"], False),
+        (DEPTH_ORIGINS["parallax"], DEPTH_ORIGINS["measured"], False),
+        (None, DEPTH_ORIGINS["measured"], False),
     ],
 )
 def test_a_model_is_metric_only_where_all_of_its_depth_is(first, second, wanted):

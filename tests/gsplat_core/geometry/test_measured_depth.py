@@ -8,7 +8,8 @@ import pytest
 from gsplat_core.depth.maps import measured_confidence
 from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 
 ROWS, COLUMNS = 40, 48
 
@@ -94,10 +95,10 @@ def test_nothing_known_is_nothing_believed():
 def test_recorded_depth_keeps_its_values_and_says_which_it_doubts():
     depth = slope()
     depth[:, -1] = 229.0
-    frame = Frame(0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), depth=depth, depth_origin=DepthOrigin.MEASURED)
+    frame = Frame(0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), depth=depth, depth_origin=DEPTH_ORIGINS["measured"])
     finder = DepthFinder("recorded", Camera.from_focal(50.0, COLUMNS, ROWS))
     given = finder.with_depth(frame)
-    assert given.depth is depth and given.depth_origin is DepthOrigin.MEASURED
+    assert given.depth is depth and given.depth_origin is DEPTH_ORIGINS["measured"]
     assert np.array_equal(given.depth_confidence, measured_confidence(depth))
     sure = np.full_like(depth, 0.7)
     frame = frame.with_fields(depth_confidence=sure)

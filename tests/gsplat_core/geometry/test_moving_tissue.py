@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from gsplat_core.depth import moving_tissue
-from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.depth.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 
 FPS = 10.0
 
@@ -41,7 +41,7 @@ def test_depth_of_every_frame() -> None:
     errors, shares = [], []
     for number in range(3, len(frames), 7):
         depth, true = found.depth_of(number), list(recording())[number].depth
-        assert depth.origin is DepthOrigin.PARALLAX
+        assert depth.origin is DEPTH_ORIGINS["parallax"]
         assert depth.doubt is None
         tissue = frames[number].mask
         assert tissue is not None

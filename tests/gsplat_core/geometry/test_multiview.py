@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import BELIEVED, DepthMap
+from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.multiview import MOST_VIEWS, chosen_views, depth_of_view, view_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.moving_scope import (
     FIRST,
     HEIGHT,
@@ -41,7 +42,7 @@ def errors(found: DepthMap) -> NDArray[np.float64]:
 def test_a_slanted_surface_is_found(step: tuple[float, float, float]) -> None:
     found = found_in(*video(8, step))
     assert found.depth.shape == found.confidence.shape == (HEIGHT, WIDTH)
-    assert found.origin is DepthOrigin.PARALLAX
+    assert found.origin is DEPTH_ORIGINS["parallax"]
     assert not found.metric
     wrong = errors(found)
     assert wrong.size > 0.5 * HEIGHT * WIDTH

@@ -13,8 +13,9 @@ from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.tracks import FeatureTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
-from gsplat_core.poses.odometry import DISTANCE, Trajectory, trajectory_of
+from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
 
 COUNT = 16
@@ -49,7 +50,7 @@ def test_the_way_of_a_moving_scope_is_found(rigid, found):
 
 
 def test_the_first_frames_tissue_is_at_the_stated_distance(found):
-    assert np.median(found.points[:, 2]) == pytest.approx(DISTANCE, rel=0.1)
+    assert np.median(found.points[:, 2]) == pytest.approx(RELATIVE_DISTANCE, rel=0.1)
 
 
 def test_depth_of_the_points_follows_the_true_depth(rigid, found):

@@ -8,7 +8,8 @@ import pytest
 from gsplat_core.depth import registry
 from gsplat_core.depth.registry import DepthFinder, Sentences
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
+from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
 
 FRAME_NS = 33_333_333
@@ -30,9 +31,9 @@ def origins(finder: DepthFinder, frames: list[Frame]) -> set[DepthOrigin | None]
 
 def test_parallax_is_looked_for_by_itself_only_where_there_is_time(stream):
     """A camera that has to be kept up with gets none."""
-    assert origins(DepthFinder("auto", FIRST, has_time=True), stream) == {None, DepthOrigin.PARALLAX}
+    assert origins(DepthFinder("auto", FIRST, has_time=True), stream) == {None, DEPTH_ORIGINS["parallax"]}
     assert origins(DepthFinder("auto", FIRST), stream) == {None}
-    assert origins(DepthFinder("parallax", FIRST), stream) == {None, DepthOrigin.PARALLAX}
+    assert origins(DepthFinder("parallax", FIRST), stream) == {None, DEPTH_ORIGINS["parallax"]}
 
 
 def test_nothing_is_learned_from_frames_that_are_only_shown(stream):
@@ -43,7 +44,7 @@ def test_nothing_is_learned_from_frames_that_are_only_shown(stream):
 
 def test_depth_that_a_frame_came_with_is_taken_first(stream):
     measured = np.full((HEIGHT, WIDTH), 3.0, np.float32)
-    given = [frame.with_fields(depth=measured, depth_origin=DepthOrigin.MEASURED) for frame in stream]
+    given = [frame.with_fields(depth=measured, depth_origin=DEPTH_ORIGINS["measured"]) for frame in stream]
     finder = DepthFinder("auto", FIRST, has_time=True)
     assert all(finder.with_depth(frame) is frame for frame in given)
     assert finder.with_depth(given[0], shown_only=True) is given[0]

@@ -12,7 +12,7 @@ import torch
 
 from gsplat_core.depth import stereo
 from gsplat_core.depth.stereo import StereoDepth
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from tests.gsplat_core.geometry.pairs import (
     BASELINE_MM,
     FOCAL_PX,
@@ -51,7 +51,7 @@ def test_a_known_surface_comes_out_in_millimetres(left, right):
     found = estimate(frame(left, right))
     error, believed = off_by(found, bowl())
     assert error < 0.005 and believed > 0.8
-    assert found.metric and found.origin is DepthOrigin.STEREO and found.doubt is None and found.remark is None
+    assert found.metric and found.origin is DEPTH_ORIGINS["stereo"] and found.doubt is None and found.remark is None
     assert found.believed.dtype == np.float32 and (found.believed[found.confidence < 0.5] == 0).all()
 
 

@@ -13,8 +13,8 @@ from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io import bundle, files
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.model import Model
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
@@ -60,7 +60,9 @@ def test_colours_of_the_right_eye_are_kept_and_part_of_the_digest(make_gaussians
             load_bundle(tmp_path)
 
 
-@pytest.mark.parametrize("source", [None, *(DepthSource(origin, metric=False) for origin in DepthOrigin)])
+@pytest.mark.parametrize(
+    "source", [None, *(DepthSource(origin, metric=False) for origin in (DEPTH_ORIGINS[name] for name in DEPTH_ORIGINS))]
+)
 def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaussians, tmp_path):
     model = replace(make_model(make_gaussians(4)), depth_source=source)
     save_bundle(model, tmp_path)

@@ -10,7 +10,8 @@ import pytest
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 
@@ -36,7 +37,7 @@ def test_a_point_appears_to_the_right_camera_where_its_disparity_says(tmp_path: 
     folder = synthesize(tmp_path / "pair", frames=1, width_px=96, height_px=80, stereo=True)
     recording = open_recording(folder, scale=scale)
     frame = next(iter(recording))
-    assert frame.depth_origin is DepthOrigin.MEASURED and frame.depth is not None
+    assert frame.depth_origin is DEPTH_ORIGINS["measured"] and frame.depth is not None
     right, K, baseline = frame.right_camera, recording.camera.K, recording.stereo_baseline_mm
     assert right is not None and (right.width_px, right.height_px) == (frame.width_px, frame.height_px)
     z = float(frame.depth[10, 20])

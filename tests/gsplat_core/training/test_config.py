@@ -8,11 +8,8 @@ import pytest
 from gsplat_core.deformation.basis import BasisLearningRates
 from gsplat_core.deformation.hexplane import HexPlaneLearningRates
 from gsplat_core.errors import InvalidSetting, UserError
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.training.config import (
-    MATCHED_WEIGHS,
-    MEASURED_WEIGHS,
-    MEASURED_WEIGHS_ONLINE,
     LearningRates,
     ReconstructorConfig,
 )
@@ -88,29 +85,24 @@ def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_m
     assert not online.squared_error
 
 
-@pytest.mark.parametrize("origin", [None, *DepthOrigin])
-def test_measured_depth_and_that_of_two_eyes_count_more_than_other_depth_that_was_found(make_frame, origin):
-    config = ReconstructorConfig(depth_weight=0.2)
-    frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
-    offline, online = {DepthOrigin.STEREO: MATCHED_WEIGHS}, {}
-    for measured in (None, DepthOrigin.MEASURED):
-        offline[measured], online[measured] = MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE
-    for all_known, factors in ((True, offline), (False, online)):
-        starts = config.starting_from(frame, all_known)
-        assert starts.depth_weight == pytest.approx(0.2 * factors.get(origin, 1.0))
-        assert starts.rates.right_share == (1.0 if all_known and origin is DepthOrigin.STEREO else 0.1)
+@pytest.mark.parametrize("all_known", [True, False])
+@pytest.mark.parametrize("name", DEPTH_ORIGINS)
+def test_right_colours_follow_at_the_full_rate_offline_where_both_eyes_gave_the_depth(make_frame, name, all_known):
+    frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=DEPTH_ORIGINS[name])
+    starts = ReconstructorConfig().starting_from(frame, all_known)
+    assert starts.rates.right_share == (1.0 if all_known and name == "stereo" else 0.1)
 
 
 @pytest.mark.parametrize(
     ("origin", "all_known", "factor"),
     [
-        (DepthOrigin.MEASURED, True, 10.0), (DepthOrigin.MEASURED, False, 3.0), (None, True, 10.0), (None, False, 3.0),
-        (DepthOrigin.STEREO, True, 10.0), (DepthOrigin.STEREO, False, 1.0), (DepthOrigin.LIGHT, True, 1.0),
-        (DepthOrigin.LEARNED, False, 1.0), (DepthOrigin.PARALLAX, True, 1.0),
+        (DEPTH_ORIGINS["measured"], True, 10.0), (DEPTH_ORIGINS["measured"], False, 3.0), (None, True, 10.0), (None, False, 3.0),
+        (DEPTH_ORIGINS["stereo"], True, 10.0), (DEPTH_ORIGINS["stereo"], False, 1.0), (DEPTH_ORIGINS["light"], True, 1.0),
+        (DEPTH_ORIGINS["learned"], False, 1.0), (DEPTH_ORIGINS["parallax"], True, 1.0),
     ],
 )  # fmt: skip
 def test_the_weight_of_depth_by_its_origin(make_frame, origin, all_known, factor):
-    """Numbers, not the constants: exchanged ones would be found in both places."""
+    """Compare with numbers, because a comparison with the table would accept exchanged entries."""
     frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
     assert ReconstructorConfig(depth_weight=0.1).starting_from(frame, all_known).depth_weight == pytest.approx(
         0.1 * factor

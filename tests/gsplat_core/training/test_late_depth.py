@@ -10,8 +10,9 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.placement import MOST_LATE
 from gsplat_core.training.reconstructor import Reconstructor
@@ -30,9 +31,9 @@ def frame_at(k: int, **fields: object) -> Frame:
     return Frame(k, k * 33_000_000, ((planes + 1) * 95 + 10).astype(np.uint8), **fields)
 
 
-def found(frame: Frame, depth: float | np.ndarray = 80.0, origin: DepthOrigin = DepthOrigin.STEREO) -> Frame:
+def found(frame: Frame, depth: float | np.ndarray = 80.0, origin: DepthOrigin = DEPTH_ORIGINS["stereo"]) -> Frame:
     plane = np.broadcast_to(np.asarray(depth, np.float32), frame.image.shape[:2]).copy()
-    eye = CAMERA.right_eye(5.0) if origin is DepthOrigin.STEREO else None
+    eye = CAMERA.right_eye(5.0) if origin is DEPTH_ORIGINS["stereo"] else None
     return frame.with_fields(depth=plane, depth_confidence=np.ones_like(plane), depth_origin=origin, right_camera=eye)
 
 
@@ -58,7 +59,7 @@ def test_the_first_depth_places_the_scene_and_its_picture_stays() -> None:
     assert distance(made, 2) == pytest.approx(80, rel=0.02)
     after = render(made.snapshot().at(frame_at(1).time_s), CAMERA).image
     assert float((after - before).abs().mean()) < 0.03
-    assert made.snapshot().depth_source == DepthSource(DepthOrigin.STEREO, metric=True)
+    assert made.snapshot().depth_source == DepthSource(DEPTH_ORIGINS["stereo"], metric=True)
 
 
 def test_rehearsal_looks_at_it() -> None:
@@ -78,7 +79,7 @@ def test_rehearsal_looks_at_it() -> None:
     assert error(late=True) < 0.7 * error(late=False)
 
 
-@pytest.mark.parametrize("origin", [DepthOrigin.LIGHT, DepthOrigin.PARALLAX])
+@pytest.mark.parametrize("origin", [DEPTH_ORIGINS["light"], DEPTH_ORIGINS["parallax"]])
 def test_depth_without_a_unit_places_a_scene_and_gives_it_none(origin: DepthOrigin) -> None:
     made = learner()
     assert made.take_depth(found(frame_at(0), 75.0, origin))
@@ -90,11 +91,13 @@ def test_depth_without_a_unit_places_a_scene_and_gives_it_none(origin: DepthOrig
 
 def test_the_loss_does_not_see_depth_by_light() -> None:
     made = learner()
-    made.take_depth(found(frame_at(0), 75.0, DepthOrigin.LIGHT))
+    made.take_depth(found(frame_at(0), 75.0, DEPTH_ORIGINS["light"]))
     assert made._window.find(0, MOST_LATE).depth is None
 
 
-@pytest.mark.parametrize(("origin", "goes_to"), [(DepthOrigin.STEREO, (50 * 80) ** 0.5), (DepthOrigin.LIGHT, 50.0)])
+@pytest.mark.parametrize(
+    ("origin", "goes_to"), [(DEPTH_ORIGINS["stereo"], (50 * 80) ** 0.5), (DEPTH_ORIGINS["light"], 50.0)]
+)
 def test_a_scene_that_started_from_depth_is_corrected_and_not_placed_again(origin: DepthOrigin, goes_to: float) -> None:
     made = Reconstructor(ReconstructorConfig(gaussians=300, max_gaussians=400), CAMERA, live=LiveTraining())
     made.observe(frame_at(0, depth=np.full((HEIGHT, WIDTH), 50, np.float32)), steps=3)

@@ -8,7 +8,8 @@ import torch
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
@@ -279,7 +280,7 @@ def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
     for k in range(newer + 1):
         made.observe(frame_at(k), budget=Budget.of_steps(1))
     depth = np.full((HEIGHT, WIDTH), 40.0, np.float32)
-    deep = frame_at(0).with_fields(depth=depth, depth_origin=DepthOrigin.STEREO)
+    deep = frame_at(0).with_fields(depth=depth, depth_origin=DEPTH_ORIGINS["stereo"])
     assert made.take_depth(deep) == is_taken
     source = made.snapshot().depth_source
     assert (source is not None and "stereo" in str(source).lower()) == is_taken

@@ -8,7 +8,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.training.observations import Observation, ObservationWindow
 
 
@@ -34,11 +34,11 @@ def test_an_observation_holds_what_the_frame_holds(make_frame, camera):
     assert np.array_equal(seen.depth.numpy(), depth)
 
 
-@pytest.mark.parametrize("origin", [DepthOrigin.LIGHT, DepthOrigin.LEARNED])
+@pytest.mark.parametrize("origin", [DEPTH_ORIGINS["light"], DEPTH_ORIGINS["learned"]])
 def test_depth_of_a_single_picture_is_for_the_start_of_a_scene_and_not_for_the_loss(make_frame, camera, origin):
     frame = make_frame(depth=np.full((40, 48), 55.0), depth_origin=origin)
     assert Observation.of(frame, camera).depth is None
-    assert Observation.of(frame.with_fields(depth_origin=DepthOrigin.PARALLAX), camera).depth is not None
+    assert Observation.of(frame.with_fields(depth_origin=DEPTH_ORIGINS["parallax"]), camera).depth is not None
 
 
 @pytest.mark.cuda

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth.maps import BELIEVED
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
 from gsplat_core.training import parallax
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.parallax import frames_with_parallax, to_fit
@@ -30,7 +29,7 @@ def test_every_frame_of_a_short_recording_gets_depth() -> None:
     for frame in given:
         assert frame.depth is not None
         assert frame.depth_confidence is not None
-        assert frame.depth_origin is DepthOrigin.PARALLAX
+        assert frame.depth_origin is DEPTH_ORIGINS["parallax"]
         # Also where it is not believed there is something to start from.
         assert (frame.depth > 0).all()
     assert np.median(np.abs(given[0].depth / depth_of_surface() - 1)) < 0.02
@@ -89,7 +88,7 @@ def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
     sure = np.full(true.shape, 0.8, np.float32)
     depth = (focal_px / (focal_px / true + noise_px)).astype(np.float32)
     frames = [
-        frame.with_fields(depth=depth, depth_confidence=sure, depth_origin=DepthOrigin.STEREO) for frame in frames
+        frame.with_fields(depth=depth, depth_confidence=sure, depth_origin=DEPTH_ORIGINS["stereo"]) for frame in frames
     ]
     found = to_fit(list(frames), lambda frame: Observation.of(frame, cameras[0]), finds_depth=False)
     for frame, one in zip(found.frames, found.seen, strict=True):
@@ -98,6 +97,6 @@ def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
         assert np.array_equal(learned, np.where(learned > 0, frame.depth, 0)) and (learned > 0).mean() > 0.8
         off, before = np.std(frame.depth / true - 1), np.std(depth / true - 1)
         assert off < 0.5 * before
-    measured = [frame.with_fields(depth_origin=DepthOrigin.MEASURED) for frame in frames]
+    measured = [frame.with_fields(depth_origin=DEPTH_ORIGINS["measured"]) for frame in frames]
     as_it_was = to_fit(list(measured), lambda frame: Observation.of(frame, cameras[0]), finds_depth=False)
     assert all(frame.depth is depth for frame in as_it_was.frames)

@@ -12,7 +12,8 @@ from gsplat_core.deformation import BasisField
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Seen
 from gsplat_core.training.initialisation import gaussians_from_frame
@@ -97,8 +98,8 @@ def covered(mask: np.ndarray) -> np.ndarray:
     "fields",
     [
         {"depth": None},
-        {"depth_origin": DepthOrigin.LIGHT},
-        {"depth_origin": DepthOrigin.LEARNED},
+        {"depth_origin": DEPTH_ORIGINS["light"]},
+        {"depth_origin": DEPTH_ORIGINS["learned"]},
         {"depth_confidence": np.full((ASKED.height_px, ASKED.width_px), 0.1, np.float32)},
     ],
     ids=["none", "light", "learned", "not believed"],
@@ -110,11 +111,6 @@ def test_frames_that_do_not_tell_the_motion_of_a_surface_leave_the_field_alone(f
 
 def test_one_frame_tells_no_motion(fixed):
     assert not moves_before_the_first_step(fixed.camera, list(fixed)[:1])
-
-
-def test_depth_by_light_tells_the_motion_where_it_followed_the_tissue(fixed):
-    frames = [frame.with_fields(depth_origin=DepthOrigin.LIGHT) for frame in fixed]
-    assert moves_before_the_first_step(fixed.camera, frames, light_shows_motion=True)
 
 
 def test_frames_with_depth_tell_the_motion_before_the_first_step(fixed):

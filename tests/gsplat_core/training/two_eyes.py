@@ -9,7 +9,8 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.initialisation import gaussians_from_frame
 
@@ -56,5 +57,5 @@ def stereo_frame(seq: int = 0, *, with_depth: bool = False, **fields: object) ->
     """Both eyes at frame `seq` of a still scene."""
     left, depth = seen(LEFT)
     if with_depth:
-        fields = {"depth": depth, "depth_origin": DepthOrigin.MEASURED} | fields
+        fields = {"depth": depth, "depth_origin": DEPTH_ORIGINS["measured"]} | fields
     return Frame(seq, seq * 33_000_000, left, **({"right_image": seen(RIGHT)[0], "right_camera": RIGHT} | fields))  # type: ignore[arg-type]

@@ -6,10 +6,11 @@ import pytest
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from operators.applications.replay import ReplaySettings
+from operators.choices import SINKS
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.registry import SINKS, SinkOptions, input_of
+from operators.sinks.registry import SinkOptions, input_of
 from operators.sources.recording import RecordingSource
 from operators.storage import StorageReserve
 

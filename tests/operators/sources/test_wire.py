@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources import wire
 from operators.sources.options import SourceOptions
 from operators.sources.source import SourceDescription
@@ -23,7 +24,7 @@ def header(**fields):
 def test_a_frame_comes_back_with_all_that_it_has():
     frame = Frame(
         3, -7, IMAGE, arrived_ns=11, status=FrameStatus.DAMAGED, damage="cut off", depth=np.ones((2, 3), np.float32),
-        depth_origin=DepthOrigin.MEASURED, right_image=IMAGE + np.uint8(9), right_camera=CAMERA,
+        depth_origin=DEPTH_ORIGINS["measured"], right_image=IMAGE + np.uint8(9), right_camera=CAMERA,
     )  # fmt: skip
     planes = wire.planes_of(frame)
     assert set(planes) == {"image", "depth", "right_image"}
@@ -35,7 +36,7 @@ def test_a_frame_comes_back_with_all_that_it_has():
         FrameStatus.DAMAGED,
         "cut off",
     )
-    assert back.depth_origin is DepthOrigin.MEASURED and back.depth is frame.depth
+    assert back.depth_origin is DEPTH_ORIGINS["measured"] and back.depth is frame.depth
     assert back.right_camera is not None and np.array_equal(back.right_camera.K, CAMERA.K)
 
 

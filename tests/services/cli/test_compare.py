@@ -13,8 +13,8 @@ import torch
 from gsplat_core import Camera, Gaussians, Model, save_bundle
 from gsplat_core.geometry.mesh import Mesh, mesh_of
 from gsplat_core.io.exports.files import mesh_ply_pieces
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 
@@ -47,7 +47,7 @@ def write(mesh: Mesh, path) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
 def test_a_model_lies_on_its_own_moved_surface(suffix, tmp_path, capsys):
-    model = bumpy(DepthSource(DepthOrigin.MEASURED, metric=True))
+    model = bumpy(DepthSource(DEPTH_ORIGINS["measured"], metric=True))
     save_bundle(model, tmp_path / "model")
     mesh = mesh_of(model, 0.0)
     angle = math.radians(3)
@@ -95,7 +95,7 @@ def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
     ],
 )
 def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, capsys):
-    save_bundle(bumpy(DepthSource(DepthOrigin.MEASURED, metric=True)), tmp_path / "model")
+    save_bundle(bumpy(DepthSource(DEPTH_ORIGINS["measured"], metric=True)), tmp_path / "model")
     (tmp_path / name).write_bytes(content)
     assert run(["compare", str(tmp_path / "model"), str(tmp_path / name)]) == BAD_INPUT
     assert said in capsys.readouterr().err
@@ -103,7 +103,7 @@ def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, cap
 
 @pytest.fixture
 def metric_model(tmp_path):
-    model = bumpy(DepthSource(DepthOrigin.MEASURED, metric=True))
+    model = bumpy(DepthSource(DEPTH_ORIGINS["measured"], metric=True))
     save_bundle(model, tmp_path / "model")
     return tmp_path / "model", mesh_of(model, 0.0)
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, Model, save_bundle
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 
@@ -32,7 +32,7 @@ def wall(tmp_path):
 
 
 def test_a_distance_in_millimetres(wall, capsys):
-    bundle = wall(DepthSource(DepthOrigin.MEASURED, metric=True))
+    bundle = wall(DepthSource(DEPTH_ORIGINS["measured"], metric=True))
     assert run(["measure", bundle, "--time", "0.5", "--from", "22,24", "--to", "47,24", "--json"]) == OK
     said = json.loads(capsys.readouterr().out)
     assert (said["unit"], said["depth_origin"], said["time_s"]) == ("mm", "measured", 0.5)

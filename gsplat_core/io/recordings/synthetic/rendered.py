@@ -16,7 +16,7 @@ from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
 from gsplat_core.io.recordings.synthetic.synthesize import check_arguments, threads_that_fit
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class RenderedRecording:
             DEFAULT_FOCAL_FACTOR * max(settings.width_px, settings.height_px), settings.width_px, settings.height_px
         )
         right = self.camera.right_eye(BASELINE_MM) if settings.stereo else None
-        self._frames = [frame.with_fields(depth_origin=DepthOrigin.MEASURED, right_camera=right) for frame in frames]
+        self._frames = [frame.with_fields(right_camera=right) for frame in frames]
         self.frame_count, self.fps = len(frames), settings.fps
         extras = [] if settings.extras == CLEAR else [settings.extras.described()]
         stated = [*(getattr(settings, each.name) for each in fields(settings) if each.name != "extras"), *extras]

@@ -17,8 +17,8 @@ from gsplat_core.io.exports.formats import FORMATS, ExportWish, format_named, fo
 from gsplat_core.io.ply import load_ply
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.model import Model
 from tests.gsplat_core.io.exports.glb_reader import NAME, read_glb, read_mesh_glb
@@ -229,7 +229,7 @@ def wall(source: DepthSource | None = None) -> Model:
 
 
 def test_a_mesh_as_glb_is_the_surface_that_the_camera_sees(tmp_path):
-    data = exported(tmp_path, wall(DepthSource(DepthOrigin.MEASURED, metric=True)), "mesh-glb", time_s=2.0)
+    data = exported(tmp_path, wall(DepthSource(DEPTH_ORIGINS["measured"], metric=True)), "mesh-glb", time_s=2.0)
     document, values, indices = read_mesh_glb(data)
     assert document["asset"]["extras"] == {"time_s": 2.0, "unit": "millimetre"}
     assert len(values["POSITION"]) == 32 * 24 and len(indices) == 3 * 2 * 31 * 23

@@ -8,7 +8,8 @@ from gsplat_core.io.sessions import SessionInfo, SessionWriter
 from gsplat_core.io.sessions.records import Observed, Rehearsed, camera_record
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame, FrameStatus
 
 HEIGHT_PX, WIDTH_PX = 16, 24
 
@@ -33,7 +34,7 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
         "right_image": rng.integers(0, 256, (*size, 3), np.uint8),
         "depth": depth,
         "depth_confidence": rng.uniform(0, 1, size).astype(np.float32),
-        "depth_origin": list(DepthOrigin)[seq % 4],
+        "depth_origin": DEPTH_ORIGINS[list(DEPTH_ORIGINS)[seq % len(DEPTH_ORIGINS)]],
         "right_camera": Camera.from_focal(20.0, width_px, height_px).right_eye(4.4),
         "mask": rng.integers(0, 2, size, np.uint8),
         "loss_mask": rng.integers(0, 2, size, np.uint8),

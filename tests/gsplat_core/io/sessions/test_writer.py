@@ -15,7 +15,8 @@ from gsplat_core.io.sessions import SessionReader, SessionWriter, WriterOptions
 from gsplat_core.io.sessions.reader import prepared_of
 from gsplat_core.io.sessions.records import DeletedLine, Observed, PreparedLine, ShownLine
 from gsplat_core.io.sessions.writer import Shown
-from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame, FrameStatus
 from tests.gsplat_core.io.sessions.made import Clock, new_frame, same_frame, session_info
 
 
@@ -51,8 +52,8 @@ def test_what_training_was_given_comes_back_to_the_bit(session, frames):
 
 def test_depth_that_came_late_comes_back_in_its_place(tmp_path):
     frames = [new_frame(seq, depth=None, depth_confidence=None, depth_origin=None) for seq in range(3)]
-    late = new_frame(1, depth_origin=DepthOrigin.STEREO)
-    bare = new_frame(0, depth_confidence=None, depth_origin=DepthOrigin.LIGHT)
+    late = new_frame(1, depth_origin=DEPTH_ORIGINS["stereo"])
+    bare = new_frame(0, depth_confidence=None, depth_origin=DEPTH_ORIGINS["light"])
     writer = SessionWriter(tmp_path / "s", session_info(), WriterOptions(segment_bytes=5000))
     for frame, found in zip(frames, [None, bare, late], strict=True):
         writer.frame(frame)
@@ -67,7 +68,7 @@ def test_depth_that_came_late_comes_back_in_its_place(tmp_path):
     first, second = reader.late_depths()
     assert first["depth"].tobytes() == bare.depth.tobytes() and first["depth_confidence"] is None
     assert second["depth_confidence"].tobytes() == late.depth_confidence.tobytes()
-    assert (first["depth_origin"], second["depth_origin"]) == (DepthOrigin.LIGHT, DepthOrigin.STEREO)
+    assert (first["depth_origin"], second["depth_origin"]) == (DEPTH_ORIGINS["light"], DEPTH_ORIGINS["stereo"])
 
 
 def test_late_depth_whose_pictures_are_gone_is_none_and_the_next_one_is_there(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.training.learned_prior import MOST_CELLS, LocalShares, SharesSettings, cells_for
+from gsplat_core.experimental.learned_prior import MOST_CELLS, LocalShares, SharesSettings, cells_for
 
 SETTINGS = SharesSettings(at_first=(0.5, 0.0), decay=0.9, around_cells=1.0, pull=0.01, ridge=0.001)
 

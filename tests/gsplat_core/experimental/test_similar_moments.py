@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.training.learned_prior import FOLLOWED, REMEMBERED, SOONEST, SimilarMoments, weighted_mean
+from gsplat_core.experimental.learned_prior import FOLLOWED, REMEMBERED, SOONEST, SimilarMoments, weighted_mean
 
 
 def motion(phase: float, shape: tuple[int, int] = (12, 16)) -> NDArray[np.float32]:

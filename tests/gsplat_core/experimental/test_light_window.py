@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.depth import light
-from gsplat_core.depth.light import LightWindow
+from gsplat_core.experimental import light
+from gsplat_core.experimental.light import LightWindow
 
 
 def look(name, followed=True):

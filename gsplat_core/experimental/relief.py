@@ -38,7 +38,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.shading import Cells, Change, Shading
+from gsplat_core.experimental.shading import Cells, Change, Shading
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.float64]

@@ -1,13 +1,8 @@
-"""Relative depth for a static scope from the shading of its own light, for streams and for complete recordings.
+"""Relative depth for a static scope from the shading of its own light.
 
 Brightness falls with the square of the distance and the cosine of the incidence angle, and highlights mark surfaces
 that face the lamp (`relief`). Brightness changes of tracked tissue depend on distance and slope alone
 (`light_change`). The depth is never metric, since neither the lamp's power nor the tissue's albedo is known.
-
-Depth by shading for a complete recording, in which each frame is compared with frames before and after it.
-
-The tissue of a key frame is tracked to the frames around it. If that succeeds over the whole recording, the change of
-depth from frame to frame is the tissue's motion along the line of sight, known up to one factor for all frames.
 """
 
 from __future__ import annotations
@@ -19,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import BELIEVED, DepthMap, doubted
-from gsplat_core.depth.relief import Array, Grid, Places, find_change, find_reliefs
-from gsplat_core.depth.shading import Change, Follower, Look, Shading, look_at
+from gsplat_core.depth.maps import DepthMap, doubted
+from gsplat_core.experimental.relief import Array, Grid, Places, find_change, find_reliefs
+from gsplat_core.experimental.shading import Change, Follower, Look, Shading, look_at
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import BELIEVED, LIGHT, RELATIVE_DISTANCE
+from gsplat_core.scene.frames import Frame
 
 SOLVED_AT = (1, 2, 4, 8, 12)
 """Numbers of looks at which all reliefs are re-estimated jointly; in between only the newest look's
@@ -53,20 +49,14 @@ class LightWindow:
         self._reliefs: list[Array] = []
         self.solve()
 
-    def add(self, look: Look, *, solve: bool = True) -> bool:
-        """Add a later look.
-
-        Args:
-            look: look to add.
-            solve: estimate its relief at once.
+    def add(self, look: Look) -> bool:
+        """Add a later look and estimate its relief.
 
         Returns:
             True if it can be tracked; otherwise the window is unchanged.
         """
         if not self._take(look, self._ahead):
             return False
-        if not solve:
-            return True
         if len(self.looks) in SOLVED_AT:
             self.solve()
         else:
@@ -93,10 +83,6 @@ class LightWindow:
         return change.is_followed
 
 
-DISTANCE = 60.0
-"""Geometric mean of every depth map, in arbitrary units; also the start depth of a scene without
-depth.
-"""
 EVERY_S = 0.3
 """Time from one estimate to the next in seconds; frames between reuse the last answer."""
 MOST_LOOKS = 12
@@ -188,9 +174,9 @@ def answer(grid: Grid, relief: Array | None, look: Look, frame: Frame) -> DepthM
     """
     size = frame.image.shape[0], frame.image.shape[1]
     if relief is None:
-        return doubted(size, DepthOrigin.LIGHT, UNSEEN)
+        return doubted(size, LIGHT, UNSEEN)
     share = share_of_distance(grid, relief[None])
-    return doubted(size, DepthOrigin.LIGHT, FLAT) if share < BELIEVED else shown(grid, relief, share, look, size)
+    return doubted(size, LIGHT, FLAT) if share < BELIEVED else shown(grid, relief, share, look, size)
 
 
 def share_of_distance(grid: Grid, reliefs: Array) -> float:
@@ -212,9 +198,9 @@ def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, 
     """
     logarithm = (Places.at(grid, *grid.middles()).value @ relief).reshape(grid.height, grid.width)
     return DepthMap(
-        _enlarged(DISTANCE * np.exp(logarithm), size),
+        _enlarged(RELATIVE_DISTANCE * np.exp(logarithm), size),
         np.asarray(np.clip(_enlarged(share * _near_seen(look.shading), size), 0, 1), np.float32),
-        DepthOrigin.LIGHT,
+        LIGHT,
         metric=False,
     )
 
@@ -228,91 +214,3 @@ def _near_seen(shading: Shading) -> Array:
 
 def _enlarged(plane: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(plane.astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_LINEAR))
-
-
-LOOKS = 160
-"""Largest number of looks; they are spaced further apart in longer recordings."""
-REACH_FRAMES = MOST_LOOKS // 2
-"""Number of looks before and after a key that are compared with it, and the spacing of keys."""
-
-
-def frames_with_light(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], bool]:
-    """Replace the shading depth of a recording by one estimated from all frames together.
-
-    The frames are returned unchanged unless shading depth was requested, the scope is static, all
-    frames show the same tissue and the relief is larger than the expected errors.
-
-    Args:
-        frames: all frames of the recording.
-        cameras: camera of each frame.
-
-    Returns:
-        The frames, and True if their depth was replaced and shows the tissue's motion.
-    """
-    given = list(frames)
-    at_rest = all(np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
-    sizes = {frame.image.shape for frame in given}
-    asked = any(frame.depth_origin is DepthOrigin.LIGHT for frame in given)
-    if not asked or not at_rest or len(sizes) > 1 or any(frame.new_scene is not None for frame in given[1:]):
-        return given, False
-    numbers = _looked_at(given)
-    looks = [look_at(given[number], cameras[0]) for number in numbers]
-    if not all(shows_enough(look) for look in looks):
-        return given, False
-    grid = Grid.of(cameras[0], looks[0].shading.brightness.shape)
-    reliefs = _reliefs(grid, looks)
-    if reliefs is None:
-        return given, False
-    times = np.array([frame.pts_ns for frame in given], np.float64)
-    each = np.stack([np.interp(times, times[numbers], column) for column in reliefs.T], axis=1)
-    nearest = np.abs(times[:, None] - times[numbers]).argmin(axis=1)
-    share = share_of_distance(grid, reliefs)
-    if share < BELIEVED:
-        return given, False
-    size = given[0].image.shape[0], given[0].image.shape[1]
-    found = [shown(grid, relief, share, looks[k], size) for relief, k in zip(each, nearest, strict=True)]
-    return [
-        frame.with_fields(depth=one.kept, depth_confidence=one.confidence, depth_origin=one.origin)
-        for frame, one in zip(given, found, strict=True)
-    ], True
-
-
-def _looked_at(frames: Sequence[Frame]) -> list[int]:
-    """Return the indices of the frames that are compared."""
-    apart_s = max(EVERY_S, (frames[-1].time_s - frames[0].time_s) / LOOKS)
-    numbers = [0]
-    for number, frame in enumerate(frames):
-        if frame.time_s - frames[numbers[-1]].time_s >= apart_s:
-            numbers.append(number)
-    return numbers
-
-
-def _reliefs(grid: Grid, looks: Sequence[Look]) -> Array | None:
-    """Return the relief coefficients of all looks [looks, cosines], or None if tissue cannot be
-    tracked from each key to its neighbours.
-    """
-    total, weight = np.zeros((len(looks), len(grid.half_waves))), np.zeros(len(looks))
-    keys = (
-        range(REACH_FRAMES, max(len(looks) - REACH_FRAMES, REACH_FRAMES + 1), REACH_FRAMES)
-        if len(looks) > 2 * REACH_FRAMES
-        else [len(looks) // 2]
-    )
-    for key in keys:
-        first, end = (
-            (0 if key == keys[0] else key - REACH_FRAMES),
-            (len(looks) if key == keys[-1] else key + REACH_FRAMES + 1),
-        )
-        window = LightWindow(grid, looks[key], looks[first:key])
-        if len(window.looks) != key - first + 1 or not all(
-            window.add(look, solve=False) for look in looks[key + 1 : end]
-        ):
-            return None
-        window.solve()
-        near = np.zeros(len(looks))
-        # Blend linearly between the answers of neighbouring keys.
-        near[first:end] = 1 - np.abs(np.arange(first, end) - key) / (max(end - key, key - first) + 1)
-        found = np.zeros_like(total)
-        for number in range(first, end):
-            found[number] = window.relief_of(looks[number])
-        total, weight = total + near[:, None] * found, weight + near
-    return np.asarray(total / weight[:, None])

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth import light
-from gsplat_core.depth.light import FLAT, UNSEEN, LightDepth
 from gsplat_core.depth.registry import DEPTHS
-from gsplat_core.depth.relief import Grid, Places
-from gsplat_core.depth.shading import shading_of
+from gsplat_core.experimental import light
+from gsplat_core.experimental.light import FLAT, UNSEEN, LightDepth
+from gsplat_core.experimental.relief import Grid, Places
+from gsplat_core.experimental.shading import shading_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, PINK, WIDTH, error, facing_and_distance, rays
 
 
@@ -53,7 +54,7 @@ def noise(seed, cell_px):
 def test_a_lambertian_surface_is_found():
     found, true = look(picture(bowl())), bowl()
     assert found.doubt is None
-    assert (found.origin, found.metric) == (DepthOrigin.LIGHT, False)
+    assert (found.origin, found.metric) == (DEPTH_ORIGINS["light"], False)
     # Measured 0.19 of the level plane's error; the best tilted plane, which needs no light, has 0.75 of it.
     assert error(found.depth, true) < 0.3 * error(plane(), true)
     assert found.confidence.min() > 0.5

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.depth import relief as relief_module
-from gsplat_core.depth.relief import Equations, Grid, Places, appearance, find_change, find_reliefs
-from gsplat_core.depth.shading import LEAST_DETAIL, Change, Shading
+from gsplat_core.experimental.relief import Equations, Grid, Places, appearance, find_change, find_reliefs
+from gsplat_core.experimental.shading import LEAST_DETAIL, Change, Shading
 from gsplat_core.scene.cameras import Camera
 
 GRID = Grid.of(Camera.from_focal(140.0, 160, 128), (32, 40))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth.shading import Follower, look_at
+from gsplat_core.experimental.shading import Follower, look_at
 from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, WIDTH, facing_and_distance, frame, noise, pigment, rays
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsplat_core.depth.shading import shading_of
+from gsplat_core.experimental.shading import shading_of
 from gsplat_core.scene.frames import Frame
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.experimental.learned_prior import LearnedPrior
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.learned_prior import LearnedPrior
 from gsplat_core.training.reconstructor import Reconstructor
 from tests.gsplat_core.training.continuation_checks import check_published_continuations
 from tests.gsplat_core.training.test_motion_prior import CAMERA, INTERVAL_S, SIZE, picture, scored, stream
