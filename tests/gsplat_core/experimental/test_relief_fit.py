@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth import relief as relief_module
+from gsplat_core.experimental import relief as relief_module
 from gsplat_core.experimental.relief import Equations, Grid, Places, appearance, find_change, find_reliefs
 from gsplat_core.experimental.shading import LEAST_DETAIL, Change, Shading
 from gsplat_core.scene.cameras import Camera
