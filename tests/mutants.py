@@ -16,6 +16,10 @@ Only tests that execute the changed line run, for a minute at most; `tests/execu
 A mutant on a line that no test executes survives. A run ends at the first failure. A test that also
 fails without the mutant is flaky: it is listed and excluded, and the remaining tests decide. Mutants
 are drawn at random with a seed, in equal parts from each folder.
+
+The boundary of a comparison (`<` to `<=`) is shifted only where an integer is compared, by its text. Of 63
+boundaries drawn from all folders, the rule leaves out 44. 34 of them compare measured numbers or clock times,
+where equality does not occur and the change is none; the other ten compare integers that the text does not show.
 """
 
 from __future__ import annotations
@@ -43,7 +47,7 @@ import pytest
 from tests.executed import Executed, bring_up_to_date
 from tests.forks import RAISED, ROOT, Fork, execute_everywhere, import_libraries, pytest_fork
 
-PARTS = ("training", "geometry", "depth", "poses", "endoscope")
+PARTS = ("training", "geometry", "depth", "poses", "endoscope", "experimental")
 """Packages of the core that are sampled, wherever they are in its tree. Kernels and data classes are left out."""
 MOST_S = 60.0
 """Seconds of tests, as recorded, that run for a mutant."""
@@ -61,6 +65,11 @@ OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
 }  # fmt: skip
 EXCHANGED = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "maximum", "maximum": "minimum"}
+COUNTS = {
+    "count", "counts", "frames", "bytes", "number", "seq", "size", "rows", "columns", "attempts", "characters", "points",
+    "matches", "lines", "entries", "levels", "steps", "rounds", "width", "height", "length",
+}  # fmt: skip
+"""Last words of names of integers. Boundaries are shifted only where an integer is compared."""
 UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_progress"}
 """Calls with no effect except a log line, which are not mutated."""
 
@@ -137,7 +146,9 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
 def _changes(node: ast.AST) -> list[tuple[str, Callable[[], None]]]:
     """Return the kinds of changes to a node, each with a function that changes it in place."""
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
-        kinds = zip(("comparison", "boundary"), COMPARISONS.get(type(node.ops[0]), ()), strict=False)
+        kinds = zip(
+            ("comparison", "boundary")[: 1 + _of_integers(node)], COMPARISONS.get(type(node.ops[0]), ()), strict=False
+        )
         return [(kind, lambda new=new: node.ops.__setitem__(0, new())) for kind, new in kinds]
     if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _is_text(node):
         return [("arithmetic", lambda: setattr(node, "op", OPERATORS[type(node.op)]()))]
@@ -157,6 +168,16 @@ def _changes(node: ast.AST) -> list[tuple[str, Callable[[], None]]]:
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
         return [("sign", lambda: setattr(node, "op", ast.UAdd()))]
     return []
+
+
+def _of_integers(node: ast.Compare) -> bool:
+    sides = [side.operand if isinstance(side, ast.UnaryOp) else side for side in (node.left, *node.comparators)]
+    names = [getattr(side, "id", "") or getattr(side, "attr", "") for side in sides]
+    return (
+        any(isinstance(side, ast.Call) and _called(side) == "len" for side in sides)
+        or any(isinstance(side, ast.Constant) and type(side.value) is int and side.value != 0 for side in sides)
+        or any(name.lower().split("_")[-1] in COUNTS for name in names)
+    )
 
 
 def _called(call: ast.Call) -> str:

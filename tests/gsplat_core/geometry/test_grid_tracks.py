@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsplat_core.geometry.grid_tracks import LONGEST_PX, follow_grids, seen_by
+from gsplat_core.geometry.grid_tracks import LONGEST_PX, TexturedPicture, follow_grids, seen_by
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, FOCAL, HEIGHT, WIDTH, texture
@@ -50,3 +50,46 @@ def test_large_pictures_are_made_small() -> None:
     small = seen_by(Frame(0, 0, np.asarray(image, np.uint8)), Camera.from_focal(600.0, 700, 500))
     assert small.texture.shape[1] == LONGEST_PX == small.camera.width_px
     assert small.usable.shape == small.texture.shape
+
+
+def test_the_usable_part_keeps_one_pixel_from_the_field_of_view_and_six_from_tools() -> None:
+    mask, field = np.ones((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, :40], field[80:] = 0, 0
+    usable = seen_by(shifted((0.0, 0.0)).with_fields(mask=mask, loss_mask=field), FIRST).usable
+    columns, rows = np.flatnonzero(usable[40]), np.flatnonzero(usable[:, 100])
+    assert columns[0] == 40 + 5 + 1 and columns[-1] >= WIDTH - 2
+    assert rows[-1] == 79 - 1
+
+
+def test_texture_is_centred_and_as_strong_in_weak_light() -> None:
+    bright, dim = (seen_by(shifted((0.0, 0.0), gain), FIRST) for gain in (1.0, 0.5))
+    inner = bright.usable[20:-20, 20:-20] > 0
+    values = bright.texture[20:-20, 20:-20][inner].astype(float)
+    assert abs(values.mean() - 128) < 4 and 30 < values.std() < 60
+    again = dim.texture[20:-20, 20:-20][inner].astype(float)
+    assert abs(again.std() - values.std()) < 5 and np.corrcoef(values, again)[0, 1] > 0.98
+
+
+def test_flat_pictures_have_no_texture() -> None:
+    noise = np.random.default_rng(0).integers(0, 2, (HEIGHT, WIDTH, 1), np.uint8)
+    flat = seen_by(Frame(0, 0, np.repeat(120 + noise, 3, 2).astype(np.uint8)), FIRST)
+    assert flat.texture.astype(float).std() < 20
+
+
+def test_a_grid_has_a_point_every_ten_pixels_that_is_seen_in_three_of_ten_pictures() -> None:
+    still = seen_by(shifted((0.0, 0.0)), FIRST)
+    hidden = TexturedPicture(still.texture, still.usable.copy(), FIRST)
+    hidden.usable[:, : WIDTH // 2] = 0
+    rows, columns = range(5, HEIGHT, 10), range(5, WIDTH, 10)
+    for visible, expected in ((2, False), (3, True)):
+        pictures = [still] * visible + [hidden] * (10 - visible)
+        tracks = follow_grids(pictures, np.arange(10.0), [0])
+        x = np.unique(np.round(tracks.rays[0, :, 0] * FOCAL + WIDTH / 2 - 0.5).astype(int))
+        y = np.unique(np.round(tracks.rays[0, :, 1] * FOCAL + HEIGHT / 2 - 0.5).astype(int))
+        inner = [column for column in columns if 6 <= column < WIDTH - 6]
+        assert x.tolist() == [column for column in inner if expected or column >= WIDTH // 2]
+        assert y.tolist() == [row for row in rows if 6 <= row < HEIGHT - 6]
+    assert tracks.extent == (WIDTH / 2 / FOCAL, HEIGHT / 2 / FOCAL) and tracks.focal_px == FOCAL
+    part = tracks.of(slice(0, 4), slice(1, 3))
+    assert part.rays.shape == (2, 4, 2) and part.seen.shape == (2, 4) and part.poses.shape == (2, 4, 4)
+    assert part.times_s.tolist() == [1.0, 2.0]

@@ -127,3 +127,91 @@ def test_what_decides_nothing_is_refused(rng):
     with pytest.raises(InvalidSetting, match="no triangles with an area"):
         ClosestPoints(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     assert math.isfinite(ClosestPoints(*tissue()).extent)
+
+
+def test_triangles_of_almost_no_area_are_left_out():
+    """Their normals are noise. The sliver is nearer to the query point than the sound triangle."""
+    vertices = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1], [4, 0, 1], [2, 1e-13, 1]])
+    surface = ClosestPoints(vertices, np.array([[0, 1, 2], [3, 4, 5]]))
+    found = surface.closest(np.array([[1.0, 1.0, 1.0]]))
+    np.testing.assert_allclose(found.points, [[1, 1, 0]], atol=1e-9)
+    np.testing.assert_allclose(found.normals, [[0, 0, 1]], atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e10])
+def test_meshes_of_an_implausible_size_are_refused(size):
+    vertices = size * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    with pytest.raises(InvalidSetting, match="supported range is 1e-06 to 1e"):
+        ClosestPoints(vertices, np.array([[0, 1, 2]]))
+    assert ClosestPoints(vertices / size, np.array([[0, 1, 2]])).extent == pytest.approx(math.sqrt(2))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_closest_points_of_few_large_triangles_are_exact(rng, count):
+    """Against the projection onto the plane, the edges and the corners of each triangle."""
+    corners = rng.normal(size=(count, 3, 3)) * [10, 10, 1]
+    points = 8 * rng.normal(size=(100, 3))
+    found = ClosestPoints(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3)).closest(points)
+    exact = np.full(len(points), np.inf)
+    for a, b, c in corners:
+        normal = np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a))
+        flat = points - ((points - a) @ normal)[:, None] * normal
+        sides = [np.cross(q - p, flat - p) @ normal >= 0 for p, q in ((a, b), (b, c), (c, a))]
+        exact = np.where(np.all(sides, axis=0), np.minimum(exact, np.abs((points - a) @ normal)), exact)
+        for p, q in ((a, b), (b, c), (c, a)):
+            share = np.clip((points - p) @ (q - p) / ((q - p) @ (q - p)), 0, 1)
+            exact = np.minimum(exact, np.linalg.norm(points - p - share[:, None] * (q - p), axis=1))
+    np.testing.assert_allclose(found.distances, exact, rtol=1e-9)
+
+
+def test_the_statistics_of_distances_are_those_of_their_values():
+    """Heights above a large flat triangle, one of them below it."""
+    surface = ClosestPoints(np.array([[-50.0, -50, 0], [150, -50, 0], [-50, 150, 0]]), np.array([[0, 1, 2]]))
+    heights = np.array([1.0, 2.0, 3.0, 4.0, -10.0, 0.0])
+    points = np.column_stack([np.arange(6.0), np.zeros(6), heights])
+    signed, summary = distances(points, surface, 3.5)
+    np.testing.assert_allclose(signed, heights, atol=1e-9)
+    assert summary.mean == pytest.approx(0.0, abs=1e-9) and summary.median == pytest.approx(1.5)
+    assert summary.absolute_p50 == pytest.approx(2.5)
+    assert summary.absolute_p90 == pytest.approx(7.0) and summary.absolute_p95 == pytest.approx(8.5)
+    assert summary.rmse == pytest.approx(math.sqrt(130 / 6))
+    assert summary.inlier_share == pytest.approx(4 / 6) and summary.inlier_distance == 3.5 and summary.points == 6
+
+
+@pytest.mark.parametrize("trim", [0.05, 1.5, float("nan")])
+def test_a_trim_out_of_range_is_refused(trim):
+    with pytest.raises(InvalidSetting, match=r"it must be from 0\.1 to 1"):
+        register(np.zeros((20, 3)), ClosestPoints(*tissue()), trim=trim)
+
+
+def test_a_registration_starts_from_the_guess_and_keeps_its_scale():
+    surface = ClosestPoints(*tissue())
+    points = tissue()[0]
+    true = rigid((2.0, -1.0, 1.5), (0.5, -0.4, 0.6))
+    guess = true.copy()
+    guess[:3, :3] *= 2.0
+    found = register(
+        moved_by(np.linalg.inv(guess), points), surface, initial=guess @ rigid((0.5, 0.0, 0.0), (0.1, 0.0, 0.0))
+    )
+    assert found.scale == pytest.approx(2.0, rel=1e-6)
+    back = moved_by(found.transform, moved_by(np.linalg.inv(guess), points))
+    assert np.linalg.norm(back - points, axis=1).max() < 0.02
+    assert 1 < found.rounds < 60
+
+
+def test_twelve_points_are_enough():
+    surface = ClosestPoints(*tissue())
+    points = tissue()[0][::250][:12]
+    assert register(points + [0.1, 0, 0], surface).rounds >= 1
+    with pytest.raises(InvalidSetting, match="at least 12 points, got 11"):
+        register(points[:11], surface)
+
+
+def test_points_nearly_on_a_line_decide_no_rotation():
+    line = np.outer(np.arange(6.0), [1.0, 2.0, 3.0])
+    bent = line.copy()
+    bent[2] += [0.03, 0.0, 0.0]
+    assert np.allclose(from_pairs(bent, bent), np.eye(4), atol=1e-9)
+    bent[2] = line[2] + [1e-8, 0.0, 0.0]
+    with pytest.raises(InvalidSetting, match="collinear"):
+        from_pairs(bent, bent)

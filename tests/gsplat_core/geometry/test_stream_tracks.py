@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from gsplat_core.geometry.stream_tracks import MOST_POINTS, SIDE_PX, SmallPictures, StreamTracks
+from gsplat_core.geometry.stream_tracks import (
+    MOST_POINTS,
+    SIDE_PX,
+    SmallPicture,
+    SmallPictures,
+    StreamTracks,
+    found_again,
+)
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
@@ -78,3 +86,99 @@ def test_points_that_are_known_again_take_the_place_of_those_that_are_there():
     assert len(tracks.numbers) == len(later) == len(tracks.pixels) == len(tracks.first)
     new = tracks.take_up()
     assert not len(new) or new.min() >= count, "numbers are not given twice"
+
+
+def wide(seed: int = 0) -> Frame:
+    cells = np.random.default_rng(seed).uniform(20, 235, (64, 80, 3)).astype(np.float32)
+    image = np.clip(cv2.resize(cells, (320, 256), interpolation=cv2.INTER_CUBIC), 0, 255).astype(np.uint8)
+    return Frame(0, 0, image)
+
+
+WIDE = Camera.from_focal(300.0, 320, 256)
+
+
+def test_at_most_220_points_three_per_cent_of_the_longer_side_apart_and_off_the_border():
+    tracks = StreamTracks()
+    tracks.begin(SmallPictures(WIDE).of(wide()))
+    assert len(tracks.take_up()) == len(tracks.numbers) == 220
+    apart = np.linalg.norm(tracks.pixels[:, None] - tracks.pixels[None], axis=2) + 999 * np.eye(220)
+    assert 10 <= apart.min() < 11.5
+    assert tracks.pixels.min() >= 6 and tracks.pixels.max(0).tolist() <= [313, 249]
+
+
+def test_missing_points_are_replaced_from_a_tenth():
+    tracks = StreamTracks()
+    tracks.begin(SmallPictures(WIDE).of(wide()))
+    tracks.take_up()
+    tracks.keep(np.arange(220) >= 21)
+    assert len(tracks.take_up()) == 0 and len(tracks.numbers) == 199
+    tracks.keep(np.arange(199) >= 1)
+    new = tracks.take_up()
+    assert len(new) > 0 and new.min() == 220
+    assert np.array_equal(tracks.numbers, np.sort(tracks.numbers))
+
+
+def test_nothing_is_taken_up_before_the_first_picture():
+    tracks = StreamTracks()
+    assert len(tracks.take_up()) == 0 and tracks.picture is None
+
+
+def test_a_position_is_shown_where_its_nearest_pixel_is_usable():
+    usable = np.zeros((20, 30), np.uint8)
+    usable[0, 0] = usable[19, 29] = usable[7, 11] = 255
+    picture = SmallPicture(np.zeros((20, 30), np.uint8), usable, WIDE.resized(30, 20))
+    pixels = np.array(
+        [[0, 0], [-0.4, 0.4], [-0.6, 0], [29.4, 19.4], [29.6, 19], [29, 19.6], [11.3, 6.8], [12.6, 7], [np.nan, 0]]
+    )
+    shown = picture.shows(pixels.astype(np.float32))
+    assert shown.tolist() == [True, True, False, True, False, False, True, False, False]
+
+
+def test_points_behind_the_camera_project_far_outside_and_the_centre_to_the_principal_point():
+    picture = SmallPictures(WIDE).of(wide())
+    pixels = picture.pixels(np.array([[0.0, 0.0, 5.0], [1.0, -1.0, -2.0], [0.1, 0.2, 2.0]]))
+    np.testing.assert_allclose(pixels[0], [159.5, 127.5])
+    np.testing.assert_allclose(pixels[1], [1e4, -1e4])
+    np.testing.assert_allclose(pixels[2], [159.5 + 15, 127.5 + 30])
+
+
+def test_tools_keep_half_a_patch_away_and_small_pictures_their_size():
+    mask = np.ones((256, 320), np.uint8)
+    mask[:, 200:] = 0
+    picture = SmallPictures(WIDE).of(wide().with_fields(mask=mask))
+    assert picture.grey.shape == (256, 320)
+    columns = np.flatnonzero(picture.usable[128])
+    assert (columns.min(), columns.max()) == (6, 199 - 8)
+    rows = np.flatnonzero(picture.usable[:, 100])
+    assert (rows.min(), rows.max()) == (6, 249)
+
+
+def test_points_that_come_back_within_half_a_pixel_are_found_again():
+    pictures = SmallPictures(WIDE)
+    first = pictures.of(wide(1))
+    moved = np.roll(wide(1).image, (3, 4), (0, 1))
+    moved[:, 200:] = wide(2).image[:, 200:]
+    second = pictures.of(Frame(1, 1, np.ascontiguousarray(moved)))
+    points = np.array([[60, 60], [150, 200], [270, 100]], np.float32)
+    there, trusted = found_again(first, second, points, points)
+    assert trusted.tolist() == [True, True, False]
+    np.testing.assert_allclose(there[:2], points[:2] + [4, 3], atol=0.05)
+
+
+def test_an_adopted_point_replaces_those_within_three_pixels():
+    tracks = StreamTracks()
+    tracks.begin(SmallPictures(WIDE).of(wide()))
+    tracks.take_up()
+    at = tracks.pixels[[10, 50]].copy()
+    tracks.keep(np.arange(220) >= 5)
+    tracks.adopt(np.array([0, 3]), (at + [[2.5, 0], [0, 3.5]]).astype(np.float32))
+    assert 10 not in tracks.numbers and 50 in tracks.numbers and {0, 3} <= set(tracks.numbers)
+    np.testing.assert_allclose(tracks.first[:2], at + [[2.5, 0], [0, 3.5]])
+
+
+def test_a_new_scene_begins_without_points():
+    tracks = begun(SmallPictures(CAMERA))
+    last = tracks.numbers.max()
+    tracks.begin(SmallPictures(CAMERA).of(frame(seed=1)))
+    assert len(tracks.numbers) == len(tracks.pixels) == len(tracks.first) == 0
+    assert tracks.take_up().min() == last + 1

@@ -82,3 +82,43 @@ def test_normals_of_tissue_are_those_of_the_sheet():
     depth = (np.stack(points.position, -1) @ rotation.T + camera.world_to_camera[:3, 3])[..., 2]
     off = np.degrees(np.arccos(np.clip((normals_of(depth, camera) * exact).sum(-1), -1, 1)))
     assert np.median(off) < 0.2 and np.quantile(off, 0.95) < 1.0
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.01, 0.5, 1.2, 1.45])
+def test_fisheye_rays_have_the_angle_of_an_equidistant_lens(angle):
+    """A ray at an angle to the axis is seen at the focal length times the angle from the centre."""
+    along = np.array([0.6, -0.8])
+    camera = Camera(np.array([[50.0, 0, 21], [0, 45.0, 17], [0, 0, 1]]), 44, 36, model="fisheye")
+    start, step = rays_of(camera, np.array([21.0, 17.0]) + angle * along * [50.0, 45.0])
+    np.testing.assert_allclose(step, [*(math.tan(angle) * along), 1.0], atol=1e-12)
+    assert not start.any()
+
+
+def test_fisheye_rays_beyond_86_degrees_are_those_of_86_degrees():
+    camera = Camera(np.array([[5.0, 0, 21], [0, 5.0, 17], [0, 0, 1]]), 44, 36, model="fisheye")
+    _, step = rays_of(camera, np.array([[21.0 + 5 * 1.5, 17.0], [43.5, 17.0], [21.0, 0.5]]))
+    np.testing.assert_allclose(step, [[14.1014, 0, 1], [14.1014, 0, 1], [0, -14.1014, 1]], rtol=1e-5)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("camera", CAMERAS[:2], ids=lambda camera: camera.model)
+def test_a_surface_is_torn_from_eighty_degrees_against_the_line_of_sight(camera, axis):
+    """The step in depth of a surface tilted by 80 degrees is 5.67 times the width of a pixel there."""
+    middle = 60.0
+    width = 1 / (camera.K[1 - axis, 1 - axis]) * (1.0 if camera.model == "ortho" else middle)
+    for degrees, connected in ((79.0, True), (81.0, False)):
+        step = math.tan(math.radians(degrees)) * width
+        depth = np.full((36, 44), middle + step / 2)
+        depth[(slice(10), slice(None)) if axis == 0 else (slice(None), slice(10))] = middle - step / 2
+        assert np.take(joined(depth, camera, axis), 9, axis).all() == connected
+        assert np.take(joined(depth, camera, axis), 8, axis).all()
+
+
+def test_normals_at_an_edge_are_those_of_the_neighbour_that_is_connected():
+    """A roof with a tear beside its ridge: each side keeps its own slope."""
+    x = (np.arange(44) + 0.5 - 21) / 50
+    depth = np.tile(np.where(np.arange(44) < 22, 60 / (1 - 0.5 * x), 90 / (1 + 0.25 * x)), (36, 1))
+    normals = normals_of(depth, Camera(np.array([[50.0, 0, 21], [0, 45.0, 17], [0, 0, 1]]), 44, 36))
+    left, right = (np.array([slope, 0, -1]) / math.hypot(slope, 1) for slope in (0.5, -0.25))
+    np.testing.assert_allclose(normals[:, :22], np.broadcast_to(left, (36, 22, 3)), atol=1e-6)
+    np.testing.assert_allclose(normals[:, 22:], np.broadcast_to(right, (36, 22, 3)), atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsplat_core.geometry.tracks import FeatureTracks
+from gsplat_core.geometry.tracks import FeatureTracks, followed
 
 HEIGHT, WIDTH = 96, 128
 
@@ -60,3 +60,75 @@ def test_fifteen_pictures_of_something_else_are_left_out_and_the_next_is_another
         tracks.follow(np.full((HEIGHT, WIDTH, 3), 90, np.uint8), None)
     tracks.follow(texture(2), None)
     assert not np.isin(first, last(tracks)[0]).any() and len(last(tracks)[0]) > 20
+
+
+def wide_texture(seed: int, cell_px: int = 8) -> np.ndarray:
+    small = np.random.default_rng(seed).uniform(20, 235, (512 // cell_px, 640 // cell_px, 3)).astype(np.float32)
+    return np.clip(cv2.resize(small, (640, 512), interpolation=cv2.INTER_CUBIC), 0, 255).astype(np.uint8)
+
+
+def test_at_most_seven_hundred_points_a_fortieth_of_the_longer_side_apart():
+    tracks = FeatureTracks()
+    tracks.follow(wide_texture(0), None)
+    pixels = tracks.observations(1).pixels
+    assert len(pixels) == 700
+    apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2) + 999 * np.eye(len(pixels))
+    assert 16 <= apart.min() < 18
+
+
+def test_no_point_is_replaced_before_a_tenth_is_missing():
+    """Of 700 points, a stripe of tissue that becomes covered loses few at first and then many."""
+    tracks, picture = FeatureTracks(), wide_texture(0)
+    tracks.follow(picture, None)
+    narrow, wide = (np.ones((512, 640), np.uint8) for _ in range(2))
+    narrow[:, :20], wide[:, :160] = 0, 0
+    tracks.follow(picture, narrow)
+    seen = tracks.observations(1)
+    few = seen.of(seen.frame == 1)
+    assert 630 < len(few.point) < 700 and few.point.max() < 700
+    tracks.follow(picture, wide)
+    seen = tracks.observations(1)
+    many = seen.of(seen.frame == 2)
+    assert few.pixels[:, 0].min() > 30 and many.pixels[:, 0].min() > 169
+    assert many.point.max() >= 700, "new points have new numbers"
+    new = many.of(many.point >= 700).pixels
+    old = many.of(many.point < 700).pixels
+    # Positions of tracked points are rounded to whole pixels when new ones are detected.
+    assert np.linalg.norm(new[:, None] - old[None], axis=2).min() > 15
+
+
+def test_flat_corners_beside_strong_ones_are_not_points():
+    """A corner must have half a per cent of the quality of the best one, which grows with the square of its contrast."""
+    image = np.full((96, 128, 3), 100, np.uint8)
+    image[20:32, 20:32] = 228
+    for column, levels in ((60, 30), (90, 4)):
+        image[50:62, column : column + 12] = 100 + levels
+    tracks = FeatureTracks()
+    tracks.follow(image, None)
+    x = tracks.observations(1).pixels[:, 0]
+    assert ((x > 55) & (x < 78)).any() and not (x > 85).any()
+
+
+def test_a_picture_that_shows_less_than_a_fifth_of_the_points_is_left_out():
+    picture = wide_texture(3)
+    for share, left_out in ((0.12, True), (0.4, False)):
+        tracks = FeatureTracks()
+        tracks.follow(picture, None)
+        other = wide_texture(4)
+        other[:, : int(share * 640)] = picture[:, : int(share * 640)]
+        tracks.follow(other, None)
+        seen = tracks.observations(1)
+        assert (len(seen.of(seen.frame == 1).point) == 0) == left_out
+
+
+def test_a_point_whose_way_back_misses_is_lost():
+    """What only one picture shows has no counterpart; a shifted patch returns to its start."""
+    first = cv2.cvtColor(wide_texture(5), cv2.COLOR_RGB2GRAY)
+    second = np.roll(first, (2, 3), (0, 1))
+    second[300:, 400:] = cv2.cvtColor(wide_texture(6), cv2.COLOR_RGB2GRAY)[300:, 400:]
+    points = np.array([[100, 100], [200, 350], [520, 400]], np.float32)
+    there, misses = followed(first, second, points, window_px=21, levels=3)
+    np.testing.assert_allclose(there[:2], points[:2] + [3, 2], atol=0.05)
+    assert misses[:2].max() < 0.05 and misses[2] > 0.7
+    nothing, none = followed(first, second, points[:0], window_px=21, levels=3)
+    assert len(nothing) == len(none) == 0
