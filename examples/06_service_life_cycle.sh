@@ -5,7 +5,7 @@
 #
 # The current folder holds one.isplat and two.isplat (made by `intrasplat pack MODEL FILE`) and case.zip, a recording's folder.
 # 06_service_life_cycle.py does the same with the Python client.
-set -euo pipefail
+set -eu
 
 KEY=$(cat "$KEY_FILE")
 ask() { curl --silent --show-error --fail-with-body -H "Authorization: Bearer $KEY" "$@"; }
