@@ -27,7 +27,7 @@ ask -X POST "$URL/v1/models/liver/rollback"                            # to vers
 send "$URL/v1/streams" -d '{"name": "playback", "source": "synthetic:?width=64&height=48&frames=4", "show": "model liver", "device": "cpu"}'
 until_state streams/playback live
 TICKET=$(send "$URL/v1/tickets" -d '{"path": "/v1/streams/playback/mjpeg"}' | sed 's/.*"ticket":"\([^"]*\)".*/\1/')
-curl --silent --max-time 20 "$URL/v1/streams/playback/mjpeg?ticket=$TICKET" | head -c 8192 > pictures.mjpeg   # endless; take a part
+curl --silent --max-time 60 "$URL/v1/streams/playback/mjpeg?ticket=$TICKET" | head -c 8192 > pictures.mjpeg   # endless; take a part
 ask -X POST "$URL/v1/streams/playback/stop"
 ask -X DELETE "$URL/v1/streams/playback"
 ask -X DELETE "$URL/v1/models/liver/versions/2"                        # the active one cannot be deleted
