@@ -1,4 +1,4 @@
-"""A batch whose processes are killed at random: is each result there exactly once?
+"""Kill the processes of `intrasplat batch` at random and check that each result is written exactly once.
 
     python benchmarks/batch_kill.py --recordings 200 --workers 2
 
@@ -29,7 +29,7 @@ WITHIN_S = 1800.0
 
 
 def make_recordings(folder: Path, count: int, frames: int) -> None:
-    """Copies of one synthetic recording, so that all results must be the same."""
+    """Write copies of one synthetic recording, whose results must be equal."""
     first = synthesize(folder / "case-000", frames=frames, width_px=64, height_px=48, stereo=False)
     for number in range(1, count):
         shutil.copytree(first, folder / f"case-{number:03d}")
@@ -42,19 +42,19 @@ class Killed:
     attempts: int = 0
     batches: int = 0
     replaced: list[str] = field(default_factory=list)
-    """Results that were there and then were another."""
+    """Results that were replaced after they were published."""
     seen: dict[str, int] = field(default_factory=dict)
-    """Each result's folder, by its number on the disk."""
+    """Inode number of each result's folder."""
 
     def look(self, out: Path) -> None:
-        """Note which results are there."""
+        """Record which results exist."""
         now = {path.name: path.stat().st_ino for path in out.glob("case-*")} if out.is_dir() else {}
         self.replaced += [name for name, number in self.seen.items() if now.get(name) != number]
         self.seen |= now
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process has started."""
+    """Return the child processes of a process."""
     try:
         return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except (FileNotFoundError, ProcessLookupError):
@@ -74,7 +74,7 @@ class Kills:
 
 
 def run_batch(recordings: Path, out: Path, workers: int, kills: Kills) -> Killed:
-    """Run a batch to its end, and start it again whenever it was killed."""
+    """Run a batch to its end; restart it whenever it was killed."""
     choose = random.Random(kills.seed)
     command = [sys.executable, "-m", "services.cli", "batch", recordings, "--out", out, "--workers", str(workers)]
     killed, until_s = Killed(), time.monotonic() + WITHIN_S
@@ -103,7 +103,7 @@ def run_batch(recordings: Path, out: Path, workers: int, kills: Kills) -> Killed
 
 
 def check(recordings: Path, out: Path, killed: Killed) -> dict[str, object]:
-    """The figures; raises AssertionError where a result is not there exactly once."""
+    """Return the figures. Raises AssertionError if a result is missing or was published twice."""
     names = sorted(path.name for path in recordings.iterdir())
     assert sorted(path.name for path in out.glob("case-*")) == names, "a result is missing, or one is too many"
     assert not killed.replaced, f"replaced: {killed.replaced}"
@@ -127,7 +127,6 @@ def check(recordings: Path, out: Path, killed: Killed) -> dict[str, object]:
 
 
 def main() -> None:
-    """Measure, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--recordings", type=int, default=200)
     parser.add_argument("--frames", type=int, default=4)

@@ -1,4 +1,4 @@
-"""Causal next-frame prediction: show frame i + 1 with the model that learned frames 0 to i, score it, then learn from it.
+"""Measure causal next-frame prediction: render frame i + 1 with the model trained on frames 0 to i, score it, then train on it.
 
     python benchmarks/causal.py RECORDING... [--steps 40] [--device cuda] [--frames N] [--scale S] [--prior flow|learned] [--live]
 
@@ -33,7 +33,7 @@ from gsplat_core.training.schedule import LiveTraining
 
 
 class HalfFlow:
-    """The newest picture, moved on by half of its last motion: what no reconstruction is needed for."""
+    """Baseline without a reconstruction: the newest picture, warped by half of the last optical flow."""
 
     def __init__(self) -> None:
         self._method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -42,7 +42,7 @@ class HalfFlow:
         """The guess for the next frame."""
 
     def observe(self, image: NDArray[np.uint8]) -> None:
-        """Take the next picture."""
+        """Add a picture to the flow."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self._before is not None:
             back = 0.5 * self._method.calc(grey, self._before, None)
@@ -55,7 +55,7 @@ class HalfFlow:
 
 
 class Shown:
-    """Renders what the reconstructor publishes, in bytes as it is displayed."""
+    """Renders the published model to 8-bit pictures, as displayed."""
 
     def __init__(self, reconstructor: Reconstructor, camera: Camera) -> None:
         self._reconstructor, self._camera = reconstructor, camera
@@ -63,7 +63,7 @@ class Shown:
         self.published: Any = None
 
     def publish(self) -> None:
-        """Take the newest model."""
+        """Publish the newest model and prepare it for rendering."""
         self.published = None
         self.published = self._reconstructor.publish()
         self._renderer.prepare(self.published)
@@ -78,7 +78,7 @@ class Shown:
 
 
 def frames_in_pairs(frames: list[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
-    """Every frame with the one before it."""
+    """Yield every frame with its predecessor."""
     yield None, frames[0]
     yield from pairwise(frames)
 
@@ -125,7 +125,7 @@ def measure(path: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def with_settings(config: Any, settings: list[str]) -> Any:
-    """The settings with `name=value` replaced."""
+    """Return the settings with `name=value` replaced."""
     changed = {}
     for setting in settings:
         name, value = setting.split("=")
@@ -134,7 +134,6 @@ def with_settings(config: Any, settings: list[str]) -> Any:
 
 
 def main() -> None:
-    """Measure every recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+")
     parser.add_argument("--steps", type=int, default=40)

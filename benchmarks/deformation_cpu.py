@@ -1,4 +1,4 @@
-"""Times of the deformation fields on the CPU, as JSON: `python benchmarks/deformation_cpu.py [--gaussians N] [--threads N]`.
+"""Measure the deformation fields on the CPU, as JSON: `python benchmarks/deformation_cpu.py [--gaussians N] [--threads N]`.
 
 Measures what a viewer pays for a new time (limits: HexPlane 15 ms with the cache, basis field 6 ms, for 50,000 Gaussians) and
 what a training step pays, next to the same work in plain torch.
@@ -25,7 +25,7 @@ WINDOW_S = (0.0, 6.0)
 
 
 def milliseconds(work: Callable[[float], Any], repeats: int) -> dict[str, float]:
-    """Median and minimum over `repeats` calls, each at a new time, after two that are not counted."""
+    """Return median and minimum over `repeats` calls, each at a new time, after two warm-up calls."""
     taken = []
     for repeat in range(repeats + 2):
         at = 0.5 + 5.0 * repeat / (repeats + 2)
@@ -37,7 +37,7 @@ def milliseconds(work: Callable[[float], Any], repeats: int) -> dict[str, float]
 
 
 def basis_times(gaussians: Gaussians, repeats: int) -> dict[str, Any]:
-    """The basis field with 26 bumps."""
+    """Time the basis field with 26 bumps."""
     field = BasisField(gaussians.count, WINDOW_S, bumps=26)
     with torch.no_grad():
         field.weights.normal_(std=0.1)
@@ -54,7 +54,7 @@ def basis_times(gaussians: Gaussians, repeats: int) -> dict[str, Any]:
 
 
 def hexplane_times(gaussians: Gaussians, repeats: int) -> dict[str, Any]:
-    """The HexPlane field with 32 channels, 2 levels and a trunk of 3 x 64."""
+    """Time the HexPlane field with 32 channels, 2 levels and an MLP of 3 x 64."""
     field = HexPlaneField(gaussians, WINDOW_S)
     with torch.no_grad():
         field.head.weight.normal_(std=0.1)
@@ -86,7 +86,6 @@ def hexplane_times(gaussians: Gaussians, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--threads", type=int, default=2)

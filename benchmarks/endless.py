@@ -1,4 +1,4 @@
-"""A recording looped for as long as a stream may last: are memory, time per frame and quality as flat as they should be?
+"""Loop a recording for hours and measure whether memory, time per frame and quality stay constant.
 
 Usage: python benchmarks/endless.py RECORDING [--minutes 60] [--device cuda] [--steps 4] [--rehearse 4] [--scale 1] [--places] [--out FILE]
        python benchmarks/endless.py RECORDING --clock [--once] [--fps 30] ...
@@ -44,12 +44,12 @@ from operators.frame_clock import FrameClock
 
 SCORED_EVERY = 10
 REHEARSED_AT_ONCE = {"cpu": 1, "cuda": 3}
-"""Rehearsal steps between two looks at the clock, as in `operators.reconstruct`."""
+"""Rehearsal steps between two readings of the clock, as in `operators.reconstruct`."""
 RETAINED_S = 5.0
 
 
 def looped(frames: list[Frame], fps: float, new_scenes: bool, first: int = 0) -> Iterator[Frame]:
-    """The frames again and again, from number `first` on, in an order of time that never runs back."""
+    """Yield the frames repeatedly, starting with number `first`, with increasing timestamps."""
     for seq in count(first):
         turn, index = divmod(seq, len(frames))
         begins = "loop" if new_scenes and index == 0 and turn else None
@@ -71,7 +71,7 @@ def memory_mib(device: str) -> dict[str, float]:
 
 
 class Stream:
-    """The looped stream and what it is measured by."""
+    """Looped stream with its measurements."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         recording = open_recording(arguments.recording, scale=arguments.scale)
@@ -94,7 +94,7 @@ class Stream:
         self.shown: PendingFrame | None = None
 
     def wait_for_next(self) -> None:
-        """Wait until the next frame comes; a run that is late goes on at once and does not catch up."""
+        """Wait until the next frame is due. A late run continues at once and does not catch up."""
         assert self.clock is not None
         now_ns = self.clock.now_ns()
         self.due_ns = now_ns if self.due_ns is None else max(now_ns, self.due_ns + round(1e9 / self.fps))
@@ -102,11 +102,11 @@ class Stream:
 
     @property
     def turns_of_minute(self) -> int:
-        """Whole turns of the recording that come closest to a minute."""
+        """Return the number of whole loops that comes closest to a minute."""
         return 1 if self.once else max(1, round(60 * self.fps / len(self.frames)))
 
     def show(self, frame: Frame) -> PendingFrame:
-        """The picture of the newest model at a frame's time, queued. The one before is finished then."""
+        """Queue the picture of the newest model at a frame's time, and finish the previous one."""
         if self.shown is not None:
             self.shown.result()
         camera = self.reconstructor.camera
@@ -115,7 +115,7 @@ class Stream:
         return self.shown
 
     def work(self, frame: Frame) -> PendingFrame:
-        """Do what a live run does with a frame."""
+        """Process a frame as a live run does."""
         first = self.shown is None or frame.new_scene is not None
         if frame.new_scene is not None:
             self.reconstructor.begin_scene(frame)
@@ -135,7 +135,7 @@ class Stream:
         return picture
 
     def rehearse_in_time(self) -> None:
-        """Take the rehearsal steps of a frame: the number asked for, or as many as the clock allows."""
+        """Run the rehearsal steps of a frame: the requested number, or as many as the clock allows."""
         made = 0
         if self.clock is None:
             self.reconstructor.rehearse(made := self.rehearse)
@@ -147,7 +147,7 @@ class Stream:
         self.steps_rehearsed += made
 
     def minute(self, frames: Iterator[Frame]) -> dict[str, Any]:
-        """Work through a minute's frames."""
+        """Process the frames of one minute and yield its figures."""
         took_ms, psnr_db = [], []
         turns, length = self.turns_of_minute, len(self.frames)
         before: Frame | None = None
@@ -187,12 +187,12 @@ class Stream:
         }
 
     def score(self, picture: PendingFrame, frame: Frame) -> float:
-        """PSNR over tissue of a picture as it is displayed."""
+        """Return the tissue PSNR of an 8-bit picture."""
         image = (picture.result().image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         return psnr_tissue_db(image, frame.image, frame.mask)
 
     def retention(self, frames_so_far: int) -> dict[str, float]:
-        """Return what the last seconds look like at the end, from the whole model: on a CPU `publish` leaves the past out."""
+        """Score the last seconds again, rendered by the final model with its whole history."""
         newest = min(frames_so_far, round(RETAINED_S * self.fps))
         frames = islice(looped(self.frames, self.fps, False, frames_so_far - newest), newest)
         self.renderer.prepare(self.reconstructor.snapshot())
@@ -209,25 +209,23 @@ def growth(minutes: list[dict[str, Any]]) -> dict[str, float]:
 
 
 class Lines:
-    """JSON lines on the screen and in a file; each is written before the next one is computed."""
+    """Writer of JSON lines to standard output and a file, flushed line by line."""
 
     def __init__(self, out: Path | None) -> None:
         self._file = None if out is None else out.open("w", encoding="utf-8")
 
     def write(self, **values: Any) -> None:
-        """Add a line."""
         print(json.dumps(values), flush=True)
         if self._file is not None:
             print(json.dumps(values), file=self._file, flush=True)
 
 
 def interrupted(number: int, _: object) -> None:
-    """SIGTERM is as good as Ctrl-C."""
+    """Handle SIGTERM like Ctrl-C."""
     raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def main() -> None:
-    """Run the stream."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--minutes", type=int, default=60)

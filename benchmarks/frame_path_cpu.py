@@ -34,7 +34,7 @@ from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
 
 SETTLED_AFTER = 30
-"""Frames before these are not counted: what is made once is made there."""
+"""Warm-up frames, not counted."""
 
 
 class FramePath:
@@ -89,21 +89,21 @@ class FramePath:
 
 
 class _Port:
-    """Inputs of an operator, and an output without a reader."""
+    """Inputs of an operator, and an output that discards messages."""
 
     def __init__(self, messages: dict[str, list[object]]) -> None:
         self._messages = messages
 
     def receive(self, name: str) -> object | None:
-        """The next message; None when there is none."""
+        """Return the next message, or None."""
         return self._messages[name].pop() if self._messages[name] else None
 
     def emit(self, message: object, name: str) -> None:
-        """Nothing."""
+        """Discard the message."""
 
 
 def frames(address: str, count: int) -> Iterator[Frame]:
-    """The first frames of a source, as they come in a live run, without their masks."""
+    """Return the first frames of a source, as delivered in a live run, without masks."""
     source = open_source(address, SourceOptions(loop=True))
     source.open()
     try:

@@ -1,4 +1,4 @@
-"""Frames that the gates withhold, by reason, of recordings from inside and of changed versions of them, and of pictures from outside.
+"""Count the frames that the gates withhold, by reason, for recordings from inside, altered copies of them, and pictures from outside.
 
 One JSON line for each recording and change: `frames`, `withheld` (by reason; the out-of-body gate's with its evidence), and `longest_s`, the
 longest stretch of withheld frames, in seconds by the recording's clock: so old the newest picture becomes. Every frame of a recording is
@@ -70,7 +70,7 @@ MEASURES: dict[str, Callable[[Evidence], float]] = {
     "cool": lambda evidence: evidence.cool,
 }
 PAIRS = {"straight": (STRAIGHT, COOL_BESIDE_STRAIGHT), "light": (ROOM_LIGHT, COOL_BESIDE_LIGHT)}
-"""Thresholds of the gate's two kinds of evidence: the measure, and `cool` in addition to it."""
+"""Thresholds of the gate's two kinds of evidence; both also require the threshold of `cool`."""
 
 
 def main() -> int:
@@ -101,7 +101,7 @@ def main() -> int:
 
 
 def frames(path: Path) -> Iterator[tuple[Image, int]]:
-    """Pictures and times of a recording, of a folder of stills, or of one picture file, which comes once."""
+    """Yield pictures and times of a recording, a folder of stills, or one picture file."""
     pictures = sorted(path.glob("[0-9]*.*")) if path.is_dir() else [path] if path.suffix in (".png", ".jpg") else []
     if pictures:
         for index, file in enumerate(pictures):
@@ -114,7 +114,7 @@ def frames(path: Path) -> Iterator[tuple[Image, int]]:
 
 
 def changed(pictures: Iterable[tuple[Image, int]], change: Change) -> Iterator[tuple[Image, int]]:
-    """The pictures, each changed in the same way."""
+    """Yield the pictures with the same alteration applied to each."""
     for image, pts_ns in pictures:
         yield change(image, np.random.default_rng(0)), pts_ns
 
@@ -147,13 +147,13 @@ def withheld(pictures: Iterable[tuple[Image, int]]) -> dict[str, object]:
 
 
 def evidence_words(image: Image) -> str:
-    """The gate's evidence against a picture."""
+    """Return the gate's evidence against a picture, as text."""
     evidence = evidence_of(image)
     return "none" if evidence is None or evidence.outside is None else evidence.outside
 
 
 def report_margins(folder: Path, names: list[str], count: int) -> None:
-    """Measure every picture, and say how far those from inside stay from each threshold."""
+    """Measure every picture, and report the distance of pictures from inside to each threshold."""
     inside = {name: measured_inside(folder / INSIDE[name], count) for name in names}
     pictures = [next(frames(folder / f"out_of_body/{number}.png"))[0] for number in FROM_OUTSIDE]
     pictures += [draw(np.random.default_rng(seed)) for draw in OUTSIDE.values() for seed in range(3)]
@@ -165,7 +165,7 @@ def report_margins(folder: Path, names: list[str], count: int) -> None:
 
 
 def measured_inside(path: Path, count: int) -> list[tuple[str, Evidence]]:
-    """Every change of up to `count` evenly spread frames."""
+    """Measure every alteration of up to `count` evenly spaced frames."""
     pictures = [image for image, _ in frames(path)]
     spread = np.unique(np.linspace(0, len(pictures) - 1, min(count, len(pictures))).astype(int))
     found = []
@@ -185,7 +185,7 @@ def margins(
     other: str,
     other_limit: float,
 ) -> dict[str, object]:
-    """Extreme values of one measure among pictures whose other measure exceeds its threshold, and the leave-one-recording-out count."""
+    """Return extreme values of one measure among pictures whose other measure exceeds its threshold, and the leave-one-recording-out count."""
     value, beside = MEASURES[measure], MEASURES[other]
     values = {name: [value(each) for _, each in found if beside(each) >= other_limit] for name, found in inside.items()}
     extremes = {name: max(each, default=0.0) for name, each in values.items()}
@@ -203,7 +203,7 @@ def margins(
 
 
 def say(line: Mapping[str, object]) -> None:
-    """Print a line with what is needed to repeat it."""
+    """Print a result line with the facts needed to repeat it."""
     origin = {
         "command": " ".join(
             ["python", "benchmarks/gates.py", *("RECORDINGS" if Path(each).is_dir() else each for each in sys.argv[1:])]

@@ -23,7 +23,6 @@ from gsplat_core.scene.projection import inverse, moved, pixels_of, points_of
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--every", type=int, default=8)

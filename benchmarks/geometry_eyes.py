@@ -101,7 +101,7 @@ class Scores:
             self._depth.append(float(np.median(np.abs(focal_mm / shown[known] - focal_mm / frame.depth[known]))))
 
     def line(self, frames: list[Frame]) -> dict[str, Any]:
-        """Everything, rounded."""
+        """Return all scores, rounded."""
         rounded = lambda value: None if value is None else round(float(value), 2)
         mean = lambda values: rounded(np.mean(values)) if values else None
         found = evaluate_second_eye(
@@ -200,7 +200,6 @@ def arguments() -> Arguments:
 
 
 def main() -> None:
-    """Every run that was asked for."""
     asked = arguments()
     frames, camera = frames_of(asked)
     runs: list[Callable[[str], dict[str, Any]]] = []

@@ -32,7 +32,7 @@ SEEDS = 6
 
 
 def error(found: NDArray[np.float32], true: NDArray[np.float32], kept: NDArray[np.bool_]) -> float:
-    """After the factor that makes the medians agree."""
+    """Return the depth error after scaling the median to the true one."""
     shown, known = found[kept].astype(np.float64), true[kept].astype(np.float64)
     off = shown * np.median(known / shown) - known
     return float(np.sqrt(np.mean(off * off)) / np.median(known))
@@ -50,7 +50,7 @@ def known_tissue(frame: Frame) -> NDArray[np.bool_]:
 
 
 def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path | None) -> dict[str, object]:
-    """Return the figures of a recording, with its frames in order; the estimator does not get their depth."""
+    """Return the figures of a recording. The estimator receives the frames in order, without depth."""
     estimator = LightDepth()
     errors, levels, planes, believed, doubted, spent = [], [], [], [], [], []
     for frame in frames:
@@ -84,7 +84,7 @@ def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path |
 
 
 def _draw(path: Path, frame: Frame, depth: NDArray[np.float32]) -> None:
-    """The picture and its depth side by side; the true depth after them, where it is known."""
+    """Draw picture, estimated depth and, if known, true depth side by side."""
     planes = [depth] if frame.depth is None else [depth, frame.depth]
     drawn = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)]
     for plane in planes:
@@ -96,7 +96,6 @@ def _draw(path: Path, frame: Frame, depth: NDArray[np.float32]) -> None:
 
 
 def main() -> None:
-    """See the module."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--recordings", type=Path, default=RECORDINGS)
     parser.add_argument("--frames", type=int, default=75)

@@ -81,14 +81,14 @@ def add_breathing_options(parser: argparse.ArgumentParser) -> None:
 
 
 def asked_breathing(arguments: argparse.Namespace) -> Extras:
-    """Return what `add_breathing_options` was given."""
+    """Return the arguments of `synthesize` for the parsed breathing options."""
     return Extras(
         breathing_ratio=arguments.breathing_ratio, rate_wander=arguments.rate_wander, scope_path=arguments.scope_path
     )
 
 
 def breathing_facts(extras: Extras) -> dict[str, Any]:
-    """Return the figures' conditions for a line of the log."""
+    """Return the breathing conditions for a log line."""
     return {name: getattr(extras, name) for name in ("breathing_ratio", "rate_wander", "scope_path")}
 
 

@@ -1,4 +1,4 @@
-"""Depth of a moving scope with poses: the estimator's at the points of a structure from motion, and that of the model that learns from it.
+"""Measure depth of a moving scope with poses at structure-from-motion points, for the estimator and for the model trained on it.
 
     python benchmarks/geometry_parallax.py RECORDING [--scale 0.5] [--depth none parallax]
 

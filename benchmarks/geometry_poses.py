@@ -1,4 +1,4 @@
-"""Poses from pictures alone, against those that a recording came with.
+"""Compare poses estimated from pictures with the recorded ones.
 
     python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--way WAY] [--causal] [--assume F] [--depth]
         [--breathing-ratio 2] [--rate-wander 0.15] [--scope-path seeded]
@@ -40,7 +40,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 FARTHEST_MM = 110.0
-"""Greatest distance that the scope moves away on paths that return. A picture shows 82 mm of the tissue."""
+"""Largest distance from the start on paths that return, in mm. A picture shows 82 mm of the tissue."""
 
 
 def measured(

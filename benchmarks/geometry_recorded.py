@@ -34,7 +34,7 @@ EVERY = 3
 def models(
     offline: bool, choice: str, frames: list[Frame], camera: Camera, asked: argparse.Namespace
 ) -> Iterator[Model]:
-    """The model that shows each frame."""
+    """Yield each frame with the model that displays it."""
     settings = ReplaySettings(recording="", out=Path(), device=asked.device, depth=choice)
     config = settings.reconstructor_config(camera.width_px * camera.height_px, offline=offline)
     learning = Reconstructor(config, camera, device=asked.device)
@@ -48,7 +48,6 @@ def models(
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording")
     parser.add_argument("--depth", nargs="+", default=["recorded", "light", "none"])

@@ -1,4 +1,4 @@
-"""Depth from two eyes: against truth where there is one, and what it costs.
+"""Measure the error and cost of stereo depth.
 
     python benchmarks/geometry_stereo.py --recordings FOLDER [--pictures OUT] [--device cuda] [--without synthetic heart …]
 
@@ -29,12 +29,12 @@ from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
 
 DEVICE = "cpu"
-"""Device that matches the pictures."""
+"""Device on which pictures are matched."""
 HEART_BORDER_PX, HEART_ONE_EYED_PX = 10, 110
 
 
 def estimates(frames: Iterable[Frame], camera: Camera) -> Iterator[tuple[Frame, DepthMap, float]]:
-    """Each frame of a stream with its depth and the CPU time that it took, in ms."""
+    """Yield each frame with its estimated depth and the CPU time in ms."""
     estimator = StereoDepth(DEVICE)
     for frame in frames:
         begun = time.process_time()
@@ -48,7 +48,7 @@ def believed(found: DepthMap) -> np.ndarray:
 
 
 def scared_pair(folder: Path) -> dict[str, Any]:
-    """End-point error against `disparity.tiff`."""
+    """Return the end-point error against `disparity.tiff`."""
     recording = open_recording(folder)
     truth = cv2.imread(str(folder / "disparity.tiff"), cv2.IMREAD_UNCHANGED)
     ((_, found, cpu_ms),) = estimates(recording, recording.camera)
@@ -61,7 +61,7 @@ def scared_pair(folder: Path) -> dict[str, Any]:
 
 
 def rectified(folder: Path) -> dict[str, Any]:
-    """Vertical residual of SIFT matches (ratio test 0.75, at most 8 px off) after rectification, and the distances that were found."""
+    """Return the vertical residual of SIFT matches (ratio test 0.75, at most 8 px) after rectification, and the estimated distances."""
     recording = open_recording(folder)
     ((frame, found, cpu_ms),) = estimates(recording, recording.camera)
     finder = cv2.SIFT.create(2000)
@@ -79,7 +79,7 @@ def rectified(folder: Path) -> dict[str, Any]:
 
 
 def heart(folder: Path) -> dict[str, Any]:
-    """The right picture made from the left one by the right eye's disparities, as `recordings/README.md` measures it: every tenth frame."""
+    """Score every tenth right picture, warped from the left one by the right eye's disparities."""
     recording = open_recording(folder)
     # Seen in a mirror the right eye is the left one, and its disparities are those that lead from its pixels to the left picture.
     mirrored = (
@@ -107,7 +107,7 @@ def flipped(image: np.ndarray) -> np.ndarray:
 
 
 def filled(plane: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Values around them where none are known, from ever larger squares."""
+    """Fill unknown values with means of known neighbours, in growing windows."""
     weight = known.astype(np.float32)
     for side in (5, 15, 45, 135, 301):
         share = cv2.blur(weight, (side, side))
@@ -119,7 +119,7 @@ def filled(plane: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def psnr_of_line(shown: np.ndarray, true: np.ndarray) -> float:
-    """After a straight line for each channel, without the border and the columns that only one eye sees."""
+    """Return the PSNR after a linear fit per channel, without the border and columns that one eye does not see."""
     inside = np.s_[HEART_BORDER_PX:-HEART_BORDER_PX, HEART_BORDER_PX:-HEART_ONE_EYED_PX]
     errors = []
     for channel in range(3):
@@ -130,7 +130,7 @@ def psnr_of_line(shown: np.ndarray, true: np.ndarray) -> float:
 
 
 def synthetic(asked: RenderSettings) -> dict[str, Any]:
-    """Root mean square error of believed depth on tissue, as a share of the median depth, over all frames."""
+    """Return the RMS error of confident depth on tissue over all frames, relative to the median depth."""
     recording = render_recording(asked)
     squares, shares, costs, everywhere = [], [], [], []
     for frame, found, cpu_ms in estimates(recording, recording.camera):

@@ -109,7 +109,7 @@ def parsed() -> argparse.Namespace:
 
 
 def measured(name: str, case: Case, arguments: argparse.Namespace, work: Path) -> tuple[Geometry, float]:
-    """Train on what the case has, and measure against all that is known; with the seconds that training and its report took."""
+    """Train on the inputs of the case and evaluate with the full ground truth; returns the evaluation and the training time in s."""
     whole = recording_of(case, arguments, work)
     given = work / f"{name}-given"
     copy_of(whole, given, case)
@@ -136,7 +136,7 @@ def measured(name: str, case: Case, arguments: argparse.Namespace, work: Path) -
 
 
 def recording_of(case: Case, arguments: argparse.Namespace, work: Path) -> Path:
-    """The recording with all that is known; made once for all cases with the same camera."""
+    """Return the recording with full ground truth, rendered once for all cases with the same camera."""
     extras = Extras(
         scene=arguments.scene,
         third=True,

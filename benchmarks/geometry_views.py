@@ -46,14 +46,14 @@ def errors_of(model: Model, frame: Frame, camera: Any) -> dict[str, float]:
 
 
 def angle_between(found: NDArray[np.float32], exact: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
-    """Median angle in degrees, where both are known."""
+    """Return the median angle in degrees where both normals are known."""
     both = where & found.any(-1) & exact.any(-1)
     cosine = np.clip(np.einsum("ij,ij->i", found[both], exact[both]), -1, 1)
     return float(np.degrees(np.median(np.arccos(cosine))))
 
 
 def replayed(recording: RenderedRecording, weight: float) -> dict[str, float]:
-    """Means over every fourth frame, each measured right after it was trained on."""
+    """Return means over every fourth frame, each measured right after training on it."""
     pixels = recording.width_px * recording.height_px
     config = ReconstructorConfig(gaussians=pixels // 4, max_gaussians=pixels // 2, depth_weight=weight)
     learning = Reconstructor(config, recording.camera)
@@ -66,7 +66,6 @@ def replayed(recording: RenderedRecording, weight: float) -> dict[str, float]:
 
 
 def main() -> None:
-    """Replay once for each weight."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--width", type=int, default=160)

@@ -29,18 +29,18 @@ HEXPLANES = {
     "85M": ({"channels": 64, "resolution": (64, 64, 64, 100), "levels": (1, 2, 4, 8), "width": 32, "depth": 2}, gsharp),
     "small": ({"channels": 32, "resolution": (64, 64, 64, 25), "levels": (1, 2), "width": 64, "depth": 3}, small),
 }
-"""Our field and the peer's, of one size. Where G-SHARP has a hidden layer per head, ours has one in common."""
+"""Configuration of both fields, of equal size. G-SHARP has a hidden layer per head; here all heads share one."""
 KEPT: dict[Precision, torch.dtype] = {"fp32": torch.float32, "fp16": torch.float16}
 ASKED_MS = {("85M", 50_000): 0.10}
 
 
 def times_s() -> Iterator[float]:
-    """Times through the window, again and again."""
+    """Yield times within the window endlessly."""
     return itertools.cycle(torch.linspace(0.1, 5.9, 37).tolist())
 
 
 def moving(field: HexPlaneField) -> HexPlaneField:
-    """A field that was not trained adds nothing; this one moves things a little."""
+    """Return a field with small random deformations, since an untrained one is the identity."""
     with torch.no_grad():
         weights = torch.randn(field.head.weight.shape, generator=torch.Generator().manual_seed(3))
         field.head.weight.copy_(1e-3 * weights)
@@ -63,7 +63,7 @@ def deltas_alone(field: DeformationField, gaussians: Gaussians, repetitions: int
 def with_picture(
     field: DeformationField, gaussians: Gaussians, camera: Camera, repetitions: int, precision: Precision = "fp32"
 ) -> tuple[Times, float]:
-    """`FrameRenderer` with a new time for every frame; and how near its picture is to that of float32 ops, in dB."""
+    """Time `FrameRenderer` at a new time per frame; also returns the PSNR of its picture against the float32 ops."""
     renderer = FrameRenderer(gaussians, camera, field, precision=precision)
     at = times_s()
     picture = renderer.render(time_s=2.5).result().image
@@ -76,7 +76,7 @@ def with_picture(
 def peer_times(
     scene: Scene, field: PlainHexPlane, rasterization: Callable | None, repetitions: int
 ) -> tuple[Times, Times | None]:
-    """The plain network alone, and with gsplat's picture."""
+    """Time the plain PyTorch network alone and with gsplat's rendering."""
     raw = scene.raw()
     box = torch.stack([raw[0].amin(0), raw[0].amax(0)])
     deform = with_hexplane(field, box)
@@ -117,7 +117,7 @@ def hexplane(size: str, count: int, repetitions: int) -> None:
 
 
 def basis(count: int, repetitions: int) -> None:
-    """26 bumps per Gaussian."""
+    """Return a basis field with 26 bumps per Gaussian."""
     scene = surgical(count, 640, 512)
     gaussians = Gaussians(*scene.raw())
     field = BasisField(count, WINDOW_S, bumps=26)

@@ -21,7 +21,7 @@ from torch import Tensor
 import gsplat_core
 
 ASKED_MS = {"surgical50k_640x512": (0.35, 1.2), "volume1m_1080p": (0.9, 2.8)}
-"""Forward, and forward with backward, where a limit was set."""
+"""Required times in ms: forward, and forward with backward."""
 
 
 def run(name: str, repetitions: int, packed: bool) -> None:

@@ -28,11 +28,11 @@ ROOT = Path(__file__).resolve().parent.parent
 LIBRARY = ROOT / "gsplat_core" / "gsplat_core_cuda.so"
 TESTS = "tests/gsplat_core/cuda"
 QUICK_US = 3000.0
-"""Time on the GPU of a test that is not too long under a sanitizer, which makes it a hundred times as long and more."""
+"""Longest GPU time of a test to run under a sanitizer, which multiplies it by 100 or more."""
 MUCH = 0.5
-"""A test gives a kernel much work if the kernel takes at least this part of the longest time that it takes in a quick test."""
+"""A test counts as heavy use of a kernel from this share of the kernel's longest time in a quick test on."""
 SETUP_US = 1000.0
-"""Rough cost of a test under a sanitizer in addition to its kernels, in the same unit."""
+"""Approximate overhead of a test under a sanitizer, in the same unit."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Launched:
 
 @dataclass
 class Watch:
-    """A pytest plugin that notes what every test launches."""
+    """Pytest plugin that records the kernels each test launches."""
 
     tests: dict[str, Launched] = field(default_factory=dict)
 
@@ -76,12 +76,12 @@ class Watch:
 
 
 def plain(name: str) -> str:
-    """A demangled name without spaces and without the type of the result."""
+    """Return a demangled name without spaces and result type."""
     return re.sub(r"^void|\s", "", name)
 
 
 def kernels_of(library: Path) -> set[str]:
-    """All kernels in the library but CUB's, which have their own tests, and the probe that is never launched (`cuda_build.cu`)."""
+    """Return all kernels of the library except CUB's and the probe of `cuda_build.cu`, which is never launched."""
     usage = subprocess.run(["cuobjdump", "-res-usage", library], check=True, capture_output=True, text=True).stdout
     mangled = "\n".join(sorted(set(re.findall(r"\b_Z\w+", usage))))
     names = subprocess.run(["c++filt"], input=mangled, check=True, capture_output=True, text=True).stdout
@@ -89,7 +89,7 @@ def kernels_of(library: Path) -> set[str]:
 
 
 def cover(tests: dict[str, Launched], kernels: set[str]) -> list[str]:
-    """Few and quick tests, greedily chosen, that together give every kernel much work."""
+    """Select few, quick tests that together use every kernel heavily (greedy set cover)."""
     eager = {name: test for name, test in tests.items() if not test.records_graphs}
     most: dict[str, float] = {}
     for test in sorted(eager.values(), key=lambda test: test.total_us):

@@ -33,14 +33,14 @@ from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.replay import ReplaySettings
 
 MOMENTS = (0.1, 0.25, 0.5, 0.75, 1.0)
-"""Shares of the steps after which it is evaluated."""
+"""Shares of the steps after which the model is evaluated."""
 STRETCH_STEPS = 100
 TRIAL_STRETCHES = 6
 
 
 @dataclass
 class Clock:
-    """Seconds of training, without those of evaluation."""
+    """Stopwatch of training time that excludes evaluation."""
 
     device: torch.device
     total_s: float = 0.0
@@ -56,7 +56,7 @@ class Clock:
 
 
 def quality(learning: Reconstructor, frames: list[Frame], camera: Camera) -> tuple[float, float]:
-    """Mean and worst tissue PSNR of some frames, as they would be shown: in bytes."""
+    """Return mean and worst tissue PSNR of frames rendered to 8 bits."""
     model = learning.snapshot()
     values = []
     for frame in frames:

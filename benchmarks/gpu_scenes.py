@@ -1,4 +1,4 @@
-"""The scenes of the GPU benchmarks: seeded, the same as those that the peers' figures were taken with."""
+"""Seeded scenes of the GPU benchmarks, equal to those of the peers' figures."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ class Scene:
 
     @property
     def camera(self) -> tuple[Tensor, Tensor]:
-        """viewmat [4, 4] and K [3, 3]."""
+        """Return viewmat [4, 4] and K [3, 3]."""
         return self.arguments["viewmats"][0], self.arguments["Ks"][0]
 
     def raw(self) -> tuple[Tensor, ...]:
-        """Means, rotations, log-scales, logit opacities and harmonics, as the frame path takes them."""
+        """Return means, rotations, log-scales, logit opacities and harmonics, the arguments of the frame path."""
         of = self.arguments
         return of["means"], of["quats"], of["scales"].log(), of["opacities"].logit(), of["colors"]
 
     def leaves(self) -> dict[str, Tensor]:
-        """Copies of the parameters that take gradients."""
+        """Return copies of the parameters that require gradients."""
         return {name: self.arguments[name].clone().requires_grad_() for name in PARAMETERS}
 
 
 def surgical(count: int, width: int, height: int, seed: int = 0) -> Scene:
-    """A bumpy tissue-like surface: flat and mostly opaque Gaussians of about 1.6 px."""
+    """Return a bumpy tissue-like surface: flat, mostly opaque Gaussians of about 1.6 px."""
     g, focal_px = torch.Generator().manual_seed(seed), 560.0
     u, v = torch.rand(count, generator=g) * width, torch.rand(count, generator=g) * height
     z = 60 + 12 * torch.sin(u / 90) * torch.cos(v / 70) + 0.3 * torch.randn(count, generator=g)
@@ -53,7 +53,7 @@ def surgical(count: int, width: int, height: int, seed: int = 0) -> Scene:
 
 
 def volume(count: int, width: int, height: int, seed: int = 1) -> Scene:
-    """Gaussians of log-normal screen size (median 1.2 px) through a deep frustum."""
+    """Return Gaussians of log-normal screen size (median 1.2 px) in a deep frustum."""
     g, focal_px = torch.Generator().manual_seed(seed), 1400.0
     u = torch.rand(count, generator=g) * width * 1.2 - 0.1 * width
     v = torch.rand(count, generator=g) * height * 1.2 - 0.1 * height

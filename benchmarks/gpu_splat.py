@@ -36,9 +36,9 @@ ASKED_MS = {
     "volume1m_1080p": (0.40, 1.8),
     "volume4m_4k": (1.5, 7.0),
 }
-"""Forward and forward with backward, where a limit was set."""
+"""Required times in ms: forward, and forward with backward."""
 ASKED_HALF_MS = {"volume1m_1080p": 0.30, "volume4m_4k": 1.5}
-"""Forward in half precision."""
+"""Required times in ms: forward in half precision."""
 ASKED_MIB = {"volume1m_1080p": 250.0}
 """Memory beyond what is there before (parameters, Adam's moments) for forward with backward. The gradients themselves are in it where
 they are stored, as the peer's are; a training step of ours, whose Adam is in the same pass, stores none, and is what the limit is for."""
@@ -61,7 +61,7 @@ class FramePath:
         return self._render(self._gaussians[4])
 
     def forward_half(self) -> Frame:
-        """Harmonics kept and splats blended in half precision."""
+        """Render with harmonics and blending in half precision."""
         return self._render(self._half_sh)
 
     def step(self) -> None:
@@ -71,7 +71,7 @@ class FramePath:
         )
 
     def learning_step(self) -> Work:
-        """A step whose gradient goes straight into Adam over the Gaussians: no gradient of theirs is ever stored."""
+        """Run a step with the gradient fused into Adam, so that no gradient of the Gaussians is stored."""
         gaussians = tuple(tensor.clone() for tensor in self._gaussians)
         moments = [[torch.zeros_like(tensor) for tensor in gaussians] for _ in range(2)]
         rates = torch.full((RATES,), 1e-6, device="cuda")
@@ -95,7 +95,7 @@ class FramePath:
 
 
 def l1_gradients(image: Tensor, alphas: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of the mean absolute difference of RGB and expected depth, which is the last channel divided by alpha.
+    """Return the gradients of the mean absolute difference of RGB and expected depth (last channel divided by alpha).
 
     `image` is overwritten.
     """
@@ -110,7 +110,7 @@ def l1_gradients(image: Tensor, alphas: Tensor, target: Tensor) -> tuple[Tensor,
 
 
 def called(rasterization: Callable[..., Any], scene: Scene, target: Tensor) -> tuple[Callable[[], Tensor], Work]:
-    """Forward, and forward with backward, of a function with gsplat's arguments."""
+    """Time forward, and forward with backward, of a function with gsplat's arguments."""
 
     def forward() -> Tensor:
         with torch.no_grad():
@@ -128,7 +128,7 @@ def called(rasterization: Callable[..., Any], scene: Scene, target: Tensor) -> t
 
 
 def live(scene: Scene, repetitions: int) -> Times:
-    """`FrameRenderer`: a new camera for every frame."""
+    """Time `FrameRenderer` with a new camera per frame."""
     raw, (width, height) = scene.raw(), scene.size_px
     pose, intrinsics = (tensor.cpu().double().numpy() for tensor in scene.camera)
     cameras = []

@@ -32,7 +32,7 @@ Work = Callable[[], object]
 
 @dataclass(frozen=True)
 class Times:
-    """Times of one piece of work, in milliseconds."""
+    """Times of a function call, in milliseconds."""
 
     ms: float
     queued_ms: float
@@ -63,7 +63,7 @@ def _median_of_calls(work: Work, repetitions: int) -> float:
 
 
 def _queued(work: Work, repetitions: int) -> float:
-    """Best of three, for whatever else the host does can only add."""
+    """Return the best of three, since other work of the host can only add time."""
     best = float("inf")
     for _ in range(3):
         start, end = _events()
@@ -99,7 +99,7 @@ def _events() -> tuple[torch.cuda.Event, torch.cuda.Event]:
 
 
 def captured(work: Work, warm_up: int = 2) -> Work:
-    """`work` recorded once as a CUDA graph; calling the result replays it."""
+    """Capture `work` as a CUDA graph; returns the function that replays it."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -113,7 +113,7 @@ def captured(work: Work, warm_up: int = 2) -> Work:
 
 
 def extra_mib(work: Work, calls: int = 3) -> float:
-    """Peak of torch's memory during `work` beyond what was there before, after a call that is not counted."""
+    """Return the peak of torch's memory during `work`, in addition to the memory before, after a warm-up call."""
     work()
     torch.cuda.synchronize()
     torch.cuda.reset_peak_memory_stats()
@@ -125,7 +125,7 @@ def extra_mib(work: Work, calls: int = 3) -> float:
 
 
 def gsplat() -> ModuleType | None:
-    """The peer, where it is installed (`benchmarks/peers/build_gsplat.py`)."""
+    """Return the gsplat module, or None if it is not installed (`benchmarks/peers/build_gsplat.py`)."""
     try:
         import gsplat as module
     except ImportError as error:
@@ -158,7 +158,7 @@ def compare(work: str, ours: Times, peers: Mapping[str, Times], asked_ms: float 
 
 
 def report_machine() -> None:
-    """The first line of a run: what it ran on."""
+    """Print GPU, driver and versions as the first line of a run."""
     module = gsplat()
     report(
         "machine",

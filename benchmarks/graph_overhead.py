@@ -1,4 +1,4 @@
-"""Cost of the operator graph itself: a saturated chain of three operators that pass an int.
+"""Measure the overhead of the operator graph: a saturated chain of three operators that pass an int.
 
 Claim: at most 5 µs per compute call on the greedy scheduler. Prints JSON. With `--holoscan` the same operators also
 run on the Holoscan SDK through the adapter, and as native Holoscan operators, in the same process.
@@ -32,49 +32,42 @@ CLAIM_US = 5.0
 
 
 class Source(Operator):
-    """Counts."""
+    """Emits increasing numbers."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """Operator with one output."""
         spec.output("out")
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        """Emit a number."""
         op_output.emit(1, "out")
 
 
 class Pass(Operator):
-    """Passes on."""
+    """Emits what it receives."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """Operator with one input and one output."""
         spec.input("in")
         spec.output("out")
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        """Emit what came."""
         op_output.emit(op_input.receive("in"), "out")
 
 
 class Sink(Operator):
-    """Takes."""
+    """Receives and discards."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """Operator with one input."""
         spec.input("in")
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        """Receive."""
         op_input.receive("in")
 
 
 class Chain(Application):
-    """source → pass → sink."""
+    """Graph: source → pass → sink."""
 
     messages = 1
 
     def compose(self) -> None:
-        """Wire the chain."""
         source = Source(self, CountCondition(self, self.messages), name="source")
         middle, sink = Pass(self, name="pass"), Sink(self, name="sink")
         self.add_flow(source, middle)
@@ -82,7 +75,7 @@ class Chain(Application):
 
 
 def chain_us(messages: int, *, threads: bool = False, track: bool = False, engine: Any = "embedded") -> float:
-    """Microseconds per compute call of one run."""
+    """Return the microseconds per compute call of one run."""
     app = Chain(track=track)
     app.messages = messages
     app.scheduler(MultiThreadScheduler(app) if threads else GreedyScheduler(app))
@@ -93,16 +86,16 @@ def chain_us(messages: int, *, threads: bool = False, track: bool = False, engin
 
 
 class Woken(Operator):
-    """Waits for an event and notes how long the wake took."""
+    """Operator that waits for an event and records the delay until it runs."""
 
     def setup(self, spec: OperatorSpec) -> None:
-        """No ports."""
+        """Declare no ports."""
         self.set_at_ns = 0
         self.delays_us: list[float] = []
         self.asleep = threading.Event()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        """Note the delay and wait again."""
+        """Record the delay and wait again."""
         if self.set_at_ns:
             self.delays_us.append((time.perf_counter_ns() - self.set_at_ns) * 1e-3)
         event = self.conditions[0]
@@ -115,14 +108,13 @@ class WakeApp(Application):
     """Application with one operator that waits for events."""
 
     def compose(self) -> None:
-        """Add it."""
         self.event = AsynchronousCondition(self)
         self.woken = Woken(self, self.event)
         self.add_operator(self.woken)
 
 
 def wake_us(wakes: int) -> dict[str, float]:
-    """Microseconds from setting an event in another thread to compute, on the multi-threaded scheduler."""
+    """Return the microseconds from setting an event in another thread to `compute`, on the multi-threaded scheduler."""
     app = WakeApp()
     app.scheduler(MultiThreadScheduler(app))
     future = app.run_async()
@@ -166,7 +158,6 @@ def native_holoscan_us(messages: int) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--messages", type=int, default=100_000)
     parser.add_argument("--repeats", type=int, default=5)

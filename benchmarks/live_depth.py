@@ -83,7 +83,6 @@ def run(asked: Arguments, recording: FileRecording, points: SparsePoints | None,
 
 
 def main() -> None:
-    """Every run that was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--depth", default="auto")

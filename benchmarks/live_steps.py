@@ -1,4 +1,4 @@
-"""Live training with a fixed number of steps per frame, without a clock: quality of what is shown, repeatable on every machine.
+"""Measure live training with a fixed number of steps per frame, without a clock, so that results can be repeated.
 
     python benchmarks/live_steps.py RECORDING... [--steps 60] [--rehearse 60] [--like cuda] [--frames 100] [--scale 0.5] [--fps 60]
 
@@ -42,13 +42,13 @@ from operators.sinks.callback import CallbackSinkOp
 from operators.sources.registry import SourceOptions, open_source
 
 FIRST_STEPS = {"cpu": 4, "cuda": 60}
-"""Steps on the first frame: about what a live run has time for."""
+"""Steps on the first frame, about as many as in a live run."""
 SETTLING_S = 1.0
 """Seconds at the start that are not scored, as in `operators.metrics`."""
 
 
 class Shown:
-    """Pictures of what a reconstructor publishes, in bytes as they are displayed."""
+    """Renders the published model to 8-bit pictures, as displayed."""
 
     def __init__(self, reconstructor: Reconstructor, camera: Camera) -> None:
         self._reconstructor, self._camera = reconstructor, camera
@@ -56,13 +56,13 @@ class Shown:
         self._published: Any = None
 
     def publish(self, whole: bool = False) -> None:
-        """Take the newest model; `whole` with its past."""
+        """Publish the newest model; `whole` includes its history."""
         made = self._reconstructor
         self._published = made.snapshot() if whole else made.publish()
         self._renderer.prepare(self._published)
 
     def psnr_db(self, frame: Frame) -> float:
-        """Tissue PSNR of the picture at the frame's time, from the frame's camera."""
+        """Return the tissue PSNR of the picture at the frame's time and camera."""
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         image = self._renderer.render(camera, frame.time_s, ("image",)).result().image
         image = image * image.new_tensor(frame.exposure)
@@ -101,7 +101,6 @@ class Analysis(Application):
         self.frames: list[Frame] = []
 
     def compose(self) -> None:
-        """Wire the operators."""
         source = SourceOp(self, name="source", source=self._source)
         analysis = analysis_operator(self, "builtin", "withhold", ())
         sink = CallbackSinkOp(self, name="frames", callback=self.frames.append)
@@ -122,7 +121,7 @@ def frames_of(path: str, arguments: argparse.Namespace) -> tuple[list[Frame], Ca
 
 
 class Run:
-    """Train one recording in one reconstructor, frame by frame."""
+    """Training of one recording in one reconstructor, frame by frame."""
 
     def __init__(self, path: str, arguments: argparse.Namespace) -> None:
         self.arguments = arguments
@@ -133,7 +132,7 @@ class Run:
         self.series: dict[str, list[float]] = {"shown_db": [], "copy_db": [], "next_db": []}
 
     def __call__(self) -> None:
-        """Work through all frames."""
+        """Process all frames."""
         before: Frame | None = None
         for frame in self.frames:
             scored, is_shown = frame.withheld is None, self._scene is not None
@@ -164,7 +163,7 @@ class Run:
         self._shown.publish()
 
     def _rehearse(self, frame: Frame) -> None:
-        """Do what a live run does after a frame was shown."""
+        """Rehearse and grow as a live run does between frames."""
         made = self.reconstructor
         if self._scene is None or self.arguments.engine == "replay":
             return
@@ -174,7 +173,7 @@ class Run:
             made.rehearse(self.arguments.rehearse)
 
     def retained(self) -> list[float]:
-        """Return the PSNR of the newest frames as the model shows them at the end."""
+        """Return the PSNR of the newest frames, rendered by the final model."""
         self._shown.publish(whole=True)
         newest = self.frames[-max(1, round(self.arguments.retained * self.fps)) :]
         return [self._shown.psnr_db(f) for f in newest if f.withheld is None and f.scene == self._scene]
@@ -205,7 +204,7 @@ def measure(path: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def figures_of(series: dict[str, list[float]], settled: int) -> dict[str, float]:
-    """Return the means after the first `settled` frames, of what is shown the median and the worst, too."""
+    """Return the means after the first `settled` frames, and median and minimum of the displayed pictures."""
     kept = {name: np.array(values[settled:]) for name, values in series.items()}
     figures = {name: round(float(np.nanmean(values)), 2) for name, values in kept.items()}
     shown = kept["shown_db"]
@@ -217,7 +216,7 @@ def figures_of(series: dict[str, list[float]], settled: int) -> dict[str, float]
 
 
 def commit() -> str:
-    """Return the commit of the working tree, with a plus sign where files differ from it."""
+    """Return the commit of the working tree, with a plus sign if files differ from it."""
     run = lambda *command: subprocess.run(["git", *command], capture_output=True, text=True, cwd=Path(__file__).parent)
     return run("rev-parse", "--short", "HEAD").stdout.strip() + (
         "+" if run("status", "--porcelain", "-uno").stdout else ""
@@ -225,7 +224,7 @@ def commit() -> str:
 
 
 def lines(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yield each recording's line, with the settings that lead to it."""
+    """Yield a result line per recording, with its settings."""
     for path in arguments.recordings:
         stated = {
             name: vars(arguments)[name] for name in ("engine", "like", "device", "steps", "rehearse", "scale", "fps")
@@ -235,7 +234,6 @@ def lines(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure every recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+")
     parser.add_argument("--engine", choices=("live", "replay"), default="live")

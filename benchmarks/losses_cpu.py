@@ -1,4 +1,4 @@
-"""Time of the fused image loss, SSIM and Adam on the CPU against the same work in torch.
+"""Measure the fused image loss, SSIM and Adam on the CPU against torch.
 
     OMP_NUM_THREADS=2 python benchmarks/losses_cpu.py [--repeats 20]
 
@@ -26,7 +26,7 @@ ROWS = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (),
 
 
 def measure(name: str, body: Callable[[], object], repeats: int) -> float:
-    """Prints and returns the best time in milliseconds."""
+    """Print and return the best time in milliseconds."""
     body()
     times_ms = []
     for _ in range(repeats):

@@ -54,7 +54,7 @@ def figures(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def still(stills: Path, folder: Path) -> Path:
-    """A recording of several equal frames out of one that has a single frame; its calibration stays."""
+    """Return a recording that repeats the only frame of another one, with its calibration."""
     made = folder / stills.name
     for images in (each for each in stills.iterdir() if each.is_dir()):
         (made / images.name).mkdir(parents=True)

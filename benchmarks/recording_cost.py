@@ -116,7 +116,7 @@ def beside_a_graph(shown: Literal["vp9", "digest"], info: SessionInfo, frames: l
 
 
 def with_loss_mask(frame: Frame) -> Frame:
-    """Highlights left out of the loss, as live training has it."""
+    """Return the frame with highlights excluded from the loss, as in live training."""
     return frame.with_fields(loss_mask=(frame.image.min(axis=2) < 200).astype(np.uint8))
 
 

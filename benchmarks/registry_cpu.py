@@ -29,7 +29,7 @@ WINDOW_S = (0.0, 5.0)
 
 
 def save_model(folder: Path, count: int) -> None:
-    """A sheet of Gaussians that fills a picture of 640x512, with a basis field."""
+    """Save a sheet of Gaussians that fills a 640x512 picture, with a basis field."""
     random = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, generator=random)
     means = draw(count, 3) * torch.tensor([20.0, 20.0, 3.0]) + torch.tensor([0.0, 0.0, 60.0])

@@ -1,4 +1,4 @@
-"""A whole replay of a real recording: wall time, peak memory, quality, and whether the same seed gives the same bytes on both engines.
+"""Measure whole replays: wall time, peak memory, quality, and equality of the results of both engines.
 
 Usage: python benchmarks/replay_cpu.py RECORDING [--fields basis hexplane] [--frames N] [--engines embedded holoscan]
 
@@ -44,7 +44,7 @@ def replay(recording: Path, field: str, engine: str, frames: int | None) -> dict
 
 
 def main() -> None:
-    """Run the replays that were asked for, the first one twice."""
+    """Run the requested replays, the first one twice."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--fields", nargs="+", default=["basis", "hexplane"])

@@ -1,4 +1,4 @@
-"""Facts of a run that each line of a log states: command, commit, machine, date."""
+"""Provenance of a log line: command, commit, machine, date."""
 
 from __future__ import annotations
 

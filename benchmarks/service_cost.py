@@ -35,7 +35,7 @@ from services.supervisor.capture import CapturedSource
 
 
 class Pattern(LiveSource):
-    """Pictures of noise at a rate."""
+    """Source of noise pictures at a fixed rate."""
 
     def __init__(self, width_px: int, height_px: int, fps: float, frames: int) -> None:
         super().__init__(waiting=4)
@@ -44,7 +44,6 @@ class Pattern(LiveSource):
         self._image = np.random.default_rng(0).integers(0, 256, (height_px, width_px, 3), np.uint8)
 
     def frames(self):
-        """The pictures."""
         for seq in range(self.description.frame_count or 0):
             if self.wait(1 / self.description.fps):
                 return
@@ -52,14 +51,14 @@ class Pattern(LiveSource):
 
 
 def measured(what: Callable[[], int]) -> tuple[float, int]:
-    """CPU time for each frame in ms, and how many frames there were."""
+    """Return the CPU time per frame in ms and the number of frames."""
     began_s = time.process_time()
     frames = what()
     return 1e3 * (time.process_time() - began_s) / max(1, frames), frames
 
 
 def read_all(source: Any, each: Callable[[Frame], None], frames: int) -> int:
-    """Read a source to its end, or until nothing has come for a second."""
+    """Read a source to its end, or until nothing arrives for a second."""
     source.open()
     count = 0
     while count < frames and (frame := source.read(1.0)) is not None:
@@ -70,7 +69,7 @@ def read_all(source: Any, each: Callable[[Frame], None], frames: int) -> int:
 
 
 def raw_hop(options: argparse.Namespace, runtime: RuntimeFolder) -> dict[str, Any]:
-    """Capture to engine."""
+    """Measure the hop from capture to engine."""
     folder = runtime.stream("raw")
     pattern = Pattern(options.width, options.height, options.fps, options.frames)
     alone_ms, _ = measured(lambda: read_all(pattern, lambda frame: None, options.frames))
@@ -106,7 +105,7 @@ def raw_hop(options: argparse.Namespace, runtime: RuntimeFolder) -> dict[str, An
 
 
 def shown_hop(options: argparse.Namespace, runtime: RuntimeFolder) -> dict[str, Any]:
-    """Engine to display, and one JPEG."""
+    """Measure the hop from engine to display, including one JPEG."""
     endpoint = runtime.stream("shown").pictures("engine")
     publisher = PicturePublisher(endpoint)
     image = np.random.default_rng(0).integers(0, 256, (options.height, options.width, 3), np.uint8)
@@ -144,7 +143,6 @@ def shown_hop(options: argparse.Namespace, runtime: RuntimeFolder) -> dict[str, 
 
 
 def main() -> None:
-    """Measure both hops."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=512)

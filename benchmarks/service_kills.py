@@ -1,4 +1,4 @@
-"""kill -9 of the service's processes while people watch: what they see of it, and whether anything that was kept is lost or broken.
+"""Kill the service's processes by SIGKILL while viewers watch; measure interruptions and check that stored data is intact.
 
     python benchmarks/service_kills.py engine --kills 20     also: capture, control
 
@@ -34,7 +34,7 @@ BACK_WITHIN_S = 60.0
 
 
 class Changes:
-    """Activates and rolls back, in a thread, and keeps what was answered."""
+    """Thread that activates and rolls back models and records the answers."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -63,7 +63,7 @@ class Changes:
                 self.unanswered += 1
 
     def kept(self) -> dict[str, Any]:
-        """Stop, and say what of it is there."""
+        """Stop, and report which recorded changes are stored."""
         self._stop.set()
         self._thread.join()
         path = self._server.data / "audit.jsonl"
@@ -83,7 +83,7 @@ class Changes:
 
 
 async def until(what: Any, within_s: float = BACK_WITHIN_S) -> None:
-    """Wait until something holds."""
+    """Wait until a condition holds."""
     async with asyncio.timeout(within_s):
         while not what():
             await asyncio.sleep(0.005)
@@ -95,7 +95,7 @@ def newer(viewer: FastViewer, at_ns: int) -> bool:
 
 
 async def role_killed(server: Server, role: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Capture or engine."""
+    """Kill capture or engine repeatedly and measure the interruptions."""
     choose = random.Random(options.seed)
     viewers = {kind: [await watch(server.port, server.ticket(), kind) for _ in range(2)] for kind in ("raw", "shown")}
     watched = viewers["raw" if role == "capture" else "shown"][0]
@@ -124,7 +124,7 @@ async def role_killed(server: Server, role: str, options: argparse.Namespace) ->
 
 
 async def control_killed(server: Server, options: argparse.Namespace) -> dict[str, Any]:
-    """The control plane."""
+    """Kill the control plane repeatedly and measure the interruptions."""
     choose = random.Random(options.seed)
     folder = server.runtime / STREAM
     raw, shown = (Watch(f"ipc://{folder / name}") for name in ("raw", "shown"))
@@ -158,7 +158,6 @@ async def control_killed(server: Server, options: argparse.Namespace) -> dict[st
 
 
 def main() -> None:
-    """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["engine", "capture", "control"])
     parser.add_argument("--kills", type=int, default=20)

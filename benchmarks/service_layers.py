@@ -26,13 +26,13 @@ from services.supervisor.worker import specs_of
 
 
 def cpu_s(pid: int) -> float:
-    """User and system time of a process so far."""
+    """Return the user and system time of a process in s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 async def part(stream: Stream, what: str, layers: tuple[str, ...], seconds: float) -> None:
-    """Watch the screen and these layers for a while."""
+    """Watch the reconstruction and these layers for a while."""
     shown = Watch(stream.folder.pictures("engine"))
     beside = {layer: Watch(stream.folder.endpoint(layer)) for layer in layers}
     await asyncio.sleep(2)
@@ -67,7 +67,7 @@ async def part(stream: Stream, what: str, layers: tuple[str, ...], seconds: floa
 
 
 async def snapshots(stream: Stream, count: int, folder: Path) -> None:
-    """Take snapshots while the screen is watched."""
+    """Take snapshots while the reconstruction is watched."""
     shown = Watch(stream.folder.pictures("engine"))
     await asyncio.sleep(2)
     shown.begin()
@@ -88,7 +88,7 @@ async def snapshots(stream: Stream, count: int, folder: Path) -> None:
 
 
 async def main() -> None:
-    """Each part after the other, on one stream."""
+    """Measure all parts on one stream."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--source", default="synthetic:?width=320&height=256&frames=90&fps=30&moving=1")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")

@@ -55,14 +55,14 @@ def _rate(before: tuple[int, int], after: tuple[int, int]) -> float:
 
 
 async def phase(server: Server, pids: dict[str, int], seconds: float) -> dict[str, Any]:
-    """Let it run, and say what it did."""
+    """Run for a while and return the rates."""
     before = await asyncio.to_thread(Marks, server, pids)
     await asyncio.sleep(seconds)
     return (await asyncio.to_thread(Marks, server, pids)).since(before)
 
 
 async def asking(server: Server, per_s: float, took_ms: list[float]) -> None:
-    """Ask the API at a rate over eight connections, whether or not it keeps up."""
+    """Send API requests at a fixed rate over eight connections, even if the server falls behind."""
     connections: asyncio.Queue = asyncio.Queue()
     for _ in range(8):
         connections.put_nowait(await asyncio.open_connection("127.0.0.1", server.port))
@@ -89,14 +89,13 @@ async def asking(server: Server, per_s: float, took_ms: list[float]) -> None:
 
 
 async def memory(pid: int, found: list[float]) -> None:
-    """The control plane's own memory, twice a second."""
+    """Sample the control plane's resident memory twice per second."""
     while True:
         found.append(resident_mib(pid))
         await asyncio.sleep(0.5)
 
 
 async def measured(server: Server, options: argparse.Namespace) -> dict[str, Any]:
-    """Run all phases."""
     pids = await asyncio.to_thread(server.pids)
     await asyncio.sleep(options.settle)
     result: dict[str, Any] = {"without": await phase(server, pids, options.seconds)}
@@ -151,7 +150,6 @@ async def measured(server: Server, options: argparse.Namespace) -> dict[str, Any
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default=SOURCE)
     parser.add_argument("--device", default="cpu")

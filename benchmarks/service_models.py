@@ -1,4 +1,4 @@
-"""Models for measurements of the service: still scenes of random Gaussians, uploaded, checked and activated over its API."""
+"""Static random models for measurements of the service, with API calls to upload, activate and roll back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NAME = "swapped"
 
 
 def packed_model(seed: int, gaussians: int, width_px: int, height_px: int) -> bytes:
-    """A scene in front of the camera, as one file; each seed has another one."""
+    """Write a random scene in front of the camera as one file; the seed selects the scene."""
     random = torch.Generator().manual_seed(seed)
     spread = lambda *shape: torch.rand(*shape, generator=random)
     scene = Gaussians(
@@ -40,7 +40,7 @@ def packed_model(seed: int, gaussians: int, width_px: int, height_px: int) -> by
 
 
 def upload(server: Server, content: bytes, within_s: float = 120.0) -> int:
-    """The number of a version that was uploaded and found to be good."""
+    """Upload a version, wait for its check, and return its number."""
     digest = base64.b64encode(hashlib.sha256(content).digest()).decode()
     headers = {"Content-Type": "application/octet-stream", "Content-Digest": f"sha-256=:{digest}:"}
     version = server.ask(f"/v1/models/{NAME}/versions", "PUT", content, headers)["version"]
@@ -53,12 +53,12 @@ def upload(server: Server, content: bytes, within_s: float = 120.0) -> int:
 
 
 def activate(server: Server, version: int, current: int | None) -> None:
-    """Serve a version in place of another one."""
+    """Activate a version in place of another one."""
     server.ask(f"/v1/models/{NAME}/activate", "POST", {"version": version, "expected_current": current})
 
 
 def roll_back(server: Server) -> int:
-    """Serve the version before; its number."""
+    """Roll back, and return the active version's number."""
     return server.ask(f"/v1/models/{NAME}/rollback", "POST")["version"]
 
 

@@ -30,7 +30,7 @@ SOURCE = "synthetic:?width=320&height=256&frames=24&fps=30"
 
 
 def bare(options: argparse.Namespace) -> dict[str, Any]:
-    """`live` in this process."""
+    """Run `live` in this process and measure it."""
     from operators.applications.live import live
     from services.supervisor.engine import live_settings
     from services.supervisor.worker import EngineSpec
@@ -103,7 +103,7 @@ def served(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _window(server: Server, pids: dict[str, int], options: argparse.Namespace, engine: Watch | None = None) -> dict:
-    """Measure one stretch of time; `engine` adds ages, at some cost of its own."""
+    """Measure one time window. With `engine`, ages are measured too, which costs some time."""
     if engine is not None:
         engine.begin()
     before, began_s, pictures = {name: cpu_s(pid) for name, pid in pids.items()}, time.monotonic(), shown_so_far(server)
@@ -122,7 +122,7 @@ def _window(server: Server, pids: dict[str, int], options: argparse.Namespace, e
 
 
 def shown_so_far(server: Server) -> int:
-    """New pictures of the engine."""
+    """Return the number of new pictures of the engine."""
     return server.stream()["processes"]["engine"]["figures"]["pictures"]
 
 
@@ -136,7 +136,6 @@ async def _watched(server: Server, pids: dict[str, int], options: argparse.Names
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default=SOURCE)
     parser.add_argument("--fps", type=float, default=30.0, help="frame rate of the source")

@@ -1,4 +1,4 @@
-"""A real `intrasplat serve` for measurements: started with a stream, asked over HTTP, watched through /proc, ended."""
+"""Real `intrasplat serve` for measurements: started with a stream, called over HTTP, observed through /proc."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ class Server:
 
     @property
     def key(self) -> str:
-        """The administrator's key."""
+        """Return the administrator's key."""
         return (self.data / "admin.key").read_text().strip()
 
     def start(self) -> float:
-        """Start the control plane; the seconds until the API answers."""
+        """Start the control plane, and return the seconds until the API answers."""
         began_s = time.monotonic()
         log = self.path / "serve.log"
         before = log.stat().st_size if log.exists() else 0
@@ -82,7 +82,7 @@ class Server:
         return time.monotonic() - began_s
 
     def ask(self, path: str, method: str = "GET", body: Any = None, headers: Mapping[str, str] | None = None) -> Any:
-        """An answer of the API. Raises RuntimeError for one that is no success."""
+        """Call the API and return the answer. Raises RuntimeError unless the call succeeds."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         try:
             sent = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
@@ -101,7 +101,7 @@ class Server:
         return self.ask(f"/v1/streams/{STREAM}")
 
     def until(self, what: Callable[[dict[str, Any]], Any], within_s: float = 120.0) -> float:
-        """Wait until the stream is as wanted; the seconds that it took."""
+        """Wait until the stream fulfils a condition, and return the seconds."""
         began_s = time.monotonic()
         while True:
             found = self.stream()
@@ -112,11 +112,11 @@ class Server:
             time.sleep(0.05)
 
     def until_live(self) -> float:
-        """Wait until pictures are shown as live; the seconds that it took."""
+        """Wait until pictures are shown as live, and return the seconds."""
         return self.until(lambda stream: stream["state"] == "live")
 
     def pids(self) -> dict[str, int]:
-        """Processes by what they do."""
+        """Return the process ids by role."""
         assert self.process is not None
         processes = self.stream()["processes"]
         return {"control": self.process.pid, **{role: processes[role]["pid"] for role in ("capture", "engine")}}
@@ -126,13 +126,13 @@ class Server:
         return self.ask("/v1/tickets", "POST", {"path": f"/v1/streams/{STREAM}/display"})["ticket"]
 
     def kill(self) -> None:
-        """kill -9 of the control plane."""
+        """Kill the control plane by SIGKILL."""
         assert self.process is not None
         self.process.kill()
         self.process.wait()
 
     def logs(self) -> str:
-        """The ends of what all processes have printed."""
+        """Return the last lines of all process logs."""
         files = [self.path / "serve.log", *(self.runtime / STREAM).glob("*.log")]
         return "\n".join(f"{file.name}: {file.read_text(errors='replace')[-1500:]}" for file in files if file.exists())
 
@@ -148,7 +148,7 @@ class Server:
 
 
 def cpu_s(pid: int) -> float:
-    """User and system time of a process with all its threads."""
+    """Return the user and system time of a process with all its threads, in s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
 
@@ -160,7 +160,7 @@ def machine_busy_s() -> float:
 
 
 def resident_mib(pid: int) -> float:
-    """Memory of a process that is its own: not shared with others, nor a file's."""
+    """Return the private anonymous memory of a process in MiB."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("RssAnon:"):
             return round(int(line.split()[1]) / 1024, 1)

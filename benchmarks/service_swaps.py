@@ -1,4 +1,4 @@
-"""Models swapped while a stream shows them, by activations and rollbacks over the API of a real `intrasplat serve`.
+"""Swap models while a stream shows them, by activations and rollbacks over the API of a real `intrasplat serve`.
 
     python benchmarks/service_swaps.py --swaps 100
 
@@ -31,7 +31,7 @@ SOURCE = "synthetic:?width=640&height=512&frames=24&fps=30"
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture that was published."""
+    """Published picture."""
 
     seq: int
     version: int
@@ -63,7 +63,7 @@ class Pictures:
         socket.close()
 
     def until(self, version: int, after_ns: int, within_s: float = 60.0) -> Shown:
-        """The first picture of a version after a time."""
+        """Return the first picture of a version after a time."""
         until_s, at = time.monotonic() + within_s, max(0, len(self.seen) - 1)
         while time.monotonic() < until_s:
             for each in self.seen[at:]:
@@ -73,14 +73,14 @@ class Pictures:
         raise TimeoutError(f"version {version} was not shown; the newest picture is {self.seen[-1:]}")
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._stop.set()
         self._thread.join()
 
 
 @dataclass(frozen=True)
 class Swap:
-    """A change of the active version."""
+    """Change of the active version."""
 
     version: int
     asked_ns: int
@@ -89,7 +89,7 @@ class Swap:
 
 
 def swapped(server: Server, pictures: Pictures, versions: list[int], count: int) -> list[Swap]:
-    """Activate one and the other, or roll back, at random moments."""
+    """Activate two versions alternately, or roll back, at random times."""
     choose, active = random.Random(0), versions[0]
     swaps = []
     for index in range(count):
@@ -149,7 +149,6 @@ def _allowed(at_ns: int, changes: list[tuple[int, int, int]], first: int) -> set
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default=SOURCE)
     parser.add_argument("--device", default="cpu")

@@ -1,4 +1,4 @@
-"""Viewers over WebSocket from one event loop: as cheap as they can be, so that what is measured is the server. Nothing is decoded."""
+"""WebSocket viewers in one event loop, as cheap as possible so that the server dominates the measurement. Nothing is decoded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BINARY, PING, CLOSE = 2, 9, 8
 
 
 class FastViewer(asyncio.BufferedProtocol):
-    """Takes what comes, and keeps of each picture what its header says and when it was there as a whole."""
+    """Viewer that reads at full speed and records header and completion time of each picture."""
 
     def __init__(self, request: bytes, each: Callable[[dict[str, Any], int], None] | None = None) -> None:
         self._request, self._each = request, each
@@ -66,17 +66,17 @@ class FastViewer(asyncio.BufferedProtocol):
             self._filled = left
 
     def begin(self) -> None:
-        """Forget what was measured so far."""
+        """Reset the measurements."""
         self.ages_ms.clear()
         self.gaps_ms.clear()
         self.pictures = self.bytes = 0
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         self._transport.abort()
 
     def _message(self, begin: int) -> int | None:
-        """Take the message that begins there; where the next one begins, None while it is not whole."""
+        """Parse the message at an offset; returns the offset of the next one, or None while it is incomplete."""
         if self._filled - begin < 2:
             return None
         length, at = self._data[begin + 1] & 127, begin + 2
@@ -113,7 +113,7 @@ class FastViewer(asyncio.BufferedProtocol):
 async def watch(
     port: int, ticket: str, kind: str, quality: int = 75, each: Callable[[dict[str, Any], int], None] | None = None
 ) -> FastViewer:
-    """A viewer that is connected."""
+    """Connect a viewer and start reading."""
     loop = asyncio.get_running_loop()
     request = request_of(port, ticket, kind, quality)
     _, viewer = await loop.create_connection(lambda: FastViewer(request, each), "127.0.0.1", port)
@@ -121,7 +121,7 @@ async def watch(
 
 
 class SlowViewer:
-    """Reads a byte a second, with little room for what it has not read; comes again when it is cut off."""
+    """Viewer that reads one byte per second with a small receive buffer, and reconnects when it is disconnected."""
 
     def __init__(self, port: int, ticket: Callable[[], Any], kind: str) -> None:
         self._port, self._ticket, self._kind = port, ticket, kind
@@ -147,7 +147,7 @@ class SlowViewer:
 
 
 def request_of(port: int, ticket: str, kind: str, quality: int) -> bytes:
-    """The opening of a WebSocket."""
+    """Return the request that opens a WebSocket."""
     lines = [
         f"GET /v1/streams/{STREAM}/display?kind={kind}&quality={quality}&ticket={ticket} HTTP/1.1",
         f"Host: 127.0.0.1:{port}",

@@ -1,4 +1,4 @@
-"""Subscribers that measure what they see of a stream, each in a thread."""
+"""Subscribers that measure a stream's pictures, each in a thread."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from services.bus.pictures import subscribe
 
 
 class Watch:
-    """Subscribes to pictures and keeps the time between them."""
+    """Subscriber that records the intervals between pictures."""
 
     def __init__(self, endpoint: str) -> None:
         self.gaps_ms: list[float] = []
@@ -33,7 +33,7 @@ class Watch:
         self._thread.start()
 
     def begin(self) -> None:
-        """Forget what was measured so far."""
+        """Reset the measurements."""
         self.gaps_ms.clear()
         self.sent_gaps_ms.clear()
         self.ages_ms.clear()
@@ -45,12 +45,12 @@ class Watch:
         return self._sent_ns > at_ns
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         self._stop.set()
         self._thread.join()
 
     def note(self, header: dict[str, Any], now_ns: int) -> None:
-        """A new picture, and when it came."""
+        """Record a new picture and its time."""
         sent_ns = header["arrived_ns"]
         if self.last_ns:
             self.gaps_ms.append((now_ns - self.last_ns) * 1e-6)
@@ -76,7 +76,7 @@ class Watch:
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Median, 99th percentile and most."""
+    """Return median, 99th percentile and maximum."""
     ordered = sorted(values)
     return {
         "p50": round(ordered[len(ordered) // 2], 3),

@@ -32,7 +32,7 @@ def processor_s() -> float:
 
 
 def copy_ms(shape: tuple[int, ...]) -> float:
-    """A copy of a picture into new memory."""
+    """Return the time of copying a picture into new memory, in ms."""
     image = np.ones(shape, np.uint8)
     times = []
     for _ in range(50):
@@ -54,7 +54,6 @@ def latencies_ms(source: FrameSource) -> np.ndarray:
 
 
 def main() -> None:
-    """Every recording at every rate, in both ways."""
     places = sys.argv[1:] or ["synthetic:?width=640&height=512&frames=12", "synthetic:?width=320&height=256&frames=12"]
     for place in places:
         for fps in RATES:

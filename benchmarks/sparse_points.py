@@ -1,4 +1,4 @@
-"""Errors of rendered depth at the points of a structure from motion, for recordings without dense depth.
+"""Measure rendered depth at structure-from-motion points, for recordings without dense depth.
 
 The points were triangulated from the same pictures, apart from the model. Each is compared only in frames in which it was found. Lengths are in the unit
 of the poses; one factor for the whole recording, the median of true over rendered depth, is taken out.
@@ -25,23 +25,23 @@ from gsplat_core.scene.cameras import Camera
 Array = NDArray[np.float64]
 NAMES = ("points", "obs_point", "obs_frame")
 MOST_BYTES = 256 << 20
-"""Size of the file, and of its arrays together."""
+"""Largest size of the file and of its arrays together, in bytes."""
 
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points in the world, and which frame shows which of them."""
+    """World points, and the frames that show them."""
 
     points: Array
-    """[P, 3]."""
+    """Positions in world coordinates [P, 3]."""
     seen_point: NDArray[np.int64]
-    """[S]: the point of each sighting."""
+    """Point index of each sighting [S]."""
     seen_frame: NDArray[np.int64]
-    """[S]: the number of the frame in which it was found."""
+    """Frame number of each sighting [S]."""
 
     @classmethod
     def read(cls, path: str | Path) -> SparsePoints:
-        """A `.npz` file with `points` [P, 3], `obs_point` [S] and `obs_frame` [S]. Raises InvalidInput where they do not fit together."""
+        """Read a `.npz` file with `points` [P, 3], `obs_point` [S] and `obs_frame` [S]. Raises InvalidInput if they are inconsistent."""
         try:
             points, point, frame = _arrays(read_regular(path, MOST_BYTES))
         except (
@@ -99,27 +99,27 @@ def _arrays(data: bytes) -> list[NDArray[Any]]:
 
 @dataclass(frozen=True)
 class SparseDepthErrors:
-    """Over all sightings at which there is a depth."""
+    """Errors over all sightings with rendered depth."""
 
     median: float
-    """Median relative error after `scale`, a share."""
+    """Median relative error after multiplication by `scale`."""
     percentile_90: float
-    """The error that a tenth of the sightings exceed."""
+    """90th percentile of the relative error."""
     rank_correlation: float
-    """Spearman's: whether what is farther is rendered farther; a plane has none."""
+    """Spearman's rank correlation of true and rendered depth; 0 for a plane."""
     scale: float
-    """The factor that was taken out: median of true over rendered depth."""
+    """Median of true over rendered depth; the factor applied before errors are computed."""
     plane_median: float
     """Median error of each frame's best-fit plane (`FlatDepths.plane`); NaN where no frame has three sightings."""
     level_median: float
     """Median error of each frame's level plane (`FlatDepths.level`)."""
     covered: float
-    """Share of the sightings at which there is a depth; the others are in no error."""
+    """Share of the sightings with rendered depth; the others are not part of the errors."""
     sightings: int
 
 
 class SparseDepthSums:
-    """Takes frames one at a time; `errors` is what they come to."""
+    """Accumulator of errors, one frame at a time."""
 
     def __init__(self, points: SparsePoints) -> None:
         self._points = points
@@ -146,7 +146,7 @@ class SparseDepthSums:
         self._flat.append(planes)
 
     def errors(self) -> SparseDepthErrors | None:
-        """None where no sighting has a depth."""
+        """Return the errors, or None if no sighting has rendered depth."""
         rendered, true = (np.concatenate(each) if each else np.zeros(0) for each in (self._rendered, self._true))
         known = np.isfinite(rendered) & (rendered > 0)
         if not known.any():
@@ -170,7 +170,7 @@ class SparseDepthSums:
 
 
 def _rank_correlation(first: Array, second: Array) -> float:
-    """Spearman's, equal values sharing their mean rank; 0 where either is constant."""
+    """Return Spearman's rank correlation with mean ranks for ties; 0 if either input is constant."""
     ranks = [_ranks(each) for each in (first, second)]
     if min(float(np.ptp(each)) for each in ranks) == 0:
         return 0.0

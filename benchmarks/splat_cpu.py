@@ -30,7 +30,7 @@ DEPTH_MM = 60.0
 
 
 def tissue(count: int, width: int, height: int, seed: int = 0) -> dict[str, Any]:
-    """Arguments of `rasterization` for a wavy surface seen by one pinhole camera."""
+    """Return arguments of `rasterization` for a wavy surface seen by one pinhole camera."""
     g = torch.Generator().manual_seed(seed)
     u, v = torch.rand(count, generator=g) * width, torch.rand(count, generator=g) * height
     z = DEPTH_MM + 12 * torch.sin(u / 90) * torch.cos(v / 70) + 0.3 * torch.randn(count, generator=g)
@@ -57,7 +57,7 @@ def tissue(count: int, width: int, height: int, seed: int = 0) -> dict[str, Any]
 
 
 def milliseconds(function: Callable[[], object], repetitions: int, warm_up: int = 3) -> list[float]:
-    """Wall time of each repetition."""
+    """Return the wall time of each repetition in ms."""
     for _ in range(warm_up):
         function()
     times = []
@@ -69,7 +69,7 @@ def milliseconds(function: Callable[[], object], repetitions: int, warm_up: int 
 
 
 def forward(rasterization: Callable[..., Any], scene: dict[str, Any]) -> Tensor:
-    """The image, without a graph."""
+    """Render the image without autograd."""
     with torch.no_grad():
         return rasterization(**scene)[0]
 

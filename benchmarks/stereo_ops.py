@@ -25,12 +25,12 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 SIZES = [(640, 512, 64), (640, 512, 128), (1280, 1024, 64)]
-"""Width, height, and the disparities that are matched; pictures wider than 800 pixels are matched at half their size."""
+"""Width, height and number of disparities; pictures wider than 800 pixels are matched at half size."""
 WARM_UP, REPEATS = 3, 15
 
 
 def pair(width: int, height: int, most_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Grey pictures of a bowl with detail of several sizes, whose disparities end at `most_px`."""
+    """Return a grey stereo pair of a textured bowl with disparities up to `most_px`."""
     rng = np.random.default_rng(0)
     layers = [cv2.GaussianBlur(rng.normal(0, 1, (height, width)), (0, 0), sigma) * sigma for sigma in (1.2, 3.0, 9.0)]
     left = np.clip(120 + 45 * np.sum(layers, axis=0), 0, 245).astype(np.float32)
@@ -42,7 +42,7 @@ def pair(width: int, height: int, most_px: float) -> tuple[np.ndarray, np.ndarra
 
 
 def device_ms(device: torch.device, work: Callable[[], object]) -> float:
-    """Median over repeats, after a few that do not count."""
+    """Return the median over repeats in ms, after warm-up calls."""
     times = []
     for _ in range(WARM_UP + REPEATS):
         if device.type == "cuda":
@@ -60,7 +60,7 @@ def device_ms(device: torch.device, work: Callable[[], object]) -> float:
 
 
 def ops(device: torch.device, width: int, height: int, count: int) -> dict[str, float]:
-    """The ops alone, on pictures that are on the device."""
+    """Time each op alone, on pictures already on the device."""
     left, right = (torch.from_numpy(each).to(device) for each in pair(width, height, count - 4))
     guide = left[..., None].expand(-1, -1, 3).contiguous()
     matches = match_disparities(left, right, 0, count)
@@ -75,7 +75,7 @@ def ops(device: torch.device, width: int, height: int, count: int) -> dict[str, 
 
 
 def frames(device: torch.device, width: int, height: int, most_px: float) -> dict[str, float]:
-    """Frames of a stream, from pictures in host memory to depth in host memory."""
+    """Time whole frames, from pictures in host memory to depth in host memory."""
     camera = Camera.from_focal(float(width), width, height)
     left, right = (np.repeat(each[..., None], 3, axis=2) for each in pair(width, height, most_px))
     estimator = StereoDepth(device)

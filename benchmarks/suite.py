@@ -70,7 +70,7 @@ LIVE = {
     "cutting": "cutting", "heart": "heart/left.mp4", "sinus": "sinus", "resting_bowel": "others/resting_bowel/video.mp4",
     "laparoscopy": "others/laparoscopy/video.mp4", "stereomis_like": "others/stereomis_like/video.mp4",
 }  # fmt: skip
-"""Recordings that live streams are measured with, all at 30 frames/s."""
+"""Recordings of the live benchmarks, all at 30 frames/s."""
 OFFLINE = {"cutting": "cutting", "heart": "heart/left.mp4", "sinus": "sinus", "organ_still": "others/organ_still"}
 REPLAYED = {"cutting": "cutting", "sinus": "sinus", "resting_bowel": LIVE["resting_bowel"]}
 
@@ -120,7 +120,7 @@ BENCHMARKS = (
 
 
 def results(text: str) -> list[Any]:
-    """The JSON values of a command's output: one on each line, or a single one over several lines.
+    """Return the JSON values of a command's output: one per line, or a single one over several lines.
 
     Raises:
         ValueError: the output holds none.
@@ -140,7 +140,7 @@ def results(text: str) -> list[Any]:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """The properties of this machine that figures depend on."""
+    """Return the properties of this machine that figures depend on."""
     import torch
 
     from gsplat_core.ops.native import instruction_set
@@ -161,7 +161,7 @@ def _lines(path: str) -> list[str]:
 
 
 def commit() -> str:
-    """The commit that is measured, with `+` where files differ from it; INTRASPLAT_COMMIT where the tree is no checkout.
+    """Return the measured commit, with `+` if files differ from it; INTRASPLAT_COMMIT if the tree is not a checkout.
 
     Raises:
         SystemExit: neither is known.
@@ -199,7 +199,7 @@ def measured(benchmark: Benchmark, run: int, about: dict[str, Any]) -> Iterator[
 
 
 def run_all(chosen: list[Benchmark], folder: Path, seconds: float, runs: int | None) -> None:
-    """Run the benchmarks, one run of each after the other, until all runs are made or the time is over."""
+    """Run the benchmarks in turn until all runs are done or the time is over."""
     folder.mkdir(parents=True, exist_ok=True)
     until = time.monotonic() + seconds
     date = datetime.now(UTC).strftime("%Y-%m-%d")

@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def frames(path: Path) -> Iterator[tuple[Image, Image | None]]:
-    """Pictures, and masks where there are any."""
+    """Yield pictures with their recorded masks, or None."""
     if path.is_file() and path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         read = cv2.imread(str(path))
         assert read is not None, path
@@ -63,7 +63,7 @@ def frames(path: Path) -> Iterator[tuple[Image, Image | None]]:
 
 
 def measured(path: Path, count: int, finder: MaskFinder, change: Change = lambda image: image) -> dict[str, object]:
-    """The figures of one recording."""
+    """Return the figures of one recording."""
     finder.reset()
     gate = BodyGate()
     ious, recalls, shares, find_ms, judge_ms, withheld = [], [], [], [], [], 0
@@ -122,12 +122,12 @@ def changes() -> dict[str, Change]:
 
 
 def gains(red: float, green: float, blue: float) -> Change:
-    """Each channel times a factor."""
+    """Return a function that multiplies each channel by a factor."""
     return lambda image: np.clip(image * np.array([red, green, blue]), 0, 255).astype(np.uint8)
 
 
 def gamma(image: Image, exponent: float) -> Image:
-    """Another tone curve."""
+    """Return a function that applies a gamma curve."""
     return (255 * (image / 255) ** exponent + 0.5).astype(np.uint8)
 
 
@@ -139,12 +139,11 @@ def hue(image: Image, steps: int) -> Image:
 
 
 def resized(image: Image, factor: float) -> Image:
-    """Another size."""
+    """Return a function that resizes pictures."""
     return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def report(recording: str, figures: dict[str, object]) -> None:
-    """Print one line."""
     print(json.dumps({"recording": recording, **figures}), flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Time of one fused training step on the CPU: deform, render, loss, backward, Adam.
+"""Measure one fused training step on the CPU: deform, render, loss, backward, Adam.
 
     python benchmarks/training_cpu.py                # 30,000 Gaussians at 640x512, both fields; limit: 300 ms
     python benchmarks/training_cpu.py --threads 1 --repetitions 10
@@ -40,7 +40,7 @@ FOCAL_PX = 560.0
 
 
 def tissue_frame(width: int, height: int) -> Frame:
-    """A textured wavy surface with its depth, and a tool in one corner."""
+    """Return a frame of a textured wavy surface with depth, and a tool in one corner."""
     y, x = np.mgrid[:height, :width]
     depth = (60 + 12 * np.sin(x / 90) * np.cos(y / 70)).astype(np.float32)
     waves = [np.sin(0.11 * x + 0.05 * y), np.sin(0.07 * x - 0.13 * y), np.sin(0.05 * x + 0.09 * y)]
@@ -52,7 +52,7 @@ def tissue_frame(width: int, height: int) -> Frame:
 
 
 def milliseconds(work: Callable[[float], object], repetitions: int, warm_up: int = 3) -> dict[str, float]:
-    """Median and best over the repetitions, each at its own time within the window."""
+    """Return median and minimum over the repetitions in ms, each at another time within the window."""
     taken = []
     times_s = itertools.islice(itertools.cycle(np.linspace(0.5, 5.5, 37).tolist()), repetitions + warm_up)
     for at_s in times_s:
@@ -64,7 +64,7 @@ def milliseconds(work: Callable[[float], object], repetitions: int, warm_up: int
 
 
 def new_field(kind: str, gaussians: Gaussians) -> DeformationField:
-    """The field that is measured."""
+    """Return the measured field."""
     if kind == "basis":
         return BasisField(gaussians.count, WINDOW_S, spacing_s=ReconstructorConfig().bump_spacing_s)
     return HexPlaneField(gaussians, WINDOW_S, channels=16, resolution=(64, 64, 64, 25), levels=(1,), width=64, depth=2)
@@ -79,7 +79,7 @@ def seen_at(observation: Observation, time_s: float) -> Observation:
 def parts(
     step: TrainingStep, observation: Observation, config: ReconstructorConfig
 ) -> dict[str, Callable[[float], Any]]:
-    """The parts of a step of the basis field, each on its own."""
+    """Time each part of a step of the basis field."""
     field = step.field
     assert isinstance(field, BasisField)
     gaussians, _ = step.copy()
@@ -99,7 +99,6 @@ def parts(
 
 
 def main() -> None:
-    """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--width", type=int, default=640)

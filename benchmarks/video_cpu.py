@@ -50,7 +50,7 @@ def main() -> int:
 
 @contextmanager
 def measured(what: str, frames: Callable[[], int]) -> Iterator[None]:
-    """Prints frames a second, and processor time a frame, of what is done inside."""
+    """Print frames per second and processor time per frame of the enclosed code."""
     wall, before = time.perf_counter(), os.times()
     yield
     wall, after = time.perf_counter() - wall, os.times()
@@ -77,7 +77,7 @@ def _write_mpeg4(path: Path, images: list[np.ndarray]) -> None:
 
 
 def _psnr_db(path: Path, images: list[np.ndarray]) -> float:
-    """The mean over frames."""
+    """Return the mean PSNR over frames."""
     with av.open(str(path)) as container:
         read = (frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
         errors = [float(((a.astype(np.float32) - b) ** 2).mean()) for a, b in zip(read, images, strict=True)]

@@ -19,7 +19,7 @@ from gsplat_core.scene.gaussians import SH_C0
 
 
 def sphere(count: int, radius_mm: float, z_mm: float) -> Gaussians:
-    """Gaussians spread evenly over a sphere (Fibonacci lattice) at distance `z_mm` in front of the camera."""
+    """Return Gaussians spread evenly over a sphere (Fibonacci lattice) at distance `z_mm` in front of the camera."""
     k = torch.arange(count) + 0.5
     polar, azimuth = torch.acos(1 - 2 * k / count), math.pi * (1 + math.sqrt(5)) * k
     unit = torch.stack([azimuth.cos() * polar.sin(), azimuth.sin() * polar.sin(), polar.cos()], -1)

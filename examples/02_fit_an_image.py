@@ -19,7 +19,7 @@ WIDTH_PX, HEIGHT_PX, DISTANCE_MM = 96, 80, 60.0
 
 
 def target_picture() -> torch.Tensor:
-    """Soft stripes and a bright disc [H, W, 3]."""
+    """Return soft stripes with a bright disc [H, W, 3]."""
     v, u = torch.meshgrid(torch.linspace(-1, 1, HEIGHT_PX), torch.linspace(-1, 1, WIDTH_PX), indexing="ij")
     stripes = 0.5 + 0.3 * torch.sin(7 * u + 3 * v)
     disc = torch.sigmoid(20 * (0.45 - (u * u + v * v).sqrt()))
@@ -27,7 +27,7 @@ def target_picture() -> torch.Tensor:
 
 
 def grid(camera: Camera, columns: int, rows: int) -> Gaussians:
-    """Grey Gaussians side by side on the plane z = DISTANCE_MM."""
+    """Return a grid of grey Gaussians on the plane z = DISTANCE_MM."""
     half_width = DISTANCE_MM * camera.width_px / 2 / camera.K[0, 0]
     half_height = DISTANCE_MM * camera.height_px / 2 / camera.K[1, 1]
     x, y = torch.meshgrid(

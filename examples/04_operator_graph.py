@@ -30,7 +30,7 @@ from operators.tool_mask import RecordedToolMaskOp
 
 
 class ToolShareOp(Operator):
-    """Says which share of the picture the tool covers."""
+    """Emits the share of the picture that the tool covers."""
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("frame", type=Frame)
@@ -57,7 +57,7 @@ class FailingOp(Operator):
 
 
 class ToolShareApplication(Application):
-    """source → tool_mask → tool_share → show, and source → failing."""
+    """Graph: source → tool_mask → tool_share → show, and source → failing."""
 
     def __init__(self, recording: Recording) -> None:
         super().__init__(name="tool_share", track=True)

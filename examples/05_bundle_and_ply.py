@@ -1,4 +1,4 @@
-"""Save a model, read it back, and hand one moment of it to other programs.
+"""Save a model, read it back, and export one point in time for other programs.
 
 Reconstructs three frames of a synthetic recording, writes the model as a bundle (safetensors and a manifest), reads it back
 with every check, and exports the Gaussians at one time as `.ply`, which splat viewers and editors open.

@@ -1,4 +1,4 @@
-"""The service's whole life cycle through the typed client: models, streams, snapshots, recordings and their replays, keys.
+"""Use the service through its Python client: models, streams, snapshots, recordings, replays and keys.
 
 Needs a running service (`intrasplat serve`) and its administrator's key. Makes two models of one colour each, uploads them as versions of one
 model, shows it as a stream, and changes what is shown: activate, roll back, stop, start. It exports the model, and a snapshot of a live
@@ -30,7 +30,7 @@ WITHIN_S = 60.0
 
 
 def wall(colour: tuple[float, float, float]) -> Model:
-    """A wall of one colour in front of the camera: 144 Gaussians that do not move."""
+    """Return a wall of one colour in front of the camera: 144 static Gaussians."""
     x, y = torch.meshgrid(torch.linspace(-2, 2, 12), torch.linspace(-2, 2, 12), indexing="xy")
     means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((144,), 4.0)], 1)
     colours = ((torch.tensor(colour) - 0.5) / 0.28209479).expand(144, 1, 3).clone()
@@ -40,7 +40,7 @@ def wall(colour: tuple[float, float, float]) -> Model:
 
 
 def uploaded(client: Client, folder: Path, name: str, colour: tuple[float, float, float]) -> int:
-    """Save, pack and upload a model, and wait until the server has checked it; its version."""
+    """Save, pack and upload a model, wait for the server's check, and return its version."""
     save_bundle(wall(colour), folder / name)
     pack(folder / name, folder / f"{name}.isplat")
     version = client.upload(MODEL, folder / f"{name}.isplat").version  # sends the file's SHA-256 along
@@ -50,7 +50,7 @@ def uploaded(client: Client, folder: Path, name: str, colour: tuple[float, float
 
 
 def wait_until_shown(client: Client, version: int) -> None:
-    """Watch the stream until its pictures are of a version."""
+    """Watch the stream until its pictures show a version."""
     end_s = time.monotonic() + WITHIN_S
     while time.monotonic() < end_s:
         if client.stream(STREAM).state == "live":
@@ -65,7 +65,7 @@ def wait_until_shown(client: Client, version: int) -> None:
 
 
 def models_change(client: Client, folder: Path) -> None:
-    """Upload, activate, roll back; the stream's pictures follow."""
+    """Upload, activate and roll back versions, and wait until the stream shows them."""
     active = {model.name: model.active for model in client.models()}.get(MODEL)
     red, green = (uploaded(client, folder, *each) for each in (("red", (0.9, 0.1, 0.1)), ("green", (0.1, 0.9, 0.1))))
     client.activate(MODEL, red, expected_current=active)
@@ -104,7 +104,7 @@ def snapshot_is_taken(client: Client, folder: Path) -> None:
 
 
 def recording_is_replayed(client: Client, folder: Path) -> None:
-    """Upload a recording and replay it as a job; its report tells how well it was reconstructed."""
+    """Upload a recording, replay it as a job, and read the report."""
     synthesize(folder / RECORDING, frames=6, width_px=64, height_px=48, stereo=False)
     archive = shutil.make_archive(str(folder / RECORDING), "zip", folder, RECORDING)
     client.upload_recording(RECORDING, Path(archive))
@@ -123,7 +123,7 @@ def recording_is_replayed(client: Client, folder: Path) -> None:
 
 
 def keys_change(client: Client) -> None:
-    """A second key of the same name, the caller changes over, the first one goes."""
+    """Rotate a key: create a second one of the same name, then revoke the first."""
     old = client.make_key("life-cycle", "viewer")
     new = client.make_key("life-cycle", "viewer")
     client.revoke_key(old.id)

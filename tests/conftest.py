@@ -19,13 +19,13 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_configure() -> None:
-    """Let SIGINT interrupt, in the processes of tests too: shells start background jobs with SIGINT ignored, and that is inherited."""
+    """Restore the default SIGINT handler, also for child processes; shells start background jobs with SIGINT ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def recordings_dir() -> Path:
-    """The real recordings. They are not part of the repository: absent, the test is skipped, but in CI it fails."""
+    """Return the folder of real recordings. If it is absent, skip the test; fail in CI."""
     default = Path(__file__).resolve().parents[1].parent / "shared" / "recordings"
     folder = Path(os.environ.get("INTRASPLAT_RECORDINGS") or default)
     if not folder.is_dir():
@@ -59,13 +59,13 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """The random numbers of a test, the same in every run."""
+    """Return a NumPy generator with a fixed seed."""
     return np.random.default_rng(0)
 
 
 @pytest.fixture
 def generator() -> torch.Generator:
-    """Torch's random numbers on the CPU for a test, the same in every run."""
+    """Return a torch CPU generator with a fixed seed."""
     return torch.Generator().manual_seed(0)
 
 

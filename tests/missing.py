@@ -9,7 +9,7 @@ import pytest
 
 
 def missing(message: str) -> NoReturn:
-    """End the test for want of something."""
+    """Skip the test, or fail it in CI, with the reason."""
     if os.environ.get("CI"):
         pytest.fail(message)
     pytest.skip(message)
