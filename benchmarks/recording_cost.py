@@ -23,9 +23,9 @@ from typing import Literal
 import av
 import numpy as np
 
+from gsplat_core.io.frame_codec import camera_record
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.sessions import SessionInfo, SessionReader, SessionWriter, WriterOptions
-from gsplat_core.io.sessions.records import camera_record
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.sinks.session_recorder import SessionRecorder

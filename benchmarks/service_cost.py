@@ -25,8 +25,6 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.live import LiveSource
 from operators.sources.source import SourceDescription
-from operators.sources.wire import description_to, frame_header, planes_of
-from operators.sources.zeromq_message import pieces
 from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher, picture_from, subscribe
 from services.bus.runtime import RuntimeFolder
@@ -74,13 +72,13 @@ def raw_hop(options: argparse.Namespace, runtime: RuntimeFolder) -> dict[str, An
     pattern = Pattern(options.width, options.height, options.fps, options.frames)
     alone_ms, _ = measured(lambda: read_all(pattern, lambda frame: None, options.frames))
     publisher = PicturePublisher(folder.pictures("capture"))
-    about = {"description": description_to(pattern.description)}
+    about = {"description": pattern.description.as_json()}
     commands = CommandServer(folder.commands("capture"), {"describe": lambda _: about})
     heartbeats = Heartbeats(folder.status("capture"), lambda: {"state": "live", "reason": ""})
     delays_ms: list[float] = []
 
     def send(frame: Frame) -> None:
-        publisher.publish_frame({**frame_header(frame), "run": 1}, pieces(frame.seq, frame.pts_ns, planes_of(frame)))
+        publisher.publish_frame({"run": 1}, frame)
 
     def both() -> int:
         captured = CapturedSource(folder)

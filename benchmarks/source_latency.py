@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource
 

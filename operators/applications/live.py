@@ -69,9 +69,9 @@ from operators.reconstruct import LiveReconstructOp
 from operators.side_by_side import SideBySideOp
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.keyframes import KeyframesOp
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions
+from operators.sources.derived import ScaledSource, scaled_description
 from operators.sources.registry import open_source
-from operators.sources.scaled import ScaledSource, scaled_description
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
 from operators.tool_mask import new_tool_mask

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
+from gsplat_core.io.frame_codec import camera_record
 from gsplat_core.io.sessions import SessionInfo
 from gsplat_core.io.sessions.records import (
     Grown,
@@ -18,7 +19,6 @@ from gsplat_core.io.sessions.records import (
     Rehearsed,
     SceneBegun,
     ScheduleLine,
-    camera_record,
 )
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Application, Operator

@@ -28,10 +28,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from gsplat_core.depth.registry import check_depth, depth_inputs
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.io.frame_codec import camera_of
 from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.io.sessions import SessionReader, is_session
-from gsplat_core.io.sessions.records import ReconstructorMade, camera_of
+from gsplat_core.io.sessions.records import ReconstructorMade
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

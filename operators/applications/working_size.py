@@ -27,7 +27,7 @@ from operators.applications.device import seeded
 from operators.applications.live_settings import LiveSettings
 from operators.graph import Application, run
 from operators.messages import ShownPicture
-from operators.sources.scaled import scaled_description
+from operators.sources.derived import scaled_description
 from operators.sources.source import FrameSource, SourceDescription, ThreadedSource
 
 TRIAL_FRAMES = 10

@@ -27,8 +27,9 @@ import av
 from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.io.frame_codec import MOST_NS
 from gsplat_core.io.sessions import SessionInfo, SessionWriter, WriterOptions
-from gsplat_core.io.sessions.records import MOST_NS, SESSION_FILE, LostLine, ScheduleLine
+from gsplat_core.io.sessions.records import SESSION_FILE, LostLine, ScheduleLine
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.errors import OutputError

@@ -12,9 +12,8 @@ from pathlib import Path
 from gsplat_core.io.recordings.plain_files import IMAGE_SUFFIXES, Picture, UnreadableFile, decode_picture, natural_key
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
-from operators.sources.address_options import OPEN_S, FolderAddress
-from operators.sources.options import SourceOptions
-from operators.sources.stream import DEFAULT_FPS, SteadyClock, StreamSource
+from operators.sources.address import OPEN_S, FolderAddress, SourceOptions
+from operators.sources.live import DEFAULT_FPS, SteadyClock, StreamSource
 
 SHARE = 10
 """Minimum pause between scans of the folder, as a multiple of a scan's duration, because large

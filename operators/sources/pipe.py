@@ -24,9 +24,8 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.decoder import PictureConverter
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost, SourceUnavailable
-from operators.sources.address_options import PipeAddress
-from operators.sources.options import SourceOptions
-from operators.sources.stream import DEFAULT_FPS, SteadyClock, StreamSource, check_size
+from operators.sources.address import PipeAddress, SourceOptions
+from operators.sources.live import DEFAULT_FPS, SteadyClock, StreamSource, check_size
 
 _CHROMA = (2, 2, 1)
 PLANES: dict[str, tuple[tuple[int, int, int], ...]] = {

@@ -1,46 +1,306 @@
 """Source in a separate process, which isolates the reader from blocking drivers and crashing decoders.
 
-The parent starts the process, exchanges messages with it and ends it.
+The parent starts the process, exchanges control messages with it and ends it. Frames travel in shared memory: an anonymous
+file, which exists only while one of the processes has it open. The process does not import torch.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import importlib
 import json
 import logging
 import math
+import mmap
 import os
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 import weakref
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any
 
+from gsplat_core.errors import UserError
+from gsplat_core.io.frame_codec import MAX_FRAME_BYTES, MAX_PIECES, InvalidMessage, decode, encode
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost, SourceUnavailable
-from operators.sources.backoff import Backoff
-from operators.sources.live import STALLED_AFTER_S, FrameOrder, LiveSource
-from operators.sources.options import SourceOptions
-from operators.sources.registry import split_address
-from operators.sources.source import SourceDescription, SourceState
-from operators.sources.wire import (
-    MOST_BYTES,
-    BadHeader,
-    FrameReader,
-    description_from,
-    finite_counts,
-    frame_from,
-    message,
-    new_memory,
-    options_to,
-    parsed,
-)
+from operators.sources.address import SourceOptions
+from operators.sources.live import STALLED_AFTER_S, Backoff, FrameOrder, LiveSource
+from operators.sources.source import FrameSource, SourceDescription, SourceState
+
+log = logging.getLogger(__name__)
+
+
+SLOTS = 4
+"""Number of frames in flight."""
+_ALIGNMENT = 64
+
+
+def new_memory() -> int:
+    """Return a file descriptor of empty shared memory, inheritable by a child process through
+    `pass_fds`.
+    """
+    if hasattr(os, "memfd_create"):
+        fd = os.memfd_create("frames", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        # Shrinking the memory would crash the reader.
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        return fd
+    with tempfile.TemporaryFile() as file:  # also anonymous
+        return os.dup(file.fileno())
+
+
+class FrameWriter:
+    """Writer of encoded frames to shared memory."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._memory: mmap.mmap | None = None
+        self._slot_bytes = 0
+
+    def fits(self, pieces: Sequence[bytes | memoryview]) -> bool:
+        """Return True if the frame's pieces fit into a slot."""
+        return _laid_out(map(len, pieces))[1] <= self._slot_bytes
+
+    def grow(self, pieces: Sequence[bytes | memoryview]) -> None:
+        """Enlarge the slots for this frame; no slot may be in use."""
+        if self._memory is not None:
+            self._memory.close()
+        self._slot_bytes = _laid_out(map(len, pieces))[1]
+        os.ftruncate(self._fd, SLOTS * self._slot_bytes)
+        self._memory = mmap.mmap(self._fd, SLOTS * self._slot_bytes)
+
+    def write(self, slot: int, pieces: Sequence[bytes | memoryview]) -> dict[str, Any]:
+        """Copy a frame's pieces into a slot, which must be free. Return their position for `FrameReader.read`."""
+        assert self._memory is not None
+        offset, sizes = slot * self._slot_bytes, [len(piece) for piece in pieces]
+        for piece, begin in zip(pieces, _laid_out(sizes)[0], strict=True):
+            self._memory[offset + begin : offset + begin + len(piece)] = piece
+        return {"offset": offset, "sizes": sizes}
+
+
+class FrameReader:
+    """Reader of encoded frames from shared memory."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._memory: mmap.mmap | None = None
+
+    def read(self, offset: Any, sizes: Any) -> list[memoryview]:
+        """Return copies of a frame's pieces.
+
+        Args:
+            offset: position of the first piece in bytes.
+            sizes: sizes of the pieces in bytes.
+
+        Raises:
+            InvalidMessage: the position is invalid.
+        """
+        whole = isinstance(sizes, list) and all(type(size) is int and size > 0 for size in sizes)
+        if not whole or not 1 <= len(sizes) <= MAX_PIECES or sum(sizes) > MAX_FRAME_BYTES:
+            raise InvalidMessage(f"a frame cannot have pieces of {sizes!r:.80} bytes")
+        begins, length = _laid_out(sizes)
+        if type(offset) is not int or not 0 <= offset < 1 << 62:
+            raise InvalidMessage(f"a frame cannot begin at byte {offset!r:.20}")
+        if self._memory is None or offset + length > len(self._memory):
+            self._map()
+        if self._memory is None or offset + length > len(self._memory):
+            raise InvalidMessage(f"pieces of {sizes} bytes at byte {offset} lie outside of the shared memory")
+        with memoryview(self._memory) as memory:
+            places = [(offset + begin, size) for begin, size in zip(begins, sizes, strict=True)]
+            return [memoryview(bytearray(memory[begin : begin + size])) for begin, size in places]
+
+    def close(self) -> None:
+        """Unmap the memory."""
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
+
+    def _map(self) -> None:
+        self.close()
+        size = os.fstat(self._fd).st_size
+        if size:
+            self._memory = mmap.mmap(self._fd, size, prot=mmap.PROT_READ)
+
+
+def _laid_out(sizes: Iterable[int]) -> tuple[list[int], int]:
+    """Return the offset of each piece within a slot, and the total size in bytes."""
+    begins, end = [], 0
+    for size in sizes:
+        begins.append(end)
+        end += -(-size // _ALIGNMENT) * _ALIGNMENT
+    return begins, end
+
+
+MOST_BYTES = 1 << 20
+"""Maximum size of a control message in bytes."""
+
+
+def message(kind: str, **content: Any) -> bytes:
+    """Encode a control message."""
+    return json.dumps({"kind": kind, **content}).encode()
+
+
+def parsed(data: bytes) -> dict[str, Any]:
+    """Decode a control message. Raises InvalidMessage."""
+    try:
+        content = json.loads(data)
+    except ValueError as error:
+        raise InvalidMessage(f"{data[:40]!r} is not JSON: {error}") from error
+    if not isinstance(content, dict) or not isinstance(content.get("kind"), str):
+        raise InvalidMessage(f"{data[:40]!r} is not a message")
+    return content
+
+
+def finite_counts(content: Any) -> dict[str, int]:
+    """Return the valid counts of a JSON object; empty if it is not an object."""
+    if not isinstance(content, dict):
+        return {}
+    return {str(name): int(times) for name, times in content.items() if isinstance(times, int) and math.isfinite(times)}
+
+
+IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_REPORT_S = 0.1
+"""Period of state messages to the parent while no frame arrives, in seconds."""
+_EXIT_WITHIN_S = 0.6
+"""Time limit in seconds to exit after the parent has closed the connection, even if the source
+blocks.
+"""
+
+
+class Served:
+    """One source and the connection to the parent process."""
+
+    def __init__(self, connection: Connection, memory_fd: int) -> None:
+        self._connection = connection
+        self._sending = threading.Lock()
+        self._writer = FrameWriter(memory_fd)
+        self._changed = threading.Condition()
+        self._free = deque(range(SLOTS))
+        self._wanted = False
+        self.ended = threading.Event()
+
+    def send(self, kind: str, **content: object) -> None:
+        """Send a message to the parent. No effect after the connection was closed."""
+        try:
+            with self._sending:
+                self._connection.send_bytes(message(kind, **content))
+        except OSError:
+            self._let_go()
+
+    def listen(self) -> None:
+        """Receive messages from the parent until the connection closes, then exit. Runs in its own
+        thread.
+        """
+        try:
+            while True:
+                received = parsed(self._connection.recv_bytes(1 << 12))
+                with self._changed:
+                    if received["kind"] == "free":
+                        self._free.append(received["slot"])
+                    self._wanted = self._wanted or received["kind"] == "open"
+                    self._changed.notify_all()
+        except (EOFError, OSError):
+            self._let_go()
+        time.sleep(_EXIT_WITHIN_S)
+        os._exit(0)
+
+    def serve(self, source: FrameSource) -> None:
+        """Transfer frames until the source ends or the parent closes the connection."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._wanted or self.ended.is_set())
+        source.open()
+        try:
+            said_s = 0.0
+            while not self.ended.is_set():
+                frame = source.read(_REPORT_S)
+                if frame is not None:
+                    self._hand_over(frame)
+                if frame is None or time.monotonic() - said_s > _REPORT_S:
+                    said_s = time.monotonic()
+                    self._report(source)
+                if frame is None and source.state.value == "ended":
+                    self.send("ended", sentence=getattr(source, "state_sentence", ""))
+                    return
+        finally:
+            source.close()
+
+    def _report(self, source: FrameSource) -> None:
+        counts = getattr(source, "counts", dict)
+        sentence = getattr(source, "state_sentence", "")
+        self.send("state", state=source.state.value, sentence=sentence, counts=dict(counts()))
+
+    def _hand_over(self, frame: Frame) -> None:
+        pieces = encode(frame)
+        with self._changed:
+            fits = self._writer.fits(pieces)
+            self._changed.wait_for(lambda: self.ended.is_set() or len(self._free) >= (1 if fits else SLOTS))
+            if self.ended.is_set():
+                return
+            if not fits:
+                self._writer.grow(pieces)
+            slot = self._free.popleft()
+        self.send("frame", slot=slot, **self._writer.write(slot, pieces))
+
+    def _let_go(self) -> None:
+        with self._changed:
+            self.ended.set()
+            self._changed.notify_all()
+
+
+class ToParent(logging.Handler):
+    """Log handler that forwards records to the parent."""
+
+    def __init__(self, served: Served) -> None:
+        super().__init__(logging.INFO)
+        self._served = served
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._served.send("log", level=record.levelno, text=record.getMessage()[:2000])
+
+
+def serve_source(connection_fd: int, memory_fd: int) -> None:
+    """Open one source and transfer its frames; the main function of the process.
+
+    The process ends when the parent closes the connection, even if the source blocks. It ignores signals sent to the
+    process group, because the parent controls its lifetime.
+
+    The first message names the function that opens the source (`module:function`), an address and
+    options.
+
+    Args:
+        connection_fd: file descriptor of the connection to the parent.
+        memory_fd: file descriptor of the shared memory.
+    """
+    for number in IGNORED_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    connection = Connection(connection_fd)
+    served = Served(connection, memory_fd)
+    logging.getLogger().addHandler(ToParent(served))
+    logging.getLogger().setLevel(logging.INFO)
+    asked = parsed(connection.recv_bytes())
+    threading.Thread(target=served.listen, name="listen to the parent", daemon=True).start()
+    try:
+        module, name = asked["opener"].split(":")
+        source = getattr(importlib.import_module(module), name)(asked["address"], SourceOptions(**asked["options"]))
+        drops = getattr(source, "drops", True)
+        served.send("described", description=source.description.as_json(), drops=drops)
+        served.serve(source)
+    except UserError as error:
+        served.send("refused", error=str(error))
+    except Exception as error:  # noqa: BLE001 - carried to the parent, which reports it
+        served.send("failed", error=f"{type(error).__name__}: {error}"[:2000])
+    # Exit without waiting for library threads, which may be blocked in network calls.
+    connection.close()
+    os._exit(0)
+
 
 END_WITHIN_S = 0.8
 """Time in seconds for the process to exit after its connection closed, before it is killed."""
@@ -48,8 +308,8 @@ _BOOT = (
     "import signal, sys, json\n"
     "for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(number, signal.SIG_IGN)\n"
     "sys.path[:] = json.loads(sys.argv[1])\n"
-    "from operators.sources.child import main\n"
-    "main(int(sys.argv[2]), int(sys.argv[3]))\n"
+    "from operators.sources.process import serve_source\n"
+    "serve_source(int(sys.argv[2]), int(sys.argv[3]))\n"
 )
 
 
@@ -95,7 +355,7 @@ class ChildProcess:
         self._memory_fd = memory_fd
         self.heard_s = time.monotonic()
         """Time of the last received message, by `time.monotonic`."""
-        content = {"opener": opening.opener, "address": opening.address, "options": options_to(opening.options)}
+        content = {"opener": opening.opener, "address": opening.address, "options": asdict(opening.options)}
         self.say("ask", **content)
 
     def say(self, kind: str, **content: object) -> None:
@@ -121,7 +381,7 @@ class ChildProcess:
             received = parsed(self.connection.recv_bytes(MOST_BYTES))
         except (EOFError, OSError) as error:
             raise ChildLost(self._how_it_ended()) from error
-        except BadHeader as error:
+        except InvalidMessage as error:
             raise ChildLost(f"it sent an invalid message: {error}") from error
         self.heard_s = time.monotonic()
         return received
@@ -159,16 +419,11 @@ class ChildProcess:
         return f"it was ended by {signal.Signals(-code).name}" if code < 0 else f"it ended with status {code}"
 
 
-log = logging.getLogger(__name__)
 OPENER = "operators.sources.registry:open_source"
 OPEN_TIMEOUT_S = 30.0
 """Timeout for the process to start and to open its source, in seconds."""
 HUNG_AFTER_S = 5.0
 """Time without a message, in seconds, after which the process is considered hung."""
-ON_DISK = frozenset({"recording", "realtime"})
-"""Schemes of sources on disk. Missing files count towards `MOST_FAILURES`, as they do not
-return.
-"""
 MOST_FAILURES = 10
 """Maximum number of consecutive processes without a frame before the source is given up."""
 LOOK_S = 0.05
@@ -191,6 +446,7 @@ class ProcessSource(LiveSource):
         hung_after_s: float = HUNG_AFTER_S,
         stuck_after_s: float = math.inf,
         open_timeout_s: float = OPEN_TIMEOUT_S,
+        may_return: bool = False,
     ) -> None:
         """Start the process and wait for the description of the source.
 
@@ -202,6 +458,8 @@ class ProcessSource(LiveSource):
             stuck_after_s: time without a frame of a stalled source after which the process is
                 replaced.
             open_timeout_s: timeout for opening the source, in seconds.
+            may_return: a source that is unavailable may return, such as a camera. Otherwise, as for a missing file,
+                the failure counts towards `MOST_FAILURES`.
 
         Raises:
             SourceUnavailable: the source cannot be opened; has the message of the process.
@@ -211,7 +469,7 @@ class ProcessSource(LiveSource):
         # process.
         super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
-        self._scheme = split_address(address)[0]
+        self._may_return = may_return
         self._hung_after_s, self._stuck_after_s, self._open_timeout_s = hung_after_s, stuck_after_s, open_timeout_s
         self._child_state: tuple[SourceState, str] | None = None
         self._child_counts: dict[str, int] = {}
@@ -284,7 +542,7 @@ class ProcessSource(LiveSource):
                     name = self.description.name
                     delay_s = backoff.failed()
                     # A missing camera may return. Missing files and repeated crashes are permanent.
-                    comes_back = isinstance(error, SourceUnavailable) and self._scheme not in ON_DISK
+                    comes_back = isinstance(error, SourceUnavailable) and self._may_return
                     crashes = 0 if comes_back else crashes + 1
                     if crashes >= MOST_FAILURES:
                         raise SourceLost(
@@ -322,8 +580,8 @@ class ProcessSource(LiveSource):
 
     def _frame(self, child: ChildProcess, message: dict[str, Any]) -> Frame:
         try:
-            frame = frame_from(message, child.frames.read(message.get("planes")))
-        except (BadHeader, TypeError, ValueError) as error:
+            frame = decode(child.frames.read(message.get("offset"), message.get("sizes")))
+        except InvalidMessage as error:
             raise ChildLost(f"its frame cannot be read: {error}") from error
         child.say("free", slot=message.get("slot"))
         self._child_state = None  # the last reported state is older than this frame
@@ -370,8 +628,8 @@ class ProcessSource(LiveSource):
             elif message["kind"] == "described":
                 self._drops = message.get("drops") is not False
                 try:
-                    return description_from(message.get("description", {}))
-                except BadHeader as error:
+                    return SourceDescription.from_json(message.get("description"))
+                except InvalidMessage as error:
                     raise ChildLost(str(error)) from error
             elif message["kind"] == "refused":
                 raise SourceUnavailable(str(message.get("error")))

@@ -15,9 +15,8 @@ from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost
-from operators.sources.address_options import RealtimeAddress
+from operators.sources.address import RealtimeAddress, SourceOptions
 from operators.sources.live import LiveSource
-from operators.sources.options import SourceOptions
 from operators.sources.source import FrameSource, SourceDescription, ThreadedSource
 
 DECODED_AHEAD = 4

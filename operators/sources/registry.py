@@ -14,9 +14,7 @@ from typing import cast, get_args
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
-from operators.sources.address import UrlAddress
-from operators.sources.address_options import PARSERS
-from operators.sources.options import SourceOptions, StereoLayout
+from operators.sources.address import PARSERS, SourceOptions, StereoLayout, UrlAddress
 from operators.sources.source import FrameSource
 
 __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "check_address", "open_source", "split_address"]
@@ -50,6 +48,8 @@ _BLOCKING = frozenset({*_URLS, "v4l2"})
 process.
 """
 
+_ON_DISK = frozenset({"recording", "realtime"})
+"""Schemes of files, which do not return once they are missing."""
 _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
 """Opening timeouts of slow sources in seconds; `synthetic` renders before it plays."""
@@ -117,6 +117,7 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
             replace(options, process=False),
             stuck_after_s=STUCK_AFTER_S.get(scheme, math.inf),
             open_timeout_s=_SLOW_TO_OPEN_S.get(scheme, OPEN_TIMEOUT_S),
+            may_return=scheme not in _ON_DISK,
         )
     else:
         source = SOURCES[scheme](rest, options)
@@ -169,7 +170,7 @@ def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout 
 
 
 def _split(source: FrameSource, layout: StereoLayout) -> FrameSource:
-    from operators.sources.stereo import SplitSource
+    from operators.sources.derived import SplitSource
 
     try:
         return SplitSource(source, layout)
@@ -179,7 +180,7 @@ def _split(source: FrameSource, layout: StereoLayout) -> FrameSource:
 
 
 def _joined(addresses: str, options: SourceOptions) -> FrameSource:
-    from operators.sources.stereo import JoinedSource
+    from operators.sources.derived import JoinedSource
 
     eyes = addresses.split("|")
     if len(eyes) != 2 or not all(eyes):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import threading
@@ -10,9 +11,21 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
+
+from pydantic import ConfigDict
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.io.frame_codec import (
+    CameraRecord,
+    Count,
+    InvalidMessage,
+    Positive,
+    Record,
+    Side,
+    camera_of,
+    camera_record,
+)
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
@@ -54,6 +67,41 @@ class SourceDescription:
     def is_stereo(self) -> bool:
         """True if frames have a picture of the right eye."""
         return "right_image" in self.fields
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the description as JSON values, without `digest`, for another process."""
+        values = {name: getattr(self, name) for name in _DescriptionRecord.model_fields}
+        values |= {"camera": camera_record(self.camera), "fields": tuple(sorted(self.fields))}
+        return _DescriptionRecord(**values).model_dump(mode="json")
+
+    @staticmethod
+    def from_json(content: Any) -> SourceDescription:
+        """Return the description of `as_json`.
+
+        Raises:
+            InvalidMessage: the content does not describe a source.
+        """
+        try:
+            record = _DescriptionRecord.model_validate_json(json.dumps(content))
+            values = {name: getattr(record, name) for name in _DescriptionRecord.model_fields}
+            values |= {"camera": camera_of(record.camera), "fields": frozenset(record.fields)}
+            return SourceDescription(**values)
+        except (TypeError, ValueError, InvalidInput) as error:
+            raise InvalidMessage(f"this describes no source: {error}") from error
+
+
+class _DescriptionRecord(Record):
+    """JSON form of `SourceDescription`."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str
+    width_px: Side
+    height_px: Side
+    fps: Positive
+    camera: CameraRecord
+    fields: tuple[str, ...]
+    frame_count: Count | None
+    notes: tuple[str, ...]
 
 
 @runtime_checkable

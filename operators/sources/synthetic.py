@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from gsplat_core.io.recordings.synthetic.kept import kept_recording
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings
-from operators.sources.address_options import SyntheticAddress
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions, SyntheticAddress
 from operators.sources.recording import RealtimeSource
 
 log = logging.getLogger(__name__)

@@ -14,10 +14,8 @@ from gsplat_core.io.recordings.decoder import PictureConverter, PictureDecoder, 
 from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
-from operators.sources.address import UrlAddress
-from operators.sources.backoff import Backoff
-from operators.sources.options import SourceOptions
-from operators.sources.stream import StreamSource
+from operators.sources.address import SourceOptions, UrlAddress
+from operators.sources.live import Backoff, StreamSource
 
 KEPT_PACKETS = 256
 """Maximum number of packets in flight in the decoder."""

@@ -8,8 +8,7 @@ import stat
 
 from gsplat_core.errors import InvalidSetting
 from operators.errors import SourceUnavailable
-from operators.sources.address_options import V4l2Address
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions, V4l2Address
 from operators.sources.url import ConnectedSource, Place
 
 _DEVICE = re.compile(r"/dev/video\d{1,4}")

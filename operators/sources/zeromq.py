@@ -1,24 +1,162 @@
-"""Source that receives frames from another program over ZeroMQ (see
-`zeromq_publisher.FramePublisher`).
+"""Frames of other programs over ZeroMQ: a source that receives them, `zmq+tcp://…` or `zmq+ipc://…`, and a publisher.
+
+A message is one frame (`gsplat_core.io.frame_codec`). Connections to other machines must be encrypted (CURVE).
 """
 
 from __future__ import annotations
 
+import ipaddress
 import math
+import os
 import time
 from collections.abc import Iterator
 from functools import partial
+from types import TracebackType
+from typing import Any
 
 import zmq
+import zmq.auth
+from numpy.typing import NDArray
+from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils.monitor import recv_monitor_message
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.frame_codec import MAX_MESSAGE_BYTES, InvalidMessage, arrays_of, decode_message, encode_message
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceUnavailable
-from operators.sources.address_options import OPEN_S, ZeroMqAddress
-from operators.sources.options import SourceOptions
-from operators.sources.stream import StreamSource
-from operators.sources.zeromq_message import MOST_BYTES, BadMessage, connected, keys_from, require_encryption, unpacked
+from operators.sources.address import OPEN_S, SourceOptions, ZeroMqAddress
+from operators.sources.live import StreamSource
+
+
+def is_of_this_machine(endpoint: str) -> bool:
+    """Return True if the endpoint is on this machine."""
+    scheme, _, place = endpoint.partition("://")
+    if scheme == "ipc":
+        return True
+    host = place.rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def require_encryption(endpoint: str, encrypted: bool) -> None:
+    """Raise InvalidSetting for an unencrypted endpoint on another machine."""
+    if not encrypted and not is_of_this_machine(endpoint):
+        raise InvalidSetting(
+            f"{endpoint} leads to another machine, and patients' pictures do not go over a network in the clear; give keys "
+            "(docs/sources.md, ZeroMQ), or stay on 127.0.0.1"
+        )
+
+
+def keys_from(path: str) -> tuple[bytes, bytes | None]:
+    """Return public and secret key of a certificate file of `zmq.auth.create_certificates`. Raises
+    InvalidSetting.
+    """
+    try:
+        return zmq.auth.load_certificate(os.fspath(path))
+    except (OSError, ValueError) as error:
+        raise InvalidSetting(f"{path} is no certificate of ZeroMQ: {error}") from None
+
+
+def connected(kind: int, endpoint: str, *, bind: bool, options: dict[int, Any]) -> tuple[zmq.Context, zmq.Socket]:
+    """Create a socket in a new context and bind or connect it.
+
+    Args:
+        kind: ZeroMQ's socket type.
+        endpoint: ZeroMQ endpoint.
+        bind: bind the socket; otherwise connect it.
+        options: socket options.
+
+    Raises:
+        InvalidSetting: the endpoint or an option is invalid.
+    """
+    context = zmq.Context()
+    socket = context.socket(kind)
+    try:
+        socket.setsockopt(zmq.LINGER, 0)
+        for option, value in options.items():
+            socket.setsockopt(option, value)
+        if bind:
+            socket.bind(endpoint)
+        else:
+            socket.connect(endpoint)
+    except (zmq.ZMQError, ValueError) as error:
+        socket.close()
+        context.term()
+        raise InvalidSetting(f"{endpoint} cannot be used: {error}") from None
+    return context, socket
+
+
+class FramePublisher:
+    """Publishes frames at an endpoint to any number of readers. A slow reader loses the oldest
+    frames.
+
+        with FramePublisher("tcp://127.0.0.1:5555") as publisher:
+            publisher.publish(image, pts_ns=time.time_ns())
+
+    A remote endpoint requires `certificate`, the secret key file of `zmq.auth.create_certificates`.
+    `clients` is a folder with the public keys of permitted readers. Without it any reader that has
+    the publisher's public key is permitted.
+    """
+
+    def __init__(self, endpoint: str, *, certificate: str | None = None, clients: str | None = None) -> None:
+        """Bind the endpoint. Raises InvalidSetting for an unusable endpoint or keys.
+
+        Args:
+            endpoint: ZeroMQ endpoint.
+            certificate: file with the secret key; None for no encryption.
+            clients: folder with public keys of permitted readers; None for any reader.
+        """
+        require_encryption(endpoint, certificate is not None)
+        options: dict[int, object] = {zmq.SNDHWM: 2}
+        self._authenticator: ThreadAuthenticator | None = None
+        if certificate is not None:
+            public, secret = keys_from(certificate)
+            if secret is None:
+                raise InvalidSetting(f"{certificate} has no secret key; give the file that ends in .key_secret")
+            options |= {zmq.CURVE_SERVER: 1, zmq.CURVE_PUBLICKEY: public, zmq.CURVE_SECRETKEY: secret}
+        self._context, self._socket = connected(zmq.PUB, endpoint, bind=True, options=options)
+        if certificate is not None:
+            self._authenticator = ThreadAuthenticator(self._context)
+            self._authenticator.start()
+            self._authenticator.configure_curve(domain="*", location=clients or zmq.auth.CURVE_ALLOW_ANY)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        """Bound endpoint, with the actual port for `tcp://…:*`."""
+        self._seq = 0
+
+    def publish(self, image: NDArray, *, pts_ns: int, seq: int | None = None, **arrays: NDArray | None) -> None:
+        """Send one frame.
+
+        Args:
+            image: uint8 RGB [H, W, 3].
+            pts_ns: timestamp in nanoseconds.
+            seq: sequence number; None for the next one.
+            arrays: any of `right_image`, `depth`, `mask` and `pose`, as in `Frame`.
+
+        Raises:
+            ValueError: shapes do not match, or the picture is too large.
+        """
+        seq = self._seq if seq is None else seq
+        self._seq = seq + 1
+        given = {name: array for name, array in arrays.items() if array is not None}
+        self._socket.send(encode_message(seq, pts_ns, {"image": image, **given}))
+
+    def close(self) -> None:
+        """Close the socket and stop the authenticator."""
+        if self._authenticator is not None:
+            self._authenticator.stop()
+        self._socket.close()
+        self._context.term()
+
+    def __enter__(self) -> FramePublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
 
 LOOK_MS = 50
 NEW_SOCKET_S = 2.0
@@ -59,9 +197,7 @@ class ZeroMqSource(StreamSource):
             self._disconnect()
             raise
         size = first.width_px, first.height_px
-        fields = frozenset(
-            name for name in ("right_image", "depth", "mask", "pose") if getattr(first, name) is not None
-        )
+        fields = frozenset(arrays_of(first, ("right_image", "depth", "mask", "pose")))
         try:
             self.describe(self._name, size, fps, fields=fields)
         except InvalidSetting:
@@ -121,16 +257,15 @@ class ZeroMqSource(StreamSource):
             self.count("bad_messages")
             return None
         try:
-            seq, pts_ns, arrays = unpacked(message.buffer)
-        except BadMessage:
+            return decode_message(message.buffer, arrived_ns=now_ns)
+        except InvalidMessage:
             self.count("bad_messages")
             return None
-        return Frame(seq=seq, pts_ns=pts_ns, arrived_ns=now_ns, **arrays)  # type: ignore[arg-type]
 
     def _connect(self) -> None:
         options = {
             zmq.RCVHWM: self.options.waiting,
-            zmq.MAXMSGSIZE: MOST_BYTES,
+            zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES,
             zmq.RECONNECT_IVL: 250,
             zmq.RECONNECT_IVL_MAX: 2000,
             zmq.HEARTBEAT_IVL: 1000,

@@ -13,7 +13,8 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from operators.sources import zeromq_message
+from gsplat_core.io.frame_codec import ARRAYS, MAX_PIECES, MAX_PIXELS, InvalidMessage, decode, encode
+from gsplat_core.scene.frames import Frame
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 from services.errors import BadMessage
 
@@ -21,8 +22,9 @@ HIGH_WATER = 4
 """Pictures queued per reader on either side; further ones are dropped for that reader. Readers
 drain the queue and use the newest picture. A smaller value would lose pictures of fast readers,
 because ZeroMQ updates the queue length only now and then."""
-MOST_PARTS = 2 + len(zeromq_message.ARRAYS)
-"""Largest number of parts of a message."""
+MAX_PARTS = 1 + MAX_PIECES
+MAX_PART_BYTES = max(np.dtype(array.kind).itemsize * array.values for array in ARRAYS.values()) * MAX_PIXELS
+"""Limits of a message: number of parts, and bytes of each."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,9 @@ class PicturePublisher:
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         self._socket.bind(endpoint)
 
-    def publish_frame(self, header: Mapping[str, Any], pieces: Sequence[bytes | memoryview]) -> None:
-        """Send a frame in the pieces of `zeromq_message`, without blocking. The pieces must not be
-        modified afterwards."""
-        self._send({**header, "pixels": "frame"}, *pieces)
+    def publish_frame(self, header: Mapping[str, Any], frame: Frame) -> None:
+        """Send a frame without blocking. Its arrays must not be modified afterwards."""
+        self._send({**header, "pixels": "frame"}, *encode(frame))
 
     def publish(self, header: Mapping[str, Any], image: NDArray[np.uint8]) -> None:
         """Send a picture, RGB uint8 [H, W, 3], without blocking. The array must not be modified
@@ -81,7 +82,7 @@ def subscribe(socket: Any, *endpoints: str, waiting: int = HIGH_WATER) -> Any:
     options = {
         zmq.LINGER: 0,
         zmq.RCVHWM: waiting,
-        zmq.MAXMSGSIZE: zeromq_message.MOST_BYTES,
+        zmq.MAXMSGSIZE: MAX_PART_BYTES,
         zmq.RECONNECT_IVL: 20,
         zmq.RECONNECT_IVL_MAX: 0,
         zmq.SUBSCRIBE: b"",
@@ -99,27 +100,45 @@ def split(parts: Sequence[zmq.Frame]) -> tuple[dict[str, Any], list[memoryview]]
     Raises:
         BadMessage: if the message is malformed.
     """
-    if not 2 <= len(parts) <= MOST_PARTS:
-        raise BadMessage(f"a picture has 2 to {MOST_PARTS} parts, this message {len(parts)}")
+    if not 2 <= len(parts) <= MAX_PARTS:
+        raise BadMessage(f"a picture has 2 to {MAX_PARTS} parts, this message {len(parts)}")
     header, *pixels = (part.buffer for part in parts)
     if len(header) > MOST_BYTES:
         raise BadMessage(f"a picture's header has {len(header)} bytes; at most {MOST_BYTES} are read")
     return parsed_json(header), pixels
 
 
+def frame_from(parts: Sequence[zmq.Frame]) -> tuple[dict[str, Any], Frame]:
+    """Return header and frame of a message; the frame's arrays reference the message's memory.
+
+    Raises:
+        BadMessage: if the message is malformed or has no frame.
+    """
+    header, pixels = split(parts)
+    if header.get("pixels") != "frame":
+        raise BadMessage(f"a message with {header.get('pixels')!s:.20} pixels has no frame")
+    return header, _decoded(pixels)
+
+
+def _decoded(pixels: Sequence[memoryview]) -> Frame:
+    try:
+        return decode(pixels)
+    except InvalidMessage as error:
+        raise BadMessage(f"a frame cannot be read: {error}") from None
+
+
 def picture_from(parts: Sequence[zmq.Frame]) -> Picture:
-    """Return the picture of a message; its pixels reference the message's memory.
+    """Return the picture of a message; its pixels reference the message's memory. The header of a frame has its number,
+    times and status.
 
     Raises:
         BadMessage: if the message is malformed.
     """
     header, pixels = split(parts)
     if header.get("pixels") == "frame":
-        try:
-            _, _, arrays = zeromq_message.unpacked_pieces(pixels)
-        except zeromq_message.BadMessage as error:
-            raise BadMessage(f"a frame cannot be read: {error}") from None
-        return Picture(header, arrays["image"])
+        frame = _decoded(pixels)
+        stated = {name: getattr(frame, name) for name in ("seq", "pts_ns", "arrived_ns", "damage")}
+        return Picture({**header, **stated, "status": frame.status.value}, frame.image)
     width_px, height_px = (_side(header.get(name)) for name in ("width_px", "height_px"))
     size = sum(len(part) for part in pixels)
     if header.get("pixels") != "rgb" or len(pixels) != 1 or not 0 < 3 * width_px * height_px == size:

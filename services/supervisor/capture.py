@@ -20,20 +20,17 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from gsplat_core.errors import InvalidInput, UserError
+from gsplat_core.io.frame_codec import InvalidMessage
 from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceError, SourceUnavailable
-from operators.sources.backoff import Backoff
-from operators.sources.live import FrameOrder, LiveSource
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions
+from operators.sources.derived import scaled_description
+from operators.sources.live import Backoff, FrameOrder, LiveSource
 from operators.sources.registry import STUCK_AFTER_S, open_source, split_address
-from operators.sources.scaled import scaled_description
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
-from operators.sources.wire import BadHeader, description_from, description_to, frame_from, frame_header, planes_of
-from operators.sources.zeromq_message import BadMessage as BadFrame
-from operators.sources.zeromq_message import pieces, unpacked_pieces
 from services.bus.messages import ask, parsed_json
-from services.bus.pictures import PicturePublisher, split, subscribe
+from services.bus.pictures import PicturePublisher, frame_from, subscribe
 from services.bus.runtime import StreamFolder
 from services.errors import BadMessage, BusError, CommandRefused
 from services.private_files import keep_files_private
@@ -137,12 +134,10 @@ class CapturedSource(LiveSource):
 
     def _frame(self, parts: list[zmq.Frame]) -> tuple[dict[str, Any], Frame] | None:
         try:
-            header, pixels = split(parts)
-            _, _, arrays = unpacked_pieces(pixels)
-            frame = frame_from(header, arrays)
+            header, frame = frame_from(parts)
             size = (max(1, round(side * self._scale)) for side in (frame.width_px, frame.height_px))
             return header, resized_frame(frame, *size)
-        except (BadMessage, BadFrame, BadHeader, InvalidInput):
+        except (BadMessage, InvalidInput):
             self.count("bad_messages")
             return None
 
@@ -169,8 +164,8 @@ class CapturedSource(LiveSource):
         while True:
             try:
                 answer = ask(self._folder.commands("capture"), "describe", timeout_s=1.0)
-                return description_from(answer.get("description", {}))
-            except (BusError, BadHeader) as error:
+                return SourceDescription.from_json(answer.get("description"))
+            except (BusError, InvalidMessage) as error:
                 if stop_requested():
                     raise SourceUnavailable(f"the capture process has not opened its source: {error}") from error
                 time.sleep(ASK_AGAIN_S)
@@ -203,7 +198,7 @@ class Capture:
         with self._lock:
             if self._source is None:
                 raise CommandRefused("the source is not open")
-            return {"description": description_to(self._source.description)}
+            return {"description": self._source.description.as_json()}
 
     def figures(self) -> dict[str, Any]:
         """Return frame counts for the heartbeats."""
@@ -269,8 +264,7 @@ class Capture:
                     os._exit(FAILED)  # the thread blocked in the driver cannot be ended otherwise
 
     def _send(self, frame: Frame, publisher: PicturePublisher) -> None:
-        header = {**frame_header(frame), "run": self._run}
-        publisher.publish_frame(header, pieces(frame.seq, frame.pts_ns, planes_of(frame)))
+        publisher.publish_frame({"run": self._run}, frame)
         self.frames += 1
         self._last_ns = time.monotonic_ns()
 

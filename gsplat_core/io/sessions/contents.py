@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingInvalid
+from gsplat_core.io.frame_codec import camera_of
 from gsplat_core.io.recordings.calibration import Calibration, default_calibration
 from gsplat_core.io.recordings.contents import digest_of
 from gsplat_core.io.recordings.decoder import NO_PICTURE
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.sessions.reader import SessionReader
-from gsplat_core.io.sessions.records import SESSION_FILE, FrameLine, camera_of
+from gsplat_core.io.sessions.records import SESSION_FILE, FrameLine
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 _ADVICE = "What can be read is played"

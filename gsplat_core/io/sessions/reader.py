@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
+from gsplat_core.io.frame_codec import frame_from
 from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.sessions.records import (
     SCHEDULE_LINES,
@@ -25,7 +26,6 @@ from gsplat_core.io.sessions.records import (
     ReconstructorMade,
     ScheduleLine,
     ShownLine,
-    camera_of,
     read_session_file,
 )
 from gsplat_core.io.sessions.segments import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
@@ -209,7 +209,7 @@ def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -
         plane = getattr(arrived, track, None)
         if plane is not None:
             planes[track] = plane
-    if line.status != FrameStatus.DAMAGED.value and arrived.status is FrameStatus.DAMAGED:
+    if line.status is not FrameStatus.DAMAGED and arrived.status is FrameStatus.DAMAGED:
         damage = damage or arrived.damage
     return _frame(line, planes, line.damage or damage)
 
@@ -227,30 +227,14 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
     image = planes.get("image")
     if image is None:
         return None
-    status = FrameStatus.REPLAY if line.status == "live" else FrameStatus(line.status)
+    status = FrameStatus.REPLAY if line.status is FrameStatus.LIVE else line.status
     if damage is not None and damage != line.damage:
         # Damaged after recording, so no pixel is known to be tissue.
         status, planes = FrameStatus.DAMAGED, {**planes, "mask": mask_of_nothing(*image.shape[:2])}
+    if line.pose is not None:
+        planes = {**planes, "pose": np.array(line.pose).reshape(4, 4)}
     try:
-        return Frame(
-            seq=line.seq,
-            pts_ns=line.pts_ns,
-            image=image,
-            right_image=planes.get("right_image"),
-            right_camera=None if line.right_camera is None else camera_of(line.right_camera),
-            depth=planes.get("depth"),
-            depth_confidence=planes.get("depth_confidence"),
-            depth_origin=None if line.depth_origin is None else DEPTH_ORIGINS[line.depth_origin],
-            mask=planes.get("mask"),
-            loss_mask=planes.get("loss_mask"),
-            rehearsal_mask=planes.get("rehearsal_mask"),
-            pose=None if line.pose is None else np.array(line.pose).reshape(4, 4),
-            status=status,
-            damage=damage,
-            exposure=line.exposure or (1.0, 1.0, 1.0),
-            withheld=line.withheld,
-            new_scene=line.new_scene,
-        )
+        return frame_from(line.seq, line.pts_ns, line, planes, status=status, damage=damage, arrived_ns=None)
     except InvalidInput as error:
         raise RecordingInvalid(f"frame {line.seq} of the session cannot be one: {error}") from error
 

@@ -11,71 +11,29 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.files import PartialFile
+from gsplat_core.io.frame_codec import (
+    CameraRecord,
+    Count,
+    FrameFields,
+    Nanoseconds,
+    Origin,
+    Pose,
+    Record,
+    Side,
+    Text,
+    camera_of,
+)
 from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 
-MOST_NS = 2**62
-MAX_SIDE_PX = 65_536
-MAX_TEXT = 1_000
-Count = Annotated[int, Field(ge=0, le=MOST_NS)]
-Nanoseconds = Annotated[int, Field(ge=-MOST_NS, le=MOST_NS)]
-Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
-Text = Annotated[str, Field(max_length=MAX_TEXT)]
-Number = Annotated[float, Field(ge=-1e9, le=1e9)]
-Positive = Annotated[float, Field(gt=0, le=1e9)]
-
-
-def _is_pose(rows: tuple[float, ...]) -> tuple[float, ...]:
-    if rows[12:] != (0, 0, 0, 1):
-        raise ValueError(f"the last row of a pose must be 0, 0, 0, 1, got {rows[12:]}")
-    return rows
-
-
-Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterValidator(_is_pose)]
-"""Matrix [4, 4] in row-major order, OpenCV axes."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
 """Timestamp in milliseconds within the track's file, for each track with a picture of this line."""
-
-
-def _is_origin(name: str) -> str:
-    DEPTH_ORIGINS.check(name)
-    return name
-
-
-Origin = Annotated[str, AfterValidator(_is_origin)]
-"""Name in `DEPTH_ORIGINS`."""
-
-
-class Record(BaseModel):
-    """One line of a session log; immutable and validated on construction and on reading."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
-
-    def line(self) -> bytes:
-        """Return the JSON line as bytes, including the newline."""
-        return self.model_dump_json(exclude_none=True).encode() + b"\n"
-
-
-class CameraRecord(Record):
-    """Intrinsics, size and pose of a camera; see `gsplat_core.scene.cameras.Camera`."""
-
-    model: Literal["pinhole", "ortho", "fisheye"] = "pinhole"
-    width_px: Side
-    height_px: Side
-    fx: Positive
-    fy: Positive
-    cx: Number
-    cy: Number
-    world_to_camera: Pose
 
 
 class SegmentBegins(Record):
@@ -91,34 +49,25 @@ class SegmentBegins(Record):
     """The same moment on the monotonic clock of `arrived_ns` and `shown_ns`."""
 
 
-class _FrameLine(Record):
+class _PictureLine(Record):
+    # FrameFields follow in the subclasses, so that `event` is the first key of a line.
     event: str
     seq: Count
     pts_ns: Nanoseconds
     width_px: Side
     height_px: Side
     tracks: Tracks
-    status: Literal["live", "replay", "stale", "damaged"] = "live"
-    damage: Text | None = None
     pose: Pose | None = None
     """World-to-camera."""
-    right_camera: CameraRecord | None = None
-    """Camera of the right eye; its pose maps left-camera coordinates to its own."""
-    depth_origin: Origin | None = None
-    """None if the frame has no depth, or in recordings of earlier versions."""
-    arrived_ns: Nanoseconds | None = None
-    exposure: tuple[Positive, Positive, Positive] | None = None
-    withheld: Text | None = None
-    new_scene: Text | None = None
 
 
-class FrameLine(_FrameLine):
+class FrameLine(FrameFields, _PictureLine):
     """Frame as received, after the out-of-body gate and the concurrent image checks."""
 
     event: Literal["frame"] = "frame"
 
 
-class PreparedLine(_FrameLine):
+class PreparedLine(FrameFields, _PictureLine):
     """Frame as passed to training.
 
     A plane without a track here, but listed in `same`, equals that of the received frame.
@@ -272,7 +221,7 @@ class LogWriter:
 
     def write(self, line: Record) -> None:
         """Append one line."""
-        data = line.line()
+        data = line.as_json() + b"\n"
         written = self._file.write(data)
         self.bytes += written
         # a disk that fills up accepts a part; the next write raises the error
@@ -339,31 +288,6 @@ class SessionInfo(Record):
     """Size limit in bytes beyond which the oldest segments are deleted; None for no limit."""
     keeps_s: float | None = Field(default=None, ge=0)
     """Age limit in seconds beyond which segments are deleted; None for no limit."""
-
-
-def camera_record(camera: Camera) -> CameraRecord:
-    """Convert a camera to its record."""
-    return CameraRecord(
-        model=camera.model,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        fx=float(camera.K[0, 0]),
-        fy=float(camera.K[1, 1]),
-        cx=float(camera.K[0, 2]),
-        cy=float(camera.K[1, 2]),
-        world_to_camera=tuple(camera.world_to_camera.ravel().tolist()),
-    )
-
-
-def camera_of(record: CameraRecord) -> Camera:
-    """Convert a record to a camera.
-
-    Raises:
-        InvalidInput: if the values are invalid.
-    """
-    K = np.array([[record.fx, 0, record.cx], [0, record.fy, record.cy], [0, 0, 1]])
-    pose = np.array(record.world_to_camera).reshape(4, 4)
-    return Camera(K, record.width_px, record.height_px, pose, record.model)
 
 
 def write_session_file(folder: Path, info: SessionInfo) -> None:

@@ -15,6 +15,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.io.frame_codec import Record
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS, UnreadableFile
 from gsplat_core.io.sessions.records import (
     LOG_FILE,
@@ -23,7 +24,6 @@ from gsplat_core.io.sessions.records import (
     Line,
     LogWriter,
     PreparedLine,
-    Record,
     SegmentBegins,
     SegmentEnds,
     ShownLine,

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.io.frame_codec import ARRAYS, MAX_TEXT, Record, arrays_of, fields_of, short
 from gsplat_core.io.sessions.records import (
     LOG_FILE,
-    MAX_TEXT,
     SEGMENTS_FOLDER,
     SESSION_FILE,
     DeletedLine,
@@ -27,12 +27,10 @@ from gsplat_core.io.sessions.records import (
     FrameLine,
     NoteLine,
     PreparedLine,
-    Record,
     SegmentBegins,
     SessionInfo,
     ShownLine,
     TrackName,
-    camera_record,
     write_session_file,
 )
 from gsplat_core.io.sessions.segments import SegmentWriter, Stage
@@ -243,7 +241,7 @@ class SessionWriter:
     def frame(self, frame: Frame) -> None:
         """Record a received frame."""
         self._go_on()
-        tracks = self._pictures("", _planes(frame, _PLANES), frame.pts_ns)
+        tracks = self._pictures("", arrays_of(frame, _PLANES), frame.pts_ns)
         self._segment.line(FrameLine(**_said(frame), tracks=tracks))
 
     def prepared(self, frame: Frame, arrived: Frame) -> None:
@@ -273,7 +271,7 @@ class SessionWriter:
         """Record the depth of a frame that was passed to training after the frame."""
         self._go_on()
         assert frame.depth_origin is not None
-        tracks = self._pictures("late_", _planes(frame, _DEPTHS), frame.pts_ns)
+        tracks = self._pictures("late_", arrays_of(frame, _DEPTHS), frame.pts_ns)
         width_px, height_px = frame.width_px, frame.height_px
         self._segment.line(
             DepthTaken(
@@ -298,7 +296,7 @@ class SessionWriter:
                 sha256=sha256(rendered.data).hexdigest() if shown.new else None,
                 shown_ns=shown.shown_ns,
                 age_ns=shown.age_ns,
-                state=_short(shown.state),
+                state=short(shown.state),
                 tracks=tracks,
             )
         )
@@ -322,9 +320,7 @@ class SessionWriter:
 
     def _pictures(self, stage: Stage, planes: dict[TrackName, NDArray[Any]], pts_ns: int) -> dict[TrackName, int]:
         return {
-            name: self._segment.picture(
-                stage, name, plane.astype(np.float32 if name in _DEPTHS else np.uint8, copy=False), pts_ns
-            )
+            name: self._segment.picture(stage, name, plane.astype(ARRAYS[name].kind, copy=False), pts_ns)
             for name, plane in planes.items()
         }
 
@@ -377,28 +373,13 @@ class SessionWriter:
         self._segment.line(NoteLine(text=f"the earlier session {session.name} {what}"[:MAX_TEXT]))
 
 
-def _planes(frame: Frame, names: tuple[TrackName, ...]) -> dict[TrackName, NDArray[Any]]:
-    return {name: plane for name in names if (plane := getattr(frame, name)) is not None}
-
-
 def _said(frame: Frame) -> dict[str, Any]:
     """Return the fields of a frame's log line except its tracks."""
     return {
+        **fields_of(frame),
         "seq": frame.seq,
         "pts_ns": frame.pts_ns,
         "width_px": frame.width_px,
         "height_px": frame.height_px,
-        "status": frame.status.value,
-        "damage": _short(frame.damage),
         "pose": None if frame.pose is None else tuple(frame.pose.ravel().tolist()),
-        "right_camera": None if frame.right_camera is None else camera_record(frame.right_camera),
-        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.name,
-        "arrived_ns": frame.arrived_ns,
-        "exposure": None if frame.exposure == (1.0, 1.0, 1.0) else tuple(map(float, frame.exposure)),
-        "withheld": _short(frame.withheld),
-        "new_scene": _short(frame.new_scene),
     }
-
-
-def _short(text: str | None) -> str | None:
-    return None if text is None else text[:MAX_TEXT]

@@ -26,7 +26,7 @@ from operators.applications.working_size import (
     measured_frame_s,
 )
 from operators.messages import PictureState, RenderedFrame, ShownPicture
-from operators.sources.scaled import ScaledSource, scaled_description
+from operators.sources.derived import ScaledSource, scaled_description
 from operators.sources.source import SourceDescription, SourceState
 
 

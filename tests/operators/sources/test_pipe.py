@@ -15,10 +15,10 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from operators.errors import SourceLost, SourceUnavailable
 from operators.sources import pipe
+from operators.sources.live import SteadyClock
 from operators.sources.pipe import PLANES, RawFormat, Y4mHeader
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
-from operators.sources.stream import SteadyClock
 
 ROOT = Path(__file__).resolve().parents[3]
 ALL = SourceOptions(waiting=64)

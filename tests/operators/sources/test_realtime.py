@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.frames import FrameStatus
 from operators.sources import recording as recording_module
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions
 from operators.sources.recording import RealtimeSource, RecordingSource
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceState

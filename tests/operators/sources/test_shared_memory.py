@@ -1,75 +1,90 @@
-"""Headers of shared memory are checked before any data is read."""
+"""Positions in shared memory are checked before any data is read."""
 
 from __future__ import annotations
 
 import os
 
-import numpy as np
 import pytest
 
-from operators.sources.wire import BadHeader, FrameReader
+from gsplat_core.io.frame_codec import InvalidMessage
+from operators.sources.process import FrameReader, FrameWriter, new_memory
 
 
 @pytest.fixture
-def reader():
-    """A reader of 48 bytes: 0, 1, 2, …"""
-    fd = os.memfd_create("frames")
-    os.write(fd, bytes(range(48)))
-    reader = FrameReader(fd)
-    yield reader
-    reader.close()
+def memory():
+    fd = new_memory()
+    yield fd
     os.close(fd)
 
 
-def test_arrays_are_copied_from_where_they_lie(reader):
-    found = reader.read([["image", 0, [2, 5, 3]], ["mask", 38, [2, 5]], ["depth", 8, [1, 2]]])
-    np.testing.assert_array_equal(found["image"], np.arange(30, dtype=np.uint8).reshape(2, 5, 3))
-    np.testing.assert_array_equal(found["mask"], np.arange(38, 48, dtype=np.uint8).reshape(2, 5))
-    np.testing.assert_array_equal(found["depth"], np.frombuffer(bytes(range(8, 16)), np.float32).reshape(1, 2))
-    found["image"][:] = 0
-    assert reader.read([["image", 0, [2, 5, 3]]])["image"][0, 0, 1] == 1
+@pytest.fixture
+def reader(memory):
+    """A reader of 192 bytes: 0, 1, 2, …"""
+    os.write(memory, bytes(range(192)))
+    reader = FrameReader(memory)
+    yield reader
+    reader.close()
+
+
+def test_pieces_are_copies_in_order_each_at_an_aligned_position(reader):
+    first, second, third = reader.read(0, [5, 64, 3])
+    assert (bytes(first), bytes(second), bytes(third)) == (
+        bytes(range(5)),
+        bytes(range(64, 128)),
+        bytes(range(128, 131)),
+    )
+    first[0] = 9
+    assert reader.read(0, [5])[0][0] == 0
 
 
 @pytest.mark.parametrize(
-    "found",
+    ("offset", "sizes"),
     [
-        None,
-        {},
-        [],
-        [["mask", 0, [1, 1]]] * 40,
-        [["colour", 0, [1, 1]]],
-        [["mask", 0, (1, 1)]],
-        [["mask", 0, [1]]],
-        [["mask", 0, [1, 1, 1]]],
-        [["image", 0, [1, 1]]],
-        [["image", 0, [1, 1, 4]]],
-        [["pose", 0, [4, 3]]],
-        [["mask", 0, [0, 1]]],
-        [["mask", 0, [1, -1]]],
-        [["mask", 0, [True, 1]]],
-        [["mask", 0, [2**16, 2**16]]],
-        [["mask", -1, [1, 1]]],
-        [["mask", True, [1, 1]]],
-        [["mask", 0.0, [1, 1]]],
-        [["mask", 39, [2, 5]]],
-        [["depth", 45, [1, 1]]],
-        [["pose", 0, [4, 4]]],
+        (0, None),
+        (0, {}),
+        (0, []),
+        (0, [1] * 40),
+        (0, (1, 1)),
+        (0, [0]),
+        (0, [5, -1]),
+        (0, [True]),
+        (0, [1.0]),
+        (0, ["5"]),
+        (0, [2**62]),
+        (-1, [1]),
+        (True, [1]),
+        (0.0, [1]),
+        (None, [1]),
+        (2**62, [1]),
+        (129, [1]),
+        (0, [64, 64, 65]),
     ],
 )
-def test_what_cannot_be_a_frame_or_lies_outside_is_refused(reader, found):
-    with pytest.raises(BadHeader):
-        reader.read(found)
+def test_what_cannot_be_a_frame_or_lies_outside_is_refused(reader, offset, sizes):
+    with pytest.raises(InvalidMessage):
+        reader.read(offset, sizes)
 
 
-def test_memory_that_has_grown_is_mapped_again(reader):
-    reader.read([["mask", 0, [2, 5]]])
-    os.lseek(reader._fd, 0, os.SEEK_END)
-    os.write(reader._fd, bytes([7] * 16))
-    assert reader.read([["mask", 48, [4, 4]]])["mask"].tolist() == [[7] * 4] * 4
+def test_memory_that_has_grown_is_mapped_again(memory, reader):
+    reader.read(0, [5])
+    os.lseek(memory, 0, os.SEEK_END)
+    os.write(memory, bytes([7] * 64))
+    assert bytes(reader.read(192, [64])[0]) == bytes([7] * 64)
 
 
-def test_empty_memory_holds_no_frame():
-    fd = os.memfd_create("empty")
-    with pytest.raises(BadHeader, match="outside of the shared memory"):
-        FrameReader(fd).read([["mask", 0, [1, 1]]])
-    os.close(fd)
+def test_empty_memory_holds_no_frame(memory):
+    with pytest.raises(InvalidMessage, match="outside of the shared memory"):
+        FrameReader(memory).read(0, [1])
+
+
+def test_what_is_written_into_a_slot_is_read_from_there(memory):
+    writer, reader = FrameWriter(memory), FrameReader(memory)
+    small, large = [b"ab", b"c"], [bytes(range(200)), b"d"]
+    assert not writer.fits(small)
+    writer.grow(small)
+    assert writer.fits(small) and not writer.fits(large)
+    found = [writer.write(slot, small) for slot in (0, 3)]
+    assert [list(map(bytes, reader.read(**each))) for each in found] == [small, small]
+    writer.grow(large)
+    assert list(map(bytes, reader.read(**writer.write(3, large)))) == large
+    reader.close()

@@ -1,4 +1,4 @@
-"""Sizes of frames from a sender that is not ours."""
+"""Streams of external senders: sizes of frames, times that no sender states, waiting times between attempts."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 from gsplat_core.scene.frames import Frame
-from operators.sources.options import SourceOptions
-from operators.sources.stream import StreamSource, check_size, resized
+from operators.sources.address import SourceOptions
+from operators.sources.live import Backoff, SteadyClock, StreamSource, check_size, resized
 
 
 def test_sizes_are_taken_up_to_their_borders():
@@ -44,3 +44,37 @@ def test_a_scaled_stream_has_sides_of_at_least_eight_pixels():
     StreamSource(SourceOptions(scale=0.5)).describe("cam", (16, 16), 30)
     with pytest.raises(InvalidSetting, match="7x7 px cannot be used; both sides must be at least 8 px"):
         StreamSource(SourceOptions(scale=0.5)).describe("cam", (14, 14), 30)
+
+
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("arrived_ns", "time_ns"),
+    [
+        (0, 100_000_000),  # faster than the rate: the rate counts
+        (100_000_000, 100_000_000),
+        (120_000_000, 101_000_000),  # a twentieth of 20 ms behind
+        (1_100_000_000, 150_000_000),  # 1 s behind is still made good bit by bit
+        (1_100_000_001, 1_100_000_001),  # more is a pause
+    ],
+)
+def test_a_frame_is_one_period_later_and_a_little_more_when_it_is_behind(arrived_ns, time_ns):
+    clock = SteadyClock(10)
+    assert clock.time_ns(5 * S) == 0
+    assert clock.time_ns(5 * S + arrived_ns) == time_ns
+    assert clock.time_ns(5 * S) == time_ns + 100_000_000
+
+
+def test_each_failure_waits_twice_as_long_up_to_a_limit_and_success_begins_anew():
+    backoff = Backoff()
+    assert [backoff.failed() for _ in range(6)] == [0.25, 0.5, 1.0, 2.0, 2.0, 2.0]
+    assert backoff.failures == 6
+    backoff.worked()
+    assert backoff.failures == 0 and backoff.failed() == 0.25
+
+
+def test_a_source_that_fails_for_days_does_not_overflow():
+    backoff = Backoff(1e-9, 1e30)
+    waits = [backoff.failed() for _ in range(5000)]
+    assert waits[:3] == [1e-9, 2e-9, 4e-9] and waits[30] == waits[-1] == 1e-9 * 2**30

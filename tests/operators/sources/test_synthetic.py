@@ -9,7 +9,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from operators.sources import synthetic
-from operators.sources.options import SourceOptions
+from operators.sources.address import SourceOptions
 from operators.sources.registry import open_source
 
 SOON_S = 300.0

@@ -1,4 +1,4 @@
-"""Frames over ZeroMQ: what a message holds, real sockets on this machine, keys, senders that go and come."""
+"""Frames over ZeroMQ: real sockets on this machine, keys, senders that go and come."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsplat_core.scene.frames import FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
-from operators.sources.zeromq_message import HEADER, BadMessage, FramePublisher, is_of_this_machine, packed, unpacked
+from operators.sources.zeromq import FramePublisher, is_of_this_machine
 
 ALL = SourceOptions(waiting=64)
 
@@ -32,30 +32,6 @@ ARRAYS = {
     "mask": np.ones((4, 6), np.uint8),
     "pose": np.eye(4) * 2,
 }
-
-
-@pytest.mark.parametrize("names", [["image"], ["image", "mask"], ["image", "pose"], list(ARRAYS)])
-def test_what_is_packed_is_unpacked(names):
-    given = {name: ARRAYS[name] for name in names}
-    seq, pts_ns, found = unpacked(memoryview(packed(2**40, -5, given)))
-    assert (seq, pts_ns) == (2**40, -5) and list(found) == names
-    for name, array in given.items():
-        np.testing.assert_array_equal(found[name], array)
-        assert found[name].dtype == array.dtype
-
-
-@pytest.mark.parametrize(
-    ("wrong", "what"),
-    [
-        ({"image": np.zeros((0, 6, 3), np.uint8)}, "0 px|x0 px"),
-        ({"image": np.zeros((4, 6), np.uint8)}, r"image is \[4, 6\]"),
-        ({"image": image(0), "mask": np.ones((6, 4), np.uint8)}, r"mask is \[6, 4\]"),
-        ({"image": image(0), "pose": np.eye(3)}, r"pose is \[3, 3\]"),
-    ],
-)
-def test_what_is_no_frame_is_not_packed(wrong, what):
-    with pytest.raises(ValueError, match=what):
-        packed(0, 0, wrong)
 
 
 class Sending:
@@ -226,11 +202,3 @@ def test_a_public_key_is_no_secret_one(keys):
         FramePublisher("tcp://127.0.0.1:*", certificate=str(keys / "server.key"))
     with pytest.raises(InvalidSetting, match="has no secret key"):
         open_source(f"zmq+tcp://127.0.0.1:5?server={keys}/server.key&client={keys}/client.key")
-
-
-def test_a_header_is_as_the_module_says():
-    data = packed(3, 4, {"image": image(1, 2, 5), "mask": np.ones((2, 5), np.uint8)})
-    assert HEADER.size == 32 and data[:16] == b"ISPF" + bytes([1, 0, 4, 0, 5, 0, 0, 0, 2, 0, 0, 0])
-    assert len(data) == 32 + 2 * 5 * 4
-    with pytest.raises(BadMessage):
-        unpacked(memoryview(data[:-1]))

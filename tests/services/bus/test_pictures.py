@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import zmq
 
-from operators.sources.zeromq_message import pieces
+from gsplat_core.io.frame_codec import encode
+from gsplat_core.scene.frames import Frame
 from services.bus.pictures import HIGH_WATER, PicturePublisher, picture_from, subscribe
 from services.errors import BadMessage
 
@@ -49,8 +50,11 @@ def test_a_shown_picture_arrives_as_it_was(runtime, context):
         got = received(socket)
         assert (got.header["seq"], got.header["state"]) == (7, "live")
         np.testing.assert_array_equal(got.image, image[:, ::-1])
-        publisher.publish_frame({"seq": 8}, pieces(8, 0, {"image": image, "mask": image[..., 0]}))
-        np.testing.assert_array_equal(received(socket).image, image)
+        publisher.publish_frame({"run": 3}, Frame(8, 5, image, mask=image[..., 0], arrived_ns=7))
+        got = received(socket)
+        stated = {"seq": 8, "pts_ns": 5, "arrived_ns": 7, "damage": None, "status": "replay"}
+        assert got.header == {"pixels": "frame", "run": 3, **stated}
+        np.testing.assert_array_equal(got.image, image)
     publisher.close()
 
 
@@ -121,7 +125,7 @@ def test_a_slow_reader_gets_few_of_many(runtime, context):
     publisher.close()
 
 
-FRAME = [bytes(piece) for piece in pieces(0, 0, {"image": np.zeros((2, 2, 3), np.uint8)})]
+FRAME = [bytes(piece) for piece in encode(Frame(0, 0, np.zeros((2, 2, 3), np.uint8)))]
 
 
 @pytest.mark.parametrize(
@@ -138,10 +142,12 @@ FRAME = [bytes(piece) for piece in pieces(0, 0, {"image": np.zeros((2, 2, 3), np
         [b'{"pixels":"rgb","width_px":1e0,"height_px":1}', b"123"],
         [b'{"pixels":"frame"}', b"123"],
         [b'{"pixels":"frame"}', FRAME[0]],
-        [b'{"pixels":"frame"}', FRAME[0], FRAME[1][:-1]],
+        [b'{"pixels":"frame"}', FRAME[0], FRAME[1]],
+        [b'{"pixels":"frame"}', FRAME[0], FRAME[1][:-1], FRAME[2]],
         [b'{"pixels":"frame"}', FRAME[0], FRAME[1], b"1234"],
+        [b'{"pixels":"frame"}', *FRAME, b"{}"],
         [b'{"pixels":"frame"}', b"".join(FRAME)],
-        [b'{"pixels":"frame"}', *[FRAME[1]] * 7],
+        [b'{"pixels":"frame"}', *[FRAME[1]] * 11],
         [b'{"pixels":"rgb","width_px":1,"height_px":1}', b"12", b"3"],
         [b'{"x":"' + b"y" * (1 << 17) + b'"}', b"123"],
     ],

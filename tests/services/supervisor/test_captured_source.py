@@ -10,8 +10,6 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources.source import SourceDescription, SourceState
-from operators.sources.wire import description_to, frame_header, planes_of
-from operators.sources.zeromq_message import pieces
 from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher
 from services.supervisor.capture import CapturedSource
@@ -28,15 +26,14 @@ class StandIn:
         self.publisher = PicturePublisher(folder.pictures("capture"))
         self.heartbeats = Heartbeats(folder.status("capture"), lambda: dict(self.said))
         self.commands = CommandServer(
-            folder.commands("capture"), {"describe": lambda _: {"description": description_to(ABOUT)}}
+            folder.commands("capture"), {"describe": lambda _: {"description": ABOUT.as_json()}}
         )
 
     def send(self, seq: int, **changes) -> None:
         frame = Frame(
             seq, seq * 40_000_000, np.full((4, 6, 3), seq, np.uint8), arrived_ns=time.monotonic_ns(), **changes
         )
-        header = {**frame_header(frame), "run": self.run}
-        self.publisher.publish_frame(header, pieces(frame.seq, frame.pts_ns, planes_of(frame)))
+        self.publisher.publish_frame({"run": self.run}, frame)
 
     def close(self) -> None:
         self.publisher.close()
@@ -117,12 +114,14 @@ def test_it_says_what_capture_says_of_its_source(folder, said, state):
     capture.close()
 
 
-def test_a_message_that_is_no_frame_is_counted(folder):
+def test_a_message_that_is_no_frame_is_counted(folder, monkeypatch):
     capture = StandIn(folder, run=1)
     source = CapturedSource(folder)
     source.open()
     first(source, capture)
-    capture.publisher.publish_frame({"seq": 1}, [b"nonsense"])
+    with monkeypatch.context() as patch:
+        patch.setattr("services.bus.pictures.encode", lambda frame: [b"nonsense"])
+        capture.send(1)
     until(lambda: source.counts().get("bad_messages") == 1)
     capture.publisher.publish({"seq": 1}, np.zeros((4, 6, 3), np.uint8))
     until(lambda: source.counts().get("bad_messages") == 2)

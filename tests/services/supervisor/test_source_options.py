@@ -8,8 +8,7 @@ from pydantic import ValidationError
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED as SYNTHESIZED
 from operators.settings import MAX_SEED
-from operators.sources.address import PROTOCOLS
-from operators.sources.address_options import PARSERS
+from operators.sources.address import PARSERS, PROTOCOLS
 from operators.sources.registry import SOURCES, check_address
 from services.settings import StreamSettings
 from services.supervisor.worker import specs_of

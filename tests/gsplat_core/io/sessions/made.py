@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsplat_core.io.frame_codec import camera_record
 from gsplat_core.io.sessions import SessionInfo, SessionWriter
-from gsplat_core.io.sessions.records import Observed, Rehearsed, camera_record
+from gsplat_core.io.sessions.records import Observed, Rehearsed
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS

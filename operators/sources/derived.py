@@ -1,4 +1,4 @@
-"""Stereo sources: both eyes in one picture, or from two sources."""
+"""Sources derived from other sources: resized, split into two eyes, or joined from two eyes."""
 
 from __future__ import annotations
 
@@ -13,28 +13,25 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
+from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.scene.frames import Frame
+from operators.sources.address import StereoLayout
 from operators.sources.live import LiveSource
-from operators.sources.options import StereoLayout
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
 
-MOST_KEPT = 8
-"""Maximum number of right pictures kept for pairing."""
 
+class DerivedSource:
+    """`FrameSource` that changes each frame of another source. A subclass implements `_derived`."""
 
-class SplitSource:
-    """`FrameSource` that splits each picture into a left or upper half (`image`) and the other half
-    (`right_image`).
+    def __init__(self, source: FrameSource, description: SourceDescription) -> None:
+        """Wrap a source.
 
-    Halves that the sender has squeezed are not stretched. All other fields belong to the left eye.
-    """
-
-    def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
-        """Raises InvalidSetting if the source already has right pictures, or its camera is not that
-        of one eye.
+        Args:
+            source: opened and closed together with this one.
+            description: description of the changed frames.
         """
-        self._source, self._layout = source, layout
-        self.description = self._described(source.description)
+        self._source = source
+        self.description = description
 
     @property
     def state(self) -> SourceState:
@@ -57,13 +54,63 @@ class SplitSource:
     def read(self, timeout_s: float) -> Frame | None:
         """See `FrameSource`."""
         frame = self._source.read(timeout_s)
-        return None if frame is None else self._split(frame)
+        return None if frame is None else self._derived(frame)
 
     def close(self) -> None:
         """See `FrameSource`."""
         self._source.close()
 
-    def _split(self, frame: Frame) -> Frame:
+    def _derived(self, frame: Frame) -> Frame:
+        raise NotImplementedError(f"{type(self).__name__} has no _derived method")
+
+
+def scaled_description(about: SourceDescription, scale: float) -> SourceDescription:
+    """Return the description of a source whose frames are resized by `scale`."""
+    camera = about.camera.scaled(scale)
+    return replace(about, width_px=camera.width_px, height_px=camera.height_px, camera=camera)
+
+
+class ScaledSource(DerivedSource):
+    """`FrameSource` that resizes the frames of another source."""
+
+    def __init__(self, source: FrameSource, scale: float) -> None:
+        """Wrap a source.
+
+        Args:
+            source: opened and closed together with this one.
+            scale: factor on width and height.
+        """
+        super().__init__(source, scaled_description(source.description, scale))
+
+    def _derived(self, frame: Frame) -> Frame:
+        # A frame of another size keeps the factor instead of the stream's size.
+        own, read = self.description, self._source.description
+        if (frame.width_px, frame.height_px) == (read.width_px, read.height_px):
+            return resized_frame(frame, own.width_px, own.height_px)
+        scale = own.width_px / read.width_px
+        sides = (max(1, round(side * scale)) for side in (frame.width_px, frame.height_px))
+        return resized_frame(frame, *sides)
+
+
+MOST_KEPT = 8
+"""Maximum number of right pictures kept for pairing."""
+
+
+class SplitSource(DerivedSource):
+    """`FrameSource` that splits each picture into a left or upper half (`image`) and the other half
+    (`right_image`).
+
+    Halves that the sender has squeezed are not stretched. All other fields belong to the left eye.
+    """
+
+    def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
+        """Raises InvalidSetting if the source already has right pictures, or its camera is not that
+        of one eye.
+        """
+        self._layout = layout
+        super().__init__(source, self._described(source.description))
+
+    def _derived(self, frame: Frame) -> Frame:
         width_px, height_px = self._half(frame.width_px, frame.height_px)
 
         def left(plane: NDArray) -> NDArray:

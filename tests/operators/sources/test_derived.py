@@ -12,10 +12,10 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import FrameStatus
+from operators.sources.derived import JoinedSource, SplitSource
 from operators.sources.live import LiveSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
-from operators.sources.stereo import JoinedSource, SplitSource
 
 SOON_S = 300.0
 MS = 1_000_000
