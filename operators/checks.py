@@ -15,17 +15,17 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.cuts import CutDetector, CutSettings
-from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator, ExposureSettings
-from gsplat_core.endoscope.field_of_view import FieldOfView, FieldOfViewSettings
-from gsplat_core.endoscope.highlights import HighlightFinder, HighlightSettings
-from gsplat_core.endoscope.interlacing import Deinterlacer, InterlacingSettings, without_combs
-from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskAndDepthSettings, MaskCheck
-from gsplat_core.endoscope.ordinary import OrdinaryPictures, Turns
-from gsplat_core.endoscope.sequence import SequenceCheck, SequenceSettings
-from gsplat_core.endoscope.sharpness import SharpnessGate, SharpnessSettings
-from gsplat_core.endoscope.stream_clock import OUT_OF_ORDER, ClockSettings, StreamClock
-from gsplat_core.endoscope.strip import StripDetector, StripSettings
+from gsplat_core.endoscope.cuts import CutDetector
+from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator
+from gsplat_core.endoscope.field_of_view import FieldOfView
+from gsplat_core.endoscope.highlights import HighlightFinder
+from gsplat_core.endoscope.interlacing import Deinterlacer, without_combs
+from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskCheck
+from gsplat_core.endoscope.ordinary import LOOK_EVERY_S, OrdinaryPictures, Turns
+from gsplat_core.endoscope.sequence import SequenceCheck
+from gsplat_core.endoscope.sharpness import SharpnessGate
+from gsplat_core.endoscope.stream_clock import OUT_OF_ORDER, StreamClock
+from gsplat_core.endoscope.strip import StripDetector
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
@@ -183,7 +183,7 @@ class OrdinaryStream:
         """Clear the state, at the start of a stream."""
         self.pictures.reset()
         self.frame_is_ordinary = False
-        self._turns = Turns(self._members, self.pictures.settings.look_every_s)
+        self._turns = Turns(self._members, LOOK_EVERY_S)
         self._due: frozenset[int] = frozenset()
 
     def begin(self, ordinary: bool, pts_ns: int) -> None:
@@ -316,13 +316,9 @@ class SequenceStage(Stage):
 
     counts_type = SequenceCounts
 
-    def __init__(self, settings: SequenceSettings | None = None, clock: ClockSettings | None = None) -> None:
-        self.settings, self.clock_settings = settings or SequenceSettings(), clock or ClockSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._check = SequenceCheck(self.settings)
-        self._clock = StreamClock(self.clock_settings)
+        self._check = SequenceCheck()
+        self._clock = StreamClock()
 
     def annotate(self, frame: Frame) -> Frame:
         timing = self._clock.observe(frame.pts_ns, frame.arrived_ns)
@@ -353,12 +349,8 @@ class MaskAndDepthStage(Stage):
 
     counts_type = MaskAndDepthCounts
 
-    def __init__(self, settings: MaskAndDepthSettings | None = None) -> None:
-        self.settings = settings or MaskAndDepthSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._mask, self._depth = MaskCheck(self.settings), DepthCheck(self.settings)
+        self._mask, self._depth = MaskCheck(), DepthCheck()
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.depth is not None:
@@ -384,12 +376,8 @@ class InterlacingStage(Stage):
 
     counts_type = InterlacingCounts
 
-    def __init__(self, settings: InterlacingSettings | None = None) -> None:
-        self.settings = settings or InterlacingSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._deinterlacer = Deinterlacer(self.settings)
+        self._deinterlacer = Deinterlacer()
 
     def annotate(self, frame: Frame) -> Frame:
         image = self._deinterlacer.process(frame.image)
@@ -398,7 +386,7 @@ class InterlacingStage(Stage):
         self.found["de-interlaced"] += 1
         right = frame.right_image
         if right is not None:
-            right = without_combs(right, self.settings.stand_out_levels)
+            right = without_combs(right)
         return frame.with_fields(image=image, right_image=right)
 
 
@@ -414,12 +402,8 @@ class FieldOfViewStage(Stage):
 
     counts_type = FieldOfViewCounts
 
-    def __init__(self, settings: FieldOfViewSettings | None = None) -> None:
-        self.settings = settings or FieldOfViewSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._view = FieldOfView(self.settings)
+        self._view = FieldOfView()
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
@@ -445,12 +429,8 @@ class StripStage(Stage):
 
     counts_type = StripCounts
 
-    def __init__(self, settings: StripSettings | None = None) -> None:
-        self.settings = settings or StripSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._detector = StripDetector(self.settings)
+        self._detector = StripDetector()
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
@@ -476,12 +456,8 @@ class HighlightStage(Stage):
 
     counts_type = HighlightCounts
 
-    def __init__(self, settings: HighlightSettings | None = None) -> None:
-        self.settings = settings or HighlightSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._finder = HighlightFinder(self.settings)
+        self._finder = HighlightFinder()
 
     def annotate(self, frame: Frame) -> Frame:
         kept = None if frame.withheld is not None else self._finder.without(frame.image)
@@ -507,12 +483,8 @@ class ExposureStage(Stage):
 
     counts_type = ExposureCounts
 
-    def __init__(self, settings: ExposureSettings | None = None) -> None:
-        self.settings = settings or ExposureSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._estimator = ExposureEstimator(self.settings)
+        self._estimator = ExposureEstimator()
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.new_scene is not None:
@@ -541,12 +513,8 @@ class SharpnessStage(Stage):
 
     counts_type = SharpnessCounts
 
-    def __init__(self, settings: SharpnessSettings | None = None) -> None:
-        self.settings = settings or SharpnessSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._gate = SharpnessGate(self.settings)
+        self._gate = SharpnessGate()
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
@@ -600,12 +568,8 @@ class CutStage(Stage):
 
     counts_type = CutCounts
 
-    def __init__(self, settings: CutSettings | None = None) -> None:
-        self.settings = settings or CutSettings()
-        super().__init__()
-
     def reset(self) -> None:
-        self._detector = CutDetector(self.settings)
+        self._detector = CutDetector()
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:

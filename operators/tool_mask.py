@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.mask_and_depth import MaskAndDepthSettings
+from gsplat_core.endoscope.mask_and_depth import LEAST_TISSUE
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting
@@ -24,8 +24,6 @@ from operators.outcome import OutcomeBuilder
 log = logging.getLogger(__name__)
 
 
-LEAST_TISSUE = MaskAndDepthSettings().least_tissue
-"""Minimum share of tissue in a detected mask. A mask with less marks the whole picture as tool."""
 BELIEVED_FRAMES = 10
 """Number of frames for which an all-tool mask is accepted after the last tissue, for example with a
 tool in front of the lens. After that it counts as a false detection.
@@ -174,6 +172,7 @@ class FoundToolMaskOp(Operator):
         """
         if frame.withheld is not None or not self.doubts:
             return mask
+        # A mask with less tissue marks the whole picture as tool.
         if cv2.countNonZero(mask) >= LEAST_TISSUE * mask.size:
             self._since_tissue = 0
             return mask

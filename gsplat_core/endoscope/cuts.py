@@ -22,8 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import lowest_and_highest, median_of, reduced
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 WIDTH_PX, HEIGHT_PX = 64, 48
 BLOCK_WIDTH_PX, BLOCK_HEIGHT_PX, SEARCH_PX = 16, 12, 8
@@ -135,56 +133,32 @@ def _moved(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
     return best
 
 
-@dataclass(frozen=True)
-class CutSettings:
-    """Thresholds for frames of the same scene; the measures are those of `likeness`.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    same_difference: float = 0.15
-    """Difference up to which two frames show the same scene without further tests."""
-    same_structure: float = 0.72
-    """Structure from which two frames show the same scene."""
-    same_moved: float = 0.83
-    """Correlation of a quarter of the picture, searched over the whole other picture, from which
-    two frames show the same scene.
-    """
-    same_after_gap_difference: float = 0.2
-    """Difference up to which frames after a gap of unusable frames may show the same scene, if
-    their colours agree as well.
-    """
-    same_after_gap_colours: float = 0.65
-    """Overlap of colours required for frames after a gap."""
-    longest_doubt_frames: int = 6
-    """Largest number of consecutive unmatched frames before a cut is reported. Normally a cut is
-    confirmed by the next frame matching the unmatched one.
-    """
-    views: int = 4
-    """Number of views kept of the present scene; twice as many are kept of earlier ones."""
-    view_every: int = 15
-    """Number of frames between two kept views."""
-    rate_ratio: float = 1.4
-    """Factor by which a new frame rate must differ."""
-    rate_frames: int = 15
-    """Number of frames over which the frame rate is observed."""
-
-    def __post_init__(self) -> None:
-        share, count = NumberIn(0.0, 1.0), IntegerIn(1, 10_000)
-        check_settings(
-            self,
-            same_difference=NumberIn(0.0, 10.0),
-            same_structure=share,
-            same_moved=share,
-            same_after_gap_difference=NumberIn(0.0, 10.0),
-            same_after_gap_colours=share,
-            longest_doubt_frames=count,
-            views=IntegerIn(1, 100),
-            view_every=count,
-            rate_ratio=NumberIn(1.01, 100.0),
-            rate_frames=IntegerIn(3, 10_000),
-        )
+SAME_DIFFERENCE = 0.15
+"""Difference up to which two frames show the same scene without further tests."""
+SAME_STRUCTURE = 0.72
+"""Structure from which two frames show the same scene."""
+SAME_MOVED = 0.83
+"""Correlation of a quarter of the picture, searched over the whole other picture, from which
+two frames show the same scene.
+"""
+SAME_AFTER_GAP_DIFFERENCE = 0.2
+"""Difference up to which frames after a gap of unusable frames may show the same scene, if
+their colours agree as well.
+"""
+SAME_AFTER_GAP_COLOURS = 0.65
+"""Overlap of colours required for frames after a gap."""
+LONGEST_DOUBT_FRAMES = 6
+"""Largest number of consecutive unmatched frames before a cut is reported. Normally a cut is
+confirmed by the next frame matching the unmatched one.
+"""
+KEPT_VIEWS = 4
+"""Number of views kept of the present scene; twice as many are kept of earlier ones."""
+VIEW_EVERY = 15
+"""Number of frames between two kept views."""
+RATE_RATIO = 1.4
+"""Factor by which a new frame rate must differ."""
+RATE_FRAMES = 15
+"""Number of frames over which the frame rate is observed."""
 
 
 @dataclass(frozen=True)
@@ -208,17 +182,16 @@ class CutDetector:
     cut. A bounded number of reduced pictures is kept.
     """
 
-    def __init__(self, settings: CutSettings | None = None) -> None:
-        self.settings = settings or CutSettings()
+    def __init__(self) -> None:
         self._last: View | None = None
         self._shape: tuple[int, ...] = ()
         self._doubted: View | None = None
         self._doubts = 0
         self._gap = False
-        self._views: deque[View] = deque(maxlen=self.settings.views)
-        self._earlier: deque[View] = deque(maxlen=2 * self.settings.views)
+        self._views: deque[View] = deque(maxlen=KEPT_VIEWS)
+        self._earlier: deque[View] = deque(maxlen=2 * KEPT_VIEWS)
         self._since_view = 0
-        self._rate = FrameRate(self.settings.rate_ratio, self.settings.rate_frames)
+        self._rate = FrameRate()
 
     def skip(self) -> None:
         """Record an unusable frame."""
@@ -244,7 +217,7 @@ class CutDetector:
             return self._accept(view, "frame rate" if other_rate else None)
         settled = self._doubted is not None and self._same(view, self._doubted, gap=False)
         self._doubts += 1
-        if settled or self._doubts > self.settings.longest_doubt_frames:
+        if settled or self._doubts > LONGEST_DOUBT_FRAMES:
             known = any(self._same(view, earlier, gap=False) for earlier in self._earlier)
             return self._accept(view, "returned" if known else "cut")
         self._doubted = view
@@ -259,14 +232,13 @@ class CutDetector:
         return interrupted and any(self._same(view, earlier, self._gap) for earlier in self._views)
 
     def _same(self, view: View, other: View, gap: bool) -> bool:
-        settings = self.settings
-        if difference(view, other) <= settings.same_difference:
+        if difference(view, other) <= SAME_DIFFERENCE:
             return True
         found = likeness(view, other)
-        if found.structure >= settings.same_structure or found.moved >= settings.same_moved:
+        if found.structure >= SAME_STRUCTURE or found.moved >= SAME_MOVED:
             return True
-        near = found.difference <= settings.same_after_gap_difference
-        return gap and near and found.colours >= settings.same_after_gap_colours
+        near = found.difference <= SAME_AFTER_GAP_DIFFERENCE
+        return gap and near and found.colours >= SAME_AFTER_GAP_COLOURS
 
     def _accept(self, view: View, new_scene: str | None) -> SceneVerdict:
         self._since_view += 1
@@ -275,7 +247,7 @@ class CutDetector:
             if self._last is not None:
                 self._earlier.append(self._last)
             self._views.clear()
-        if new_scene is not None or self._since_view >= self.settings.view_every:
+        if new_scene is not None or self._since_view >= VIEW_EVERY:
             self._views.append(view)
             self._since_view = 0
         self._last, self._doubted, self._doubts, self._gap = view, None, 0, False
@@ -287,9 +259,8 @@ class FrameRate:
     numbers.
     """
 
-    def __init__(self, ratio: float, frames: int) -> None:
-        self.ratio = ratio
-        self._recent: deque[float] = deque(maxlen=frames)
+    def __init__(self) -> None:
+        self._recent: deque[float] = deque(maxlen=RATE_FRAMES)
         self._usual_ns: float | None = None
         self._last: tuple[int, int] | None = None
 
@@ -298,15 +269,15 @@ class FrameRate:
         if self._last is not None and seq > self._last[0] and pts_ns > self._last[1]:
             self._recent.append((pts_ns - self._last[1]) / (seq - self._last[0]))
         self._last = (seq, pts_ns)
-        if len(self._recent) < (self._recent.maxlen or 0):
+        if len(self._recent) < RATE_FRAMES:
             return False
         now_ns = float(np.median(self._recent))
         # Require all intervals, not only their median: an unsteady clock is no other rate.
         if self._usual_ns is None:
             self._usual_ns = now_ns
             return False
-        slower = min(self._recent) > self.ratio * self._usual_ns
-        faster = max(self._recent) * self.ratio < self._usual_ns
+        slower = min(self._recent) > RATE_RATIO * self._usual_ns
+        faster = max(self._recent) * RATE_RATIO < self._usual_ns
         if slower or faster:
             self._usual_ns = now_ns
             return True

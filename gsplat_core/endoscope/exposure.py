@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import median_of, reduced, reduced_mask
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 WIDTH_PX, HEIGHT_PX = 24, 20
 """Size of the reduced pictures. They have fewer than 500 pixels, because numpy releases the
@@ -48,19 +46,17 @@ class Reference:
     """Log gains, [3]."""
 
 
-def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None, darkest: int, brightest: int) -> Sample:
+def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None) -> Sample:
     """Reduce a picture.
 
     Args:
         image: RGB uint8 [H, W, 3].
         kept: [H, W], 0 outside the tissue, or None.
-        darkest: level that valid channels exceed.
-        brightest: level that valid channels stay below.
     """
     # The last averaging is in floats: in 8 bits a change of 1 % in a dark channel would be lost.
     small = reduced(image, 4 * WIDTH_PX, 4 * HEIGHT_PX).astype(np.float32)
     small = np.asarray(cv2.resize(small, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA), np.float32)
-    valid = (small > darkest) & (small < brightest)
+    valid = (small > DARKEST_LEVEL) & (small < BRIGHTEST_LEVEL)
     if kept is not None:
         valid &= reduced_mask(kept, WIDTH_PX, HEIGHT_PX)[..., None]
     return Sample(np.log(np.maximum(small, 1.0)).reshape(-1, 3), valid.reshape(-1, 3))
@@ -99,82 +95,51 @@ Gains = tuple[float, float, float]
 UNCHANGED: Gains = (1.0, 1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class ExposureSettings:
-    """Thresholds of gain changes. Differences are natural logarithms of ratios: 0.08 is 8 %.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    dead_zone: float = 0.08
-    """Difference from the present gain that is ignored while the gain is held."""
-    drift_zone: float = 0.1
-    """Threshold for slow changes against older references; larger because the tissue has moved
-    since.
-    """
-    more_pixels: float = 1.5
-    """Ratio of pixels that agree with a change to those that agree with no change."""
-    anchor_zone: float = 0.15
-    """Largest deviation of a settled gain from the comparison with the scene's first frame, if that
-    is possible.
-    """
-    release: float = 0.04
-    """Distance from 1 within which a settled gain is set to exactly 1."""
-    settled_change: float = 0.02
-    """Change from frame to frame below which a gain counts as settled."""
-    settled_frames: int = 6
-    """Number of settled frames after which the gain is held again."""
-    references: int = 12
-    """Number of reference pictures."""
-    reference_every: int = 4
-    """Number of frames between references; 12 references every 4 frames cover 1.6 s at 30 frames/s.
-    """
-    young_references: int = 4
-    """Number of newest references that are not used yet, so that they contain no part of a slow
-    change.
-    """
-    least_clear_jump: float = 1.5
-    """Smallest ratio of a sudden change to the dissimilarity from the previous frame."""
-    least_clear_drift: float = 1.0
-    """Smallest ratio of a slow change to the dissimilarity from the references."""
-    most_unlike: float = 0.25
-    """Median difference from every reference, after removing the gain, above which a frame's
-    exposure is not measured.
-    """
-    largest_gain: float = 8.0
-    """Bound of gains and their inverses."""
-    forget_s: float = 300.0
-    """Time constant in seconds with which a held gain returns to 1, slower than the model learns,
-    so that errors do not accumulate over days.
-    """
-    darkest: int = 14
-    """Level below which a channel is not compared because of noise and black offset."""
-    brightest: int = 225
-    """Level above which a channel is not compared because of clipping."""
-
-    def __post_init__(self) -> None:
-        share = NumberIn(1e-3, 1.0)
-        check_settings(
-            self,
-            dead_zone=share,
-            drift_zone=share,
-            more_pixels=NumberIn(0.0, 100.0),
-            anchor_zone=share,
-            release=NumberIn(0.0, 1.0),
-            settled_change=share,
-            settled_frames=IntegerIn(1, 1000),
-            references=IntegerIn(1, 100),
-            reference_every=IntegerIn(1, 1000),
-            young_references=IntegerIn(1, 100),
-            least_clear_jump=NumberIn(0.0, 100.0),
-            least_clear_drift=NumberIn(0.0, 100.0),
-            most_unlike=share,
-            largest_gain=NumberIn(1.0, 100.0),
-            forget_s=NumberIn(1.0, 1e6),
-            darkest=IntegerIn(1, 100),
-            brightest=IntegerIn(101, 255),
-        )
+DEAD_ZONE = 0.08
+"""Difference from the present gain that is ignored while the gain is held."""
+DRIFT_ZONE = 0.1
+"""Threshold for slow changes against older references; larger because the tissue has moved
+since.
+"""
+MORE_PIXELS = 1.5
+"""Ratio of pixels that agree with a change to those that agree with no change."""
+ANCHOR_ZONE = 0.15
+"""Largest deviation of a settled gain from the comparison with the scene's first frame, if that
+is possible.
+"""
+RELEASE_ZONE = 0.04
+"""Distance from 1 within which a settled gain is set to exactly 1."""
+SETTLED_CHANGE = 0.02
+"""Change from frame to frame below which a gain counts as settled."""
+SETTLED_FRAMES = 6
+"""Number of settled frames after which the gain is held again."""
+MOST_REFERENCES = 12
+"""Number of reference pictures."""
+REFERENCE_EVERY = 4
+"""Number of frames between references; 12 references every 4 frames cover 1.6 s at 30 frames/s.
+"""
+YOUNG_REFERENCES = 4
+"""Number of newest references that are not used yet, so that they contain no part of a slow
+change.
+"""
+LEAST_CLEAR_JUMP = 1.5
+"""Smallest ratio of a sudden change to the dissimilarity from the previous frame."""
+LEAST_CLEAR_DRIFT = 1.0
+"""Smallest ratio of a slow change to the dissimilarity from the references."""
+MOST_UNLIKE = 0.25
+"""Median difference from every reference, after removing the gain, above which a frame's
+exposure is not measured.
+"""
+LARGEST_GAIN = 8.0
+"""Bound of gains and their inverses."""
+FORGET_S = 300.0
+"""Time constant in seconds with which a held gain returns to 1, slower than the model learns,
+so that errors do not accumulate over days.
+"""
+DARKEST_LEVEL = 14
+"""Level below which a channel is not compared because of noise and black offset."""
+BRIGHTEST_LEVEL = 225
+"""Level above which a channel is not compared because of clipping."""
 
 
 class ExposureEstimator:
@@ -186,14 +151,13 @@ class ExposureEstimator:
     the gains are exactly (1, 1, 1).
     """
 
-    def __init__(self, settings: ExposureSettings | None = None) -> None:
-        self.settings = settings or ExposureSettings()
+    def __init__(self) -> None:
         self.following = False
         """True while the exposure is changing."""
         self._anchor: Reference | None = None
         """First frame of the scene."""
-        self._references: deque[Reference] = deque(maxlen=self.settings.references)
-        self._young: deque[Reference] = deque(maxlen=self.settings.young_references)
+        self._references: deque[Reference] = deque(maxlen=MOST_REFERENCES)
+        self._young: deque[Reference] = deque(maxlen=YOUNG_REFERENCES)
         self._previous: Reference | None = None
         self._log_gain = np.zeros(3)
         self._steady = 0
@@ -221,7 +185,7 @@ class ExposureEstimator:
             kept: [H, W], 0 outside the tissue, or None.
             pts_ns: timestamp in nanoseconds.
         """
-        sample = sample_of(image, kept, self.settings.darkest, self.settings.brightest)
+        sample = sample_of(image, kept)
         if self._previous is None:
             self._anchor = Reference(sample, self._log_gain)
             self._references.append(self._anchor)
@@ -235,13 +199,12 @@ class ExposureEstimator:
 
     def _hold(self, sample: Sample, pts_ns: int) -> None:
         assert self._previous is not None
-        settings = self.settings
         self._since_reference += 1
-        due = self._since_reference >= settings.reference_every
-        if self._changed(sample, [self._previous], settings.dead_zone, settings.least_clear_jump):
+        due = self._since_reference >= REFERENCE_EVERY
+        if self._changed(sample, [self._previous], DEAD_ZONE, LEAST_CLEAR_JUMP):
             self._references.extend(self._young)
         # Slow changes need not be tested in every frame.
-        elif not due or not self._changed(sample, self._references, settings.drift_zone, settings.least_clear_drift):
+        elif not due or not self._changed(sample, self._references, DRIFT_ZONE, LEAST_CLEAR_DRIFT):
             self._forget(pts_ns)
             if due:
                 self._since_reference = 0
@@ -263,7 +226,7 @@ class ExposureEstimator:
             return False
         # A tool that covers half of the picture shifts the mean but not the tissue next to it.
         same = share_with(sample, best.sample, self._log_gain - best.log_gain)
-        if share_with(sample, best.sample, measured - best.log_gain) < self.settings.more_pixels * same:
+        if share_with(sample, best.sample, measured - best.log_gain) < MORE_PIXELS * same:
             return False
         self._set(measured)
         return True
@@ -275,13 +238,13 @@ class ExposureEstimator:
             return
         before = self._log_gain
         self._set(found[0])
-        still = np.abs(self._log_gain - before).max() < self.settings.settled_change
+        still = np.abs(self._log_gain - before).max() < SETTLED_CHANGE
         self._steady = self._steady + 1 if still else 0
         self._since_reference += 1
-        if self._since_reference >= self.settings.reference_every:
+        if self._since_reference >= REFERENCE_EVERY:
             self._since_reference = 0
             self._references.append(Reference(sample, self._log_gain))
-        if self._steady >= self.settings.settled_frames:
+        if self._steady >= SETTLED_FRAMES:
             self.following = False
             self._settle(sample)
 
@@ -292,8 +255,7 @@ class ExposureEstimator:
         assert self._anchor is not None
         found = self._compare(sample, [self._anchor])
         if found is not None:
-            zone = self.settings.anchor_zone
-            self._set(np.clip(self._log_gain, found[0] - zone, found[0] + zone))
+            self._set(np.clip(self._log_gain, found[0] - ANCHOR_ZONE, found[0] + ANCHOR_ZONE))
         self._release()
 
     def _compare(
@@ -305,7 +267,7 @@ class ExposureEstimator:
         alike = []
         for reference in references:
             shift, spread = ratio(sample, reference.sample, 1)
-            if spread <= self.settings.most_unlike:
+            if spread <= MOST_UNLIKE:
                 alike.append((spread, reference, shift))
         if not alike:
             return None
@@ -314,7 +276,7 @@ class ExposureEstimator:
         for spread, reference, green in alike[:3]:
             for channel in range(3):
                 shift, own = (green, spread) if channel == 1 else ratio(sample, reference.sample, channel)
-                weight = 0.0 if own > self.settings.most_unlike else 1 / (own + 0.01) ** 2
+                weight = 0.0 if own > MOST_UNLIKE else 1 / (own + 0.01) ** 2
                 total[channel] += weight * (shift + reference.log_gain[channel])
                 weights[channel] += weight
         known = weights > 0
@@ -328,13 +290,13 @@ class ExposureEstimator:
     def _forget(self, pts_ns: int) -> None:
         if self._last_pts_ns is not None and self._log_gain.any():
             passed_s = min(max((pts_ns - self._last_pts_ns) * 1e-9, 0.0), 1.0)
-            self._log_gain = self._log_gain * math.exp(-passed_s / self.settings.forget_s)
+            self._log_gain = self._log_gain * math.exp(-passed_s / FORGET_S)
             self._release()
 
     def _release(self) -> None:
-        if np.abs(self._log_gain).max() < self.settings.release:
+        if np.abs(self._log_gain).max() < RELEASE_ZONE:
             self._log_gain = np.zeros(3)
 
     def _set(self, log_gain: NDArray[np.float64]) -> None:
-        most = math.log(self.settings.largest_gain)
+        most = math.log(LARGEST_GAIN)
         self._log_gain = np.clip(log_gain, -most, most)

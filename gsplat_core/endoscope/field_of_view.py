@@ -8,84 +8,53 @@ by the convex hull, or by an ellipse if most of the outline is on one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import luma, reduced
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 LONG_SIDE_PX = 160
 Outline = NDArray[np.float64]
 """Convex polygon [N, 2] as x and y in shares of the picture's width and height."""
 
 
-@dataclass(frozen=True)
-class FieldOfViewSettings:
-    """Thresholds of the surround and of changes of the field.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    darkest_level: int = 40
-    """Largest level of the surround, 0 to 255."""
-    surround_range: int = 12
-    """Largest variation of the surround's level over the picture and time."""
-    edge_contrast: int = 18
-    """Smallest brightness step from the surround to the inside of the outline."""
-    edge_share: float = 0.6
-    """Share of the outline that must have this step."""
-    least_surround: float = 0.015
-    """Smallest share of the picture covered by the surround."""
-    least_field: float = 0.15
-    """Smallest share of the picture covered by the field."""
-    ellipse_share: float = 0.7
-    """Share of the outline that must be on an ellipse for it to be used."""
-    ellipse_distance: float = 0.015
-    """Largest distance from the ellipse, as a share of its size."""
-    lit_outside: float = 0.25
-    """Largest share of lit pixels outside the outline, such as text, logos and compression
-    artefacts.
-    """
-    margin: float = 0.01
-    """Margin inside the outline that is excluded because it is blurred or has a bright ring, as a
-    share of the longer side.
-    """
-    window_frames: int = 30
-    """Number of frames per examined window; the first frame is examined alone."""
-    windows_to_change: int = 3
-    """Number of consecutive consistent windows before a smaller field, or none, is accepted; a
-    larger one is accepted at once.
-    """
-
-    def __post_init__(self) -> None:
-        share, level, count = NumberIn(0.0, 1.0), IntegerIn(0, 255), IntegerIn(1, 10_000)
-        check_settings(
-            self,
-            darkest_level=level,
-            surround_range=level,
-            edge_contrast=level,
-            edge_share=share,
-            least_surround=share,
-            least_field=share,
-            ellipse_share=share,
-            ellipse_distance=share,
-            lit_outside=share,
-            margin=NumberIn(0.0, 0.2),
-            window_frames=count,
-            windows_to_change=count,
-        )
+DARKEST_LEVEL = 40
+"""Largest level of the surround, 0 to 255."""
+SURROUND_RANGE = 12
+"""Largest variation of the surround's level over the picture and time."""
+EDGE_CONTRAST = 18
+"""Smallest brightness step from the surround to the inside of the outline."""
+EDGE_SHARE = 0.6
+"""Share of the outline that must have this step."""
+LEAST_SURROUND = 0.015
+"""Smallest share of the picture covered by the surround."""
+LEAST_FIELD = 0.15
+"""Smallest share of the picture covered by the field."""
+ELLIPSE_SHARE = 0.7
+"""Share of the outline that must be on an ellipse for it to be used."""
+ELLIPSE_DISTANCE = 0.015
+"""Largest distance from the ellipse, as a share of its size."""
+LIT_OUTSIDE = 0.25
+"""Largest share of lit pixels outside the outline, such as text, logos and compression
+artefacts.
+"""
+MARGIN_SHARE = 0.01
+"""Margin inside the outline that is excluded because it is blurred or has a bright ring, as a
+share of the longer side.
+"""
+WINDOW_FRAMES = 30
+"""Number of frames per examined window; the first frame is examined alone."""
+WINDOWS_TO_CHANGE = 3
+"""Number of consecutive consistent windows before a smaller field, or none, is accepted; a
+larger one is accepted at once.
+"""
 
 
 class FieldOfView:
     """Field-of-view detector of a stream."""
 
-    def __init__(self, settings: FieldOfViewSettings | None = None) -> None:
-        self.settings = settings or FieldOfViewSettings()
+    def __init__(self) -> None:
         self.mask: NDArray[np.uint8] | None = None
         """Mask uint8 [H, W], 1 inside; None if the field is the whole picture. Read-only, and the
         same array until the field changes.
@@ -111,10 +80,10 @@ class FieldOfView:
         else:
             self._brightest, self._darkest = np.maximum(self._brightest, grey), np.minimum(self._darkest, grey)
         self._frames += 1
-        if self._frames > 1 and self._shows_more(grey) and find_outline(grey, grey, self.settings) is None:
+        if self._frames > 1 and self._shows_more(grey) and find_outline(grey, grey) is None:
             self._take(None)
-        if self._frames == 1 or self._frames % self.settings.window_frames == 0:
-            self._consider(find_outline(self._brightest, self._darkest, self.settings))
+        if self._frames == 1 or self._frames % WINDOW_FRAMES == 0:
+            self._consider(find_outline(self._brightest, self._darkest))
             if self._frames > 1:
                 self._brightest = self._darkest = None
         return self.mask
@@ -122,8 +91,8 @@ class FieldOfView:
     def _shows_more(self, grey: NDArray[np.uint8]) -> bool:
         """Return True if a downscaled grey picture [H, W] is lit outside the field of view found so far."""
         outside = grey[~self._reduced]
-        lit = outside > self.settings.darkest_level + self.settings.surround_range
-        return bool(lit.size and lit.mean() > self.settings.lit_outside)
+        lit = outside > DARKEST_LEVEL + SURROUND_RANGE
+        return bool(lit.size and lit.mean() > LIT_OUTSIDE)
 
     def _start(self, shape: tuple[int, ...]) -> None:
         self._shape, self._frames, self._candidates = shape, 0, []
@@ -147,12 +116,10 @@ class FieldOfView:
             self._take(cv2.convexHull(corners)[:, 0].astype(np.float64))
             return
         self._candidates.append(found)
-        recent = [
-            _inside(candidate, before.shape) for candidate in self._candidates[-self.settings.windows_to_change :]
-        ]
-        self._candidates = self._candidates[-self.settings.windows_to_change :]
+        recent = [_inside(candidate, before.shape) for candidate in self._candidates[-WINDOWS_TO_CHANGE:]]
+        self._candidates = self._candidates[-WINDOWS_TO_CHANGE:]
         agree = all(_overlap(candidate, now) > 0.95 for candidate in recent)
-        if agree and len(recent) >= self.settings.windows_to_change:
+        if agree and len(recent) >= WINDOWS_TO_CHANGE:
             self._take(found)
 
     def _take(self, outline: Outline | None) -> None:
@@ -168,7 +135,7 @@ class FieldOfView:
             self.mask = None
             return
         inside = _inside(outline, (height, width)).astype(np.uint8)
-        margin = round(self.settings.margin * max(height, width))
+        margin = round(MARGIN_SHARE * max(height, width))
         if margin:
             # The picture's own edge gets no margin.
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
@@ -176,15 +143,12 @@ class FieldOfView:
         self.mask = inside
 
 
-def find_outline(
-    brightest: NDArray[np.uint8], darkest: NDArray[np.uint8], settings: FieldOfViewSettings
-) -> Outline | None:
+def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Outline | None:
     """Find the field's outline.
 
     Args:
         brightest: largest level of each pixel in a window, uint8 [H, W].
         darkest: smallest level of each pixel in the window, uint8 [H, W].
-        settings: thresholds.
 
     Returns:
         The outline, or None without a surround.
@@ -194,10 +158,10 @@ def find_outline(
         return None
     rim = np.concatenate([brightest[0], brightest[-1], brightest[:, 0], brightest[:, -1]])
     level = float(np.percentile(rim, 5))
-    if level > settings.darkest_level:
+    if level > DARKEST_LEVEL:
         return None
-    limit = level + settings.surround_range
-    dark = (brightest <= limit) & (brightest - darkest <= settings.surround_range)
+    limit = level + SURROUND_RANGE
+    dark = (brightest <= limit) & (brightest - darkest <= SURROUND_RANGE)
     lit = cv2.morphologyEx((~dark).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     # The largest lit region is the field; text and logos are separate regions.
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(lit, connectivity=4)
@@ -208,17 +172,17 @@ def find_outline(
     hull = cv2.convexHull(max(contours, key=len))[:, 0].astype(np.float64)
     if len(hull) < 3:
         return None
-    outline = _up_to_the_edge(_as_ellipse(hull, (height, width), settings), (height, width))
+    outline = _up_to_the_edge(_as_ellipse(hull, (height, width)), (height, width))
     inside = _filled(outline, (height, width))
     share = float(inside.mean())
-    if share < settings.least_field or share > 1 - settings.least_surround:
+    if share < LEAST_FIELD or share > 1 - LEAST_SURROUND:
         return None
-    if float(lit[~inside].mean()) > settings.lit_outside or not _ends_sharply(inside, brightest, limit, settings):
+    if float(lit[~inside].mean()) > LIT_OUTSIDE or not _ends_sharply(inside, brightest, limit):
         return None
     return (outline + 0.5) / np.array([width, height])
 
 
-def _as_ellipse(hull: Outline, shape: tuple[int, int], settings: FieldOfViewSettings) -> Outline:
+def _as_ellipse(hull: Outline, shape: tuple[int, int]) -> Outline:
     """Return the ellipse on which most of the hull is, clipped to the hull's bounding box, or the
     hull itself.
     """
@@ -230,7 +194,7 @@ def _as_ellipse(hull: Outline, shape: tuple[int, int], settings: FieldOfViewSett
     kept = free
     angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     for _ in range(4):
-        if len(kept) < 20 or len(kept) < settings.ellipse_share * len(free):
+        if len(kept) < 20 or len(kept) < ELLIPSE_SHARE * len(free):
             return hull
         (x, y), (across, along), turned = cv2.fitEllipseDirect(kept.astype(np.float32))
         if not np.isfinite([x, y, across, along]).all() or not 0.6 < across / max(along, 1e-6) <= 1.0:
@@ -238,8 +202,8 @@ def _as_ellipse(hull: Outline, shape: tuple[int, int], settings: FieldOfViewSett
         turn = np.deg2rad(turned)
         rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         local = (free - (x, y)) @ rotation.T / (across / 2, along / 2)
-        kept = free[np.abs(np.hypot(local[:, 0], local[:, 1]) - 1) <= 2 * settings.ellipse_distance]
-    if len(kept) < settings.ellipse_share * len(free) or along > 2 * max(shape):
+        kept = free[np.abs(np.hypot(local[:, 0], local[:, 1]) - 1) <= 2 * ELLIPSE_DISTANCE]
+    if len(kept) < ELLIPSE_SHARE * len(free) or along > 2 * max(shape):
         return hull
     ring = np.stack([np.cos(angles) * across / 2, np.sin(angles) * along / 2], axis=1) @ rotation + (x, y)
     return np.clip(ring, points.min(axis=0), points.max(axis=0))
@@ -261,9 +225,7 @@ def _along(hull: Outline) -> Outline:
     return np.concatenate(parts)
 
 
-def _ends_sharply(
-    inside: NDArray[np.bool_], brightest: NDArray[np.uint8], limit: float, settings: FieldOfViewSettings
-) -> bool:
+def _ends_sharply(inside: NDArray[np.bool_], brightest: NDArray[np.uint8], limit: float) -> bool:
     """Return True if most of the field's rim is clearly brighter than the surround next to it."""
     three = np.ones((3, 3), np.uint8)
     field = inside.astype(np.uint8)
@@ -271,7 +233,7 @@ def _ends_sharply(
     rim = (inner - cv2.erode(inner, three, borderType=cv2.BORDER_CONSTANT, borderValue=1)).astype(bool)
     if not rim.any():
         return False
-    return float((brightest[rim] >= limit + settings.edge_contrast).mean()) >= settings.edge_share
+    return float((brightest[rim] >= limit + EDGE_CONTRAST).mean()) >= EDGE_SHARE
 
 
 def _filled(outline: Outline, shape: tuple[int, int]) -> NDArray[np.bool_]:

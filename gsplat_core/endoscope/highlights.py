@@ -7,7 +7,6 @@ or overexposed areas are not brighter than their surroundings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -15,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import enlarged, sampled
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 LONG_SIDE_PX = 800
 """Longest side in pixels above which pictures are subsampled."""
@@ -28,62 +25,38 @@ of view.
 """
 
 
-@dataclass(frozen=True)
-class HighlightSettings:
-    """Thresholds of highlights.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    brightest_channel: int = 235
-    """Smallest level of a highlight's brightest channel, 0 to 255."""
-    darkest_channel: int = 170
-    """Smallest level of its darkest channel; saturated colours are tissue."""
-    above_surroundings: int = 30
-    """Smallest excess of its darkest channel over the mean of the surroundings, in levels."""
-    surroundings: float = 0.12
-    """Side of the square of surroundings, as a share of the longer side."""
-    grown: float = 0.003
-    """Dilation of highlights as a share of the longer side, 2 px of 640."""
-    most: float = 0.25
-    """Largest share of highlights in a picture; more indicates overexposure or a white object, and
-    none are reported.
-    """
-
-    def __post_init__(self) -> None:
-        level, share = IntegerIn(0, 255), NumberIn(0.0, 1.0)
-        check_settings(
-            self,
-            brightest_channel=level,
-            darkest_channel=level,
-            above_surroundings=IntegerIn(0, 255),
-            surroundings=NumberIn(0.01, 1.0),
-            grown=NumberIn(0.0, 0.05),
-            most=share,
-        )
+BRIGHTEST_CHANNEL = 235
+"""Smallest level of a highlight's brightest channel, 0 to 255."""
+DARKEST_CHANNEL = 170
+"""Smallest level of its darkest channel; saturated colours are tissue."""
+ABOVE_SURROUNDINGS = 30
+"""Smallest excess of its darkest channel over the mean of the surroundings, in levels."""
+SURROUNDINGS_SHARE = 0.12
+"""Side of the square of surroundings, as a share of the longer side."""
+GROWN_SHARE = 0.003
+"""Dilation of highlights as a share of the longer side, 2 px of 640."""
+MOST_SHARE = 0.25
+"""Largest share of highlights in a picture; more indicates overexposure or a white object, and
+none are reported.
+"""
 
 
-DEFAULTS = HighlightSettings()
-
-
-def without_highlights(image: NDArray[np.uint8], settings: HighlightSettings = DEFAULTS) -> NDArray[np.uint8] | None:
+def without_highlights(image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
     """Return a mask uint8 [H, W], 0 on highlights, for a picture RGB uint8 [H, W, 3]; None without
     highlights.
     """
-    return HighlightFinder(settings).without(image)
+    return HighlightFinder().without(image)
 
 
 class HighlightFinder:
     """Highlight detector that reuses its buffers between pictures."""
 
-    def __init__(self, settings: HighlightSettings = DEFAULTS) -> None:
-        self.settings = settings
+    def __init__(self) -> None:
         self._planes: list[NDArray[np.uint8]] = []
 
     def without(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
         """See `without_highlights`."""
-        settings, (height, width) = self.settings, image.shape[:2]
+        height, width = image.shape[:2]
         step = -(-max(height, width) // LONG_SIDE_PX)
         some = sampled(image, step)
         if not self._planes or self._planes[0].shape != some.shape[:2]:
@@ -93,15 +66,15 @@ class HighlightFinder:
         cv2.min(cv2.min(high, green, dst=low), blue, dst=low)
         cv2.max(cv2.max(high, green, dst=high), blue, dst=high)
         found, other = green, blue
-        cv2.threshold(low, settings.darkest_channel - 1, 1, cv2.THRESH_BINARY, dst=found)
-        cv2.threshold(high, settings.brightest_channel - 1, 1, cv2.THRESH_BINARY, dst=other)
+        cv2.threshold(low, DARKEST_CHANNEL - 1, 1, cv2.THRESH_BINARY, dst=found)
+        cv2.threshold(high, BRIGHTEST_CHANNEL - 1, 1, cv2.THRESH_BINARY, dst=other)
         if not cv2.countNonZero(cv2.bitwise_and(found, other, dst=found)):
             return None
-        most = cv2.resize(_surroundings(low, high, settings), found.shape[::-1], dst=other)
+        most = cv2.resize(_surroundings(low, high), found.shape[::-1], dst=other)
         cv2.bitwise_and(found, cv2.compare(low, most, cv2.CMP_GT, dst=other), dst=found)
-        if not 0 < cv2.countNonZero(found) <= settings.most * found.size:
+        if not 0 < cv2.countNonZero(found) <= MOST_SHARE * found.size:
             return None
-        grown = cv2.dilate(found, _disc(max(1, round(settings.grown * max(found.shape)))), dst=other)
+        grown = cv2.dilate(found, _disc(max(1, round(GROWN_SHARE * max(found.shape)))), dst=other)
         kept = np.asarray(cv2.threshold(grown, 0, 1, cv2.THRESH_BINARY_INV)[1], np.uint8)
         return enlarged(kept, width, height) if step > 1 else kept
 
@@ -111,7 +84,7 @@ def _disc(radius_px: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1)), np.uint8)
 
 
-def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: HighlightSettings) -> NDArray[np.uint8]:
+def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the largest darkest channel that is not a highlight, reduced by `SHRINK` (rounded up).
 
     It is one level below the local mean plus an offset. Black pixels are excluded from the mean. Where the sum
@@ -122,10 +95,10 @@ def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: Hig
         cv2.resize(sampled(plane, SHRINK // 2), (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high)
     )
     _, weight = cv2.threshold(lit, BLACK - 1, 1, cv2.THRESH_BINARY)
-    side = 2 * int(settings.surroundings * max(width, height) / 2) + 1
+    side = 2 * int(SURROUNDINGS_SHARE * max(width, height) / 2) + 1
     total, count = (
         cv2.boxFilter(plane, cv2.CV_32F, (side, side), normalize=False)
         for plane in (cv2.multiply(small, weight), weight)
     )
-    least = total / np.maximum(count, 1) + np.float32(settings.above_surroundings)
+    least = total / np.maximum(count, 1) + np.float32(ABOVE_SURROUNDINGS)
     return (least - 1).clip(0, 255).astype(np.uint8)

@@ -9,86 +9,61 @@ mean of their neighbours. Static parts are unchanged.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import luma
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 BLOCK_ROWS, BLOCK_COLUMNS, COLUMN_STEP = 16, 8, 4
 """Block size in lines and sampled columns, and the column step."""
 
 
-@dataclass(frozen=True)
-class InterlacingSettings:
-    """Thresholds of interlaced video.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    comb_ratio: float = 1.2
-    """Ratio of the difference of neighbouring lines to that of lines two apart, from which a block
-    is combed.
-    """
-    comb_levels: float = 5.0
-    """Smallest difference of neighbouring lines of a combed block, in levels 0 to 255."""
-    comb_share: float = 0.02
-    """Share of combed blocks from which a picture is combed."""
-    combed_frames: int = 4
-    """Number of combed pictures among the last `of_frames` from which a stream is interlaced."""
-    of_frames: int = 12
-    """Number of pictures over which combed ones are counted."""
-    forgotten_frames: int = 600
-    """Consecutive pictures without combs after which a stream is no longer interlaced."""
-    stand_out_levels: int = 4
-    """Excess over both neighbouring lines, in levels, from which a pixel of an odd line is
-    replaced.
-    """
-
-    def __post_init__(self) -> None:
-        count = IntegerIn(1, 1_000_000)
-        check_settings(
-            self,
-            comb_ratio=NumberIn(1.0, 100.0),
-            comb_levels=NumberIn(0.1, 255.0),
-            comb_share=NumberIn(1e-4, 1.0),
-            combed_frames=count,
-            of_frames=count,
-            forgotten_frames=count,
-            stand_out_levels=IntegerIn(0, 255),
-        )
+COMB_RATIO = 1.2
+"""Ratio of the difference of neighbouring lines to that of lines two apart, from which a block
+is combed.
+"""
+COMB_LEVELS = 5.0
+"""Smallest difference of neighbouring lines of a combed block, in levels 0 to 255."""
+COMB_SHARE = 0.02
+"""Share of combed blocks from which a picture is combed."""
+COMBED_FRAMES = 4
+"""Number of combed pictures among the last `JUDGED_FRAMES` from which a stream is interlaced."""
+JUDGED_FRAMES = 12
+"""Number of pictures over which combed ones are counted."""
+FORGOTTEN_FRAMES = 600
+"""Consecutive pictures without combs after which a stream is no longer interlaced."""
+STAND_OUT_LEVELS = 4
+"""Excess over both neighbouring lines, in levels, from which a pixel of an odd line is
+replaced.
+"""
 
 
 class Deinterlacer:
     """Deinterlacer of a stream."""
 
-    def __init__(self, settings: InterlacingSettings | None = None) -> None:
-        self.settings = settings or InterlacingSettings()
+    def __init__(self) -> None:
         self.interlaced = False
         """True if the stream is interlaced."""
-        self._recent: deque[bool] = deque(maxlen=self.settings.of_frames)
+        self._recent: deque[bool] = deque(maxlen=JUDGED_FRAMES)
         self._without = 0
 
     def process(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the picture RGB uint8 [H, W, 3] without combs. It is the given array unless the
         stream is interlaced.
         """
-        combed = comb_share(image, self.settings) >= self.settings.comb_share
+        combed = comb_share(image) >= COMB_SHARE
         self._recent.append(combed)
         self._without = 0 if combed else self._without + 1
-        if sum(self._recent) >= self.settings.combed_frames:
+        if sum(self._recent) >= COMBED_FRAMES:
             self.interlaced = True
-        elif self._without >= self.settings.forgotten_frames:
+        elif self._without >= FORGOTTEN_FRAMES:
             self.interlaced = False
-        return without_combs(image, self.settings.stand_out_levels) if self.interlaced else image
+        return without_combs(image) if self.interlaced else image
 
 
-def comb_share(image: NDArray[np.uint8], settings: InterlacingSettings) -> float:
+def comb_share(image: NDArray[np.uint8]) -> float:
     """Return the share of combed blocks; 0 for a picture smaller than a few blocks."""
     some = np.ascontiguousarray(image[:, ::COLUMN_STEP, 1])
     rows, columns = (some.shape[0] - 2) // BLOCK_ROWS, some.shape[1] // BLOCK_COLUMNS
@@ -100,11 +75,11 @@ def comb_share(image: NDArray[np.uint8], settings: InterlacingSettings) -> float
         cv2.resize(cv2.absdiff(here, other).astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
         for other in (beside, beyond)
     )
-    combed = (between >= settings.comb_levels) & (between >= settings.comb_ratio * within)
+    combed = (between >= COMB_LEVELS) & (between >= COMB_RATIO * within)
     return float(combed.mean())
 
 
-def without_combs(image: NDArray[np.uint8], stand_out_levels: int) -> NDArray[np.uint8]:
+def without_combs(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a copy of a picture [H, W, 3] with outliers of odd lines replaced by the mean of the
     neighbouring lines.
     """
@@ -118,7 +93,7 @@ def without_combs(image: NDArray[np.uint8], stand_out_levels: int) -> NDArray[np
     grey_above, grey_below, grey_odd = grey[0:-2:2][:count], grey[2::2][:count], grey[1:-1:2]
     over = cv2.subtract(grey_odd, cv2.max(grey_above, grey_below))
     under = cv2.subtract(cv2.min(grey_above, grey_below), grey_odd)
-    stands_out = (np.asarray(cv2.max(over, under)) > stand_out_levels).view(np.uint8)
+    stands_out = (np.asarray(cv2.max(over, under)) > STAND_OUT_LEVELS).view(np.uint8)
     # Include the ends of a comb's tooth, which are less distinct than its middle.
     near = cv2.dilate(stands_out, np.ones((1, 5), np.uint8))
     odd[:] = cv2.copyTo(cv2.addWeighted(above, 0.5, below, 0.5, 0), near, np.ascontiguousarray(odd))

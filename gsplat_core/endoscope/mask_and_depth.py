@@ -9,61 +9,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
-
 STEP_PX = 4
 """Smallest subsampling step of rows and columns in pixels."""
 SAMPLES = 128
 """Approximate number of samples along the shorter side of larger pictures."""
 
 
-@dataclass(frozen=True)
-class MaskAndDepthSettings:
-    """Thresholds of plausible masks and depth.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    least_tissue: float = 0.02
-    """Share of tissue below which a frame is not trained on."""
-    lost_tool_share: float = 0.05
-    """Share of a tool in the previous mask from which its sudden absence is a lost mask."""
-    lost_frames: int = 5
-    """Largest number of frames with a lost mask; then the tool has left."""
-    farthest_mm: float = 2000.0
-    """Largest plausible depth for an endoscope, in millimetres."""
-    wrong_depth_share: float = 0.2
-    """Share of invalid values (not finite, negative or too far) from which a frame's depth is
-    discarded.
-    """
-    usual_depth_ratio: float = 4.0
-    """Ratio of the median depth to that of earlier frames, in either direction, from which a
-    frame's depth is discarded.
-    """
-    unusual_frames: int = 10
-    """Largest number of such frames; then the new distance is accepted."""
-
-    def __post_init__(self) -> None:
-        share, count = NumberIn(0.0, 1.0), IntegerIn(1, 10_000)
-        check_settings(
-            self,
-            least_tissue=share,
-            lost_tool_share=share,
-            lost_frames=count,
-            farthest_mm=NumberIn(1.0, 1e9),
-            wrong_depth_share=share,
-            usual_depth_ratio=NumberIn(1.01, 1e6),
-            unusual_frames=count,
-        )
+LEAST_TISSUE = 0.02
+"""Share of tissue below which a frame is not trained on."""
+LOST_TOOL_SHARE = 0.05
+"""Share of a tool in the previous mask from which its sudden absence is a lost mask."""
+LOST_FRAMES = 5
+"""Largest number of frames with a lost mask; then the tool has left."""
+FARTHEST_MM = 2000.0
+"""Largest plausible depth for an endoscope, in millimetres."""
+WRONG_DEPTH_SHARE = 0.2
+"""Share of invalid values (not finite, negative or too far) from which a frame's depth is
+discarded.
+"""
+USUAL_DEPTH_RATIO = 4.0
+"""Ratio of the median depth to that of earlier frames, in either direction, from which a
+frame's depth is discarded.
+"""
+UNUSUAL_FRAMES = 10
+"""Largest number of such frames; then the new distance is accepted."""
 
 
 class MaskCheck:
     """Consistency check of consecutive tool masks."""
 
-    def __init__(self, settings: MaskAndDepthSettings | None = None) -> None:
-        self.settings = settings or MaskAndDepthSettings()
+    def __init__(self) -> None:
         self._tool_share = 0.0
         self._lost = 0
 
@@ -71,13 +46,9 @@ class MaskCheck:
         """Return "no tissue" or "tool mask lost" for a faulty mask [H, W] (1 = tissue), else None."""
         some = _some(mask)
         tissue = np.count_nonzero(some) / some.size
-        if tissue < self.settings.least_tissue:
+        if tissue < LEAST_TISSUE:
             return "no tissue"
-        if (
-            tissue == 1.0
-            and self._tool_share >= self.settings.lost_tool_share
-            and self._lost < self.settings.lost_frames
-        ):
+        if tissue == 1.0 and self._tool_share >= LOST_TOOL_SHARE and self._lost < LOST_FRAMES:
             self._lost += 1
             return "tool mask lost"
         self._tool_share, self._lost = 1 - tissue, 0
@@ -99,36 +70,34 @@ class CheckedDepth:
 class DepthCheck:
     """Consistency check of consecutive depth maps."""
 
-    def __init__(self, settings: MaskAndDepthSettings | None = None) -> None:
-        self.settings = settings or MaskAndDepthSettings()
+    def __init__(self) -> None:
         self._medians: deque[float] = deque(maxlen=15)
         self._unusual = 0
 
     def checked(self, depth: NDArray[np.floating]) -> CheckedDepth:
         """Check a depth map [H, W] in millimetres, 0 = unknown."""
-        settings = self.settings
         sampled = _some(depth)
         possible = self._possible(sampled)
-        if 1 - np.count_nonzero(possible) / possible.size > settings.wrong_depth_share:
+        if 1 - np.count_nonzero(possible) / possible.size > WRONG_DEPTH_SHARE:
             return CheckedDepth(None, "depth not usable")
         known = sampled[possible & (sampled > 0)]
         if len(known) and self._at_another_scale(float(np.median(known))):
             return CheckedDepth(None, "depth at another scale")
         # Both are NaN if any value is.
-        if depth.min() >= 0 and depth.max() <= settings.farthest_mm:
+        if depth.min() >= 0 and depth.max() <= FARTHEST_MM:
             return CheckedDepth(depth)
         return CheckedDepth(np.where(self._possible(depth), depth, 0).astype(np.float32), "depth repaired")
 
     def _possible(self, depth: NDArray[np.floating]) -> NDArray[np.bool_]:
         # Comparisons with NaN are false.
-        return (depth >= 0) & (depth <= self.settings.farthest_mm)
+        return (depth >= 0) & (depth <= FARTHEST_MM)
 
     def _at_another_scale(self, median_mm: float) -> bool:
         usual_mm = float(np.median(self._medians)) if self._medians else median_mm
         ratio = max(median_mm / usual_mm, usual_mm / median_mm)
-        if ratio >= self.settings.usual_depth_ratio:
+        if ratio >= USUAL_DEPTH_RATIO:
             self._unusual += 1
-            if self._unusual <= self.settings.unusual_frames:
+            if self._unusual <= UNUSUAL_FRAMES:
                 return True
             self._medians.clear()
         self._unusual = 0

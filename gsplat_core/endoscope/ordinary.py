@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from gsplat_core.errors import InvalidSetting
 
 
 class Turns:
@@ -48,38 +45,19 @@ LEAST_CHANGE = 0.2
 """Mean change of a band, in levels of 255, below which a picture may be a repetition."""
 
 
-@dataclass(frozen=True)
-class OrdinarySettings:
-    """Largest deviations of an ordinary picture from the usual values.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    look_every_s: float = 0.2
-    """Interval in seconds at which each detailed check runs in any case (every sixth frame at 30
-    frames/s), and at which the reference is renewed.
-    """
-    most_change: float = 2.0
-    """Largest change of a band from the previous picture, as a multiple of its usual change."""
-    least_change: float = 0.4
-    brightness_levels: float = 2.0
-    """Largest shift of a channel's mean from the reference, in levels of 255."""
-    sharpness_share: float = 0.08
-    """Largest relative change of the mean difference of neighbouring pixels from the reference."""
-    interval_share: float = 1.7
-    """Longest interval since the last frame, as a multiple of the usual one."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.look_every_s <= 60:
-            raise InvalidSetting(f"look_every_s is {self.look_every_s:g}; it must be between 0 and 60 seconds")
-        if not 0 < self.least_change < 1 < self.most_change <= 100:
-            raise InvalidSetting(
-                f"least_change is {self.least_change} and most_change {self.most_change}; they must be below and above 1"
-            )
-        for name in ("brightness_levels", "sharpness_share", "interval_share"):
-            if not 0 < getattr(self, name) <= 255:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
+LOOK_EVERY_S = 0.2
+"""Interval in seconds at which each detailed check runs in any case (every sixth frame at 30
+frames/s), and at which the reference is renewed.
+"""
+MOST_CHANGE_RATIO = 2.0
+"""Largest change of a band from the previous picture, as a multiple of its usual change."""
+LEAST_CHANGE_RATIO = 0.4
+BRIGHTNESS_LEVELS = 2.0
+"""Largest shift of a channel's mean from the reference, in levels of 255."""
+SHARPNESS_SHARE = 0.08
+"""Largest relative change of the mean difference of neighbouring pixels from the reference."""
+MOST_INTERVAL_RATIO = 1.7
+"""Longest interval since the last frame, as a multiple of the usual one."""
 
 
 class OrdinaryPictures:
@@ -87,8 +65,7 @@ class OrdinaryPictures:
     a few numbers.
     """
 
-    def __init__(self, settings: OrdinarySettings | None = None) -> None:
-        self.settings = settings or OrdinarySettings()
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -113,15 +90,15 @@ class OrdinaryPictures:
             self._shape = image.shape
             return self._renew_reference(colour, sharpness, pts_ns)
         change = _change_of_bands(small, before)
-        usual, settings = self._usual, self.settings
+        usual = self._usual
         expected = bool(
-            (change >= np.maximum(LEAST_CHANGE, settings.least_change * usual)).all()
-            and (change <= settings.most_change * usual).all()
+            (change >= np.maximum(LEAST_CHANGE, LEAST_CHANGE_RATIO * usual)).all()
+            and (change <= MOST_CHANGE_RATIO * usual).all()
         )
         self._usual = np.where(usual > 0, usual + USUAL_DECAY * (np.minimum(change, 3 * usual) - usual), change)
         if not (expected and in_time and self._matches_reference(colour, sharpness)):
             return self._renew_reference(colour, sharpness, pts_ns)
-        if pts_ns >= self._referenced_ns + 1e9 * settings.look_every_s:
+        if pts_ns >= self._referenced_ns + 1e9 * LOOK_EVERY_S:
             self._renew_reference(colour, sharpness, pts_ns)
         return True
 
@@ -134,10 +111,7 @@ class OrdinaryPictures:
             return False
         colour_then, sharpness_then = self._reference
         shifted = float(np.abs(colour - colour_then).max())
-        return (
-            shifted <= self.settings.brightness_levels
-            and abs(sharpness - sharpness_then) <= self.settings.sharpness_share * sharpness_then
-        )
+        return shifted <= BRIGHTNESS_LEVELS and abs(sharpness - sharpness_then) <= SHARPNESS_SHARE * sharpness_then
 
     def _in_time(self, pts_ns: int) -> bool:
         last, self._last_ns = self._last_ns, pts_ns
@@ -147,7 +121,7 @@ class OrdinaryPictures:
         if interval <= 0:
             return False
         self._interval_ns = interval if usual == 0 else usual + USUAL_DECAY * (min(interval, 3 * usual) - usual)
-        return usual > 0 and interval <= self.settings.interval_share * usual
+        return usual > 0 and interval <= MOST_INTERVAL_RATIO * usual
 
 
 def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:

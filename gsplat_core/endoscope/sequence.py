@@ -4,7 +4,6 @@ torn.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -12,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import luma
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 SAMPLES = 128
 """Approximate number of sampled rows, and of pixels per row."""
@@ -23,60 +20,36 @@ without noise.
 """
 
 
-@dataclass(frozen=True)
-class SequenceSettings:
-    """Thresholds of unusable pictures. Differences are in levels of 0 to 255.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    black_level: int = 20
-    """Level below which a picture is black, except for `odd_share` of it."""
-    one_colour_levels: int = 3
-    """Deviation from the most frequent colour within which a picture is single-coloured, except for
-    `odd_share` of it.
-    """
-    odd_share: float = 0.03
-    """Tolerated share of other pixels, such as a line of text or a logo."""
-    noise_share: float = 0.5
-    """Difference of neighbouring pixels relative to that of unrelated ones, from which a picture is
-    noise. Tissue has 0.01 to 0.04.
-    """
-    same_levels: int = 2
-    """Largest difference of equal pixels, as caused by re-encoding."""
-    same_share: float = 0.9995
-    """Share of equal pixels from which a picture repeats the previous one."""
-    frozen_s: float = 0.25
-    """Seconds without a new picture after which the stream is frozen; before, frames are
-    duplicates.
-    """
-    frozen_frames: int = 8
-    """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
-    torn_share: float = 0.08
-    """Share of rows, up to the lower edge, equal to the previous picture from which a picture is
-    torn.
-    """
-    moving_share: float = 0.9
-    """Share of frames in which a row must change to be used in the test for torn pictures; excludes
-    black borders and recorder overlays.
-    """
-
-    def __post_init__(self) -> None:
-        share = NumberIn(0.0, 1.0)
-        check_settings(
-            self,
-            black_level=IntegerIn(0, 255),
-            one_colour_levels=IntegerIn(0, 255),
-            odd_share=share,
-            noise_share=NumberIn(0.01, 10.0),
-            same_levels=IntegerIn(0, 255),
-            same_share=share,
-            frozen_s=NumberIn(0.0, 3600.0),
-            frozen_frames=IntegerIn(1, 100_000),
-            torn_share=NumberIn(0.01, 1.0),
-            moving_share=share,
-        )
+BLACK_LEVEL = 20
+"""Level below which a picture is black, except for `odd_share` of it."""
+ONE_COLOUR_LEVELS = 3
+"""Deviation from the most frequent colour within which a picture is single-coloured, except for
+`odd_share` of it.
+"""
+ODD_SHARE = 0.03
+"""Tolerated share of other pixels, such as a line of text or a logo."""
+NOISE_SHARE = 0.5
+"""Difference of neighbouring pixels relative to that of unrelated ones, from which a picture is
+noise. Tissue has 0.01 to 0.04.
+"""
+SAME_LEVELS = 2
+"""Largest difference of equal pixels, as caused by re-encoding."""
+SAME_SHARE = 0.9995
+"""Share of equal pixels from which a picture repeats the previous one."""
+FROZEN_S = 0.25
+"""Seconds without a new picture after which the stream is frozen; before, frames are
+duplicates.
+"""
+FROZEN_FRAMES = 8
+"""Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
+TORN_SHARE = 0.08
+"""Share of rows, up to the lower edge, equal to the previous picture from which a picture is
+torn.
+"""
+MOVING_SHARE = 0.9
+"""Share of frames in which a row must change to be used in the test for torn pictures; excludes
+black borders and recorder overlays.
+"""
 
 
 class SequenceCheck:
@@ -84,8 +57,7 @@ class SequenceCheck:
     row.
     """
 
-    def __init__(self, settings: SequenceSettings | None = None) -> None:
-        self.settings = settings or SequenceSettings()
+    def __init__(self) -> None:
         self._previous: NDArray[np.uint8] | None = None
         self._shape: tuple[int, ...] = ()
         self._new_since_ns = 0
@@ -108,10 +80,10 @@ class SequenceCheck:
             self._row_moves = np.zeros(height)
             self._new_since_ns = pts_ns
             return self._unusable(image, small)
-        _, differs = cv2.threshold(cv2.absdiff(small, previous), self.settings.same_levels, 1, cv2.THRESH_BINARY)
+        _, differs = cv2.threshold(cv2.absdiff(small, previous), SAME_LEVELS, 1, cv2.THRESH_BINARY)
         # Fraction per row, over all channels.
         share = cv2.reduce(differs.reshape(height, -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
-        if share.mean() <= 1 - self.settings.same_share:
+        if share.mean() <= 1 - SAME_SHARE:
             return self._unusable(image, small) or self._repeated(pts_ns)
         self._new_since_ns, self._same_run = pts_ns, 0
         changed = share > 0.01
@@ -123,14 +95,13 @@ class SequenceCheck:
         return self._unusable(image, small) or ("torn" if torn else None)
 
     def _unusable(self, image: NDArray[np.uint8], small: NDArray[np.uint8]) -> str | None:
-        settings = self.settings
         levels = cv2.calcHist([luma(small)], [0], None, [256], [0, 256]).ravel()
         pixels = small.shape[0] * small.shape[1]
-        if levels[settings.black_level :].sum() <= settings.odd_share * pixels:
+        if levels[BLACK_LEVEL:].sum() <= ODD_SHARE * pixels:
             return "black"
         if self._one_grey(levels, pixels) and self._one_colour(small):
             return "one colour"
-        if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > settings.noise_share:
+        if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > NOISE_SHARE:
             return "noise"
         return None
 
@@ -139,21 +110,21 @@ class SequenceCheck:
         comparing colours.
         """
         # One more level on either side, since grey is rounded.
-        wide = min(2 * self.settings.one_colour_levels + 3, len(levels))
+        wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
         below = np.append(0, levels.cumsum())
-        return bool((below[wide:] - below[:-wide]).max() >= (1 - self.settings.odd_share) * pixels)
+        return bool((below[wide:] - below[:-wide]).max() >= (1 - ODD_SHARE) * pixels)
 
     def _one_colour(self, small: NDArray[np.uint8]) -> bool:
-        levels = self.settings.one_colour_levels
+        levels = ONE_COLOUR_LEVELS
         most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
         of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
-        return cv2.countNonZero(of_it) >= (1 - self.settings.odd_share) * of_it.size
+        return cv2.countNonZero(of_it) >= (1 - ODD_SHARE) * of_it.size
 
     def _repeated(self, pts_ns: int) -> str:
         self._same_run += 1
         without_new_s = (pts_ns - self._new_since_ns) * 1e-9
-        long = self._same_run >= 2 and without_new_s >= self.settings.frozen_s
-        return "frozen" if long or self._same_run >= self.settings.frozen_frames else "duplicate"
+        long = self._same_run >= 2 and without_new_s >= FROZEN_S
+        return "frozen" if long or self._same_run >= FROZEN_FRAMES else "duplicate"
 
     def _torn(self, small: NDArray[np.uint8], changed: NDArray[np.bool_]) -> bool:
         """Return True if the lowest rows are those of the previous picture or single-coloured,
@@ -161,13 +132,13 @@ class SequenceCheck:
         """
         if self._frames_seen < 5:
             return False
-        moving = np.flatnonzero(self._row_moves >= self.settings.moving_share)
-        level = 2 * self.settings.one_colour_levels
+        moving = np.flatnonzero(self._row_moves >= MOVING_SHARE)
+        level = 2 * ONE_COLOUR_LEVELS
         if not len(moving) or (changed[moving[-1]] and np.ptp(small[moving[-1], ::4], axis=0).max() > level):
             # The lowest changing row is new and has content, so no row above is stale.
             return False
         flat = np.ptp(small[:, ::4], axis=1).max(axis=1) <= level
-        least = max(3, round(self.settings.torn_share * len(small)))
+        least = max(3, round(TORN_SHARE * len(small)))
         for stale in (~changed, flat & changed):
             # Count upwards from the lowest changing row; all changing rows must be stale.
             rows = moving[::-1]

@@ -29,8 +29,6 @@ from gsplat_core.endoscope.reduced import (
     sampled,
     sampled_mask,
 )
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 SIDE_PX = 320
 """Approximate longer side of the subsampled picture for measuring sharpness, in pixels."""
@@ -43,49 +41,26 @@ DARK = 28
 """Level below which pixels are ignored as noise or outside the field of view."""
 
 
-@dataclass(frozen=True)
-class SharpnessSettings:
-    """Thresholds for withholding a frame, relative to usual values.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    blurred_below: float = 0.75
-    """Relative sharpness below which a frame is blurred."""
-    sharp_above: float = 0.82
-    """Relative sharpness from which a frame after a blurred one is sharp again."""
-    smoke_contrast: float = 0.75
-    """Relative contrast below which a frame may be smoky."""
-    smoke_saturation: float = 0.8
-    """Relative saturation below which a frame may be smoky."""
-    smoke_haze: float = 15.0
-    """Increase of the haze level required for smoke."""
-    clear_above: float = 0.87
-    """Relative contrast or saturation above which a frame after smoke is clear again."""
-    recent_s: float = 1.5
-    """Window in seconds of the usual sharpness (median). Blur is withheld for at most half of it.
-    Smoke that lasts longer becomes the usual state.
-    """
-    recent_frames: int = 5
-    """Smallest number of frames for the median, for low frame rates. All frames pass before."""
-    clear_frames: int = 300
-    """Number of good frames for the usual contrast, saturation and haze (medians)."""
-
-    def __post_init__(self) -> None:
-        share, count = NumberIn(0.01, 1.0), IntegerIn(1, 100_000)
-        check_settings(
-            self,
-            blurred_below=share,
-            sharp_above=share,
-            smoke_contrast=share,
-            smoke_saturation=share,
-            smoke_haze=NumberIn(0.0, 255.0),
-            clear_above=share,
-            recent_s=NumberIn(0.01, 60.0),
-            recent_frames=count,
-            clear_frames=count,
-        )
+BLURRED_BELOW = 0.75
+"""Relative sharpness below which a frame is blurred."""
+SHARP_ABOVE = 0.82
+"""Relative sharpness from which a frame after a blurred one is sharp again."""
+SMOKE_CONTRAST = 0.75
+"""Relative contrast below which a frame may be smoky."""
+SMOKE_SATURATION = 0.8
+"""Relative saturation below which a frame may be smoky."""
+SMOKE_HAZE = 15.0
+"""Increase of the haze level required for smoke."""
+CLEAR_ABOVE = 0.87
+"""Relative contrast or saturation above which a frame after smoke is clear again."""
+RECENT_S = 1.5
+"""Window in seconds of the usual sharpness (median). Blur is withheld for at most half of it.
+Smoke that lasts longer becomes the usual state.
+"""
+RECENT_FRAMES = 5
+"""Smallest number of frames for the median, for low frame rates. All frames pass before."""
+CLEAR_FRAMES = 300
+"""Number of good frames for the usual contrast, saturation and haze (medians)."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +82,8 @@ class Appearance:
 class SharpnessGate:
     """Comparison of each frame of a stream with the usual values, in constant memory."""
 
-    def __init__(self, settings: SharpnessSettings | None = None) -> None:
-        self.settings = settings or SharpnessSettings()
-        self._clear: NDArray[np.float64] = np.empty((self.settings.clear_frames, 3))
+    def __init__(self) -> None:
+        self._clear: NDArray[np.float64] = np.empty((CLEAR_FRAMES, 3))
         """Ring buffer of contrast, saturation and haze of good frames."""
         self.start_scene()
 
@@ -140,21 +114,21 @@ class SharpnessGate:
         self._last_ns = pts_ns
         # Bound the interval: a gap must not dominate the median, and a constant clock must not stop
         # the window.
-        elapsed_s = min(max(elapsed_s, 1e-3), self.settings.recent_s / self.settings.recent_frames)
+        elapsed_s = min(max(elapsed_s, 1e-3), RECENT_S / RECENT_FRAMES)
         seen = appearance(image, kept)
         self._unseen_s = 0.0 if seen is not None else self._unseen_s + elapsed_s
         if seen is None:
-            if self._unseen_s > self.settings.recent_s:
+            if self._unseen_s > RECENT_S:
                 self._fault = None
             return self._fault
         clear = np.array([seen.contrast, seen.saturation, seen.haze])
-        if len(self._recent) >= self.settings.recent_frames:
+        if len(self._recent) >= RECENT_FRAMES:
             rows, columns = self._usual_sharpness()
             self._fault = self._judged(min(seen.rows / rows, seen.columns / columns), clear)
         self._remember(elapsed_s, seen)
         if self._fault == "smoke":
             self._smoke_s += elapsed_s
-            if self._smoke_s > self.settings.recent_s:
+            if self._smoke_s > RECENT_S:
                 self._clear_count = 0
         else:
             self._smoke_s = 0.0
@@ -167,9 +141,7 @@ class SharpnessGate:
         """Append the frame's sharpness and drop frames outside the window."""
         self._recent.append((elapsed_s, seen.rows, seen.columns))
         together_s = sum(each[0] for each in self._recent)
-        while (
-            len(self._recent) > self.settings.recent_frames and together_s - self._recent[0][0] > self.settings.recent_s
-        ):
+        while len(self._recent) > RECENT_FRAMES and together_s - self._recent[0][0] > RECENT_S:
             together_s -= self._recent.popleft()[0]
 
     def _usual_sharpness(self) -> tuple[float, float]:
@@ -184,18 +156,17 @@ class SharpnessGate:
 
     def _judged(self, sharpness: float, clear: NDArray[np.float64]) -> str | None:
         """Judge a frame by its relative sharpness, and its contrast, saturation and haze."""
-        settings = self.settings
         known = min(self._clear_count, len(self._clear))
         usual = np.maximum(np.partition(self._clear[:known], known // 2, axis=0)[known // 2], 1e-6)
         contrast, saturation = (float(share) for share in (clear / usual)[:2])
         if self._fault == "smoke":
-            smoke = max(contrast, saturation) < settings.clear_above
+            smoke = max(contrast, saturation) < CLEAR_ABOVE
         else:
-            pale = contrast < settings.smoke_contrast and saturation < settings.smoke_saturation
-            smoke = pale and float(clear[2] - usual[2]) >= settings.smoke_haze
+            pale = contrast < SMOKE_CONTRAST and saturation < SMOKE_SATURATION
+            smoke = pale and float(clear[2] - usual[2]) >= SMOKE_HAZE
         if smoke:
             return "smoke"
-        limit = settings.sharp_above if self._fault == "blur" else settings.blurred_below
+        limit = SHARP_ABOVE if self._fault == "blur" else BLURRED_BELOW
         return "blur" if sharpness < limit else None
 
 

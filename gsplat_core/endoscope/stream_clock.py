@@ -10,42 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
-
 OUT_OF_ORDER = "out of order"
 CLOCK_JUMP = "clock jump"
 GAP = "gap"
 REPEATED_TIME = "repeated time"
 
 
-@dataclass(frozen=True)
-class ClockSettings:
-    """Thresholds of timestamp steps.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    longest_step_s: float = 10.0
-    """Forward step in seconds above which the clock jumped, if arrival times are unknown."""
-    arrival_agrees_s: float = 1.0
-    """Largest difference in seconds between a forward step and the difference of arrival times."""
-    late_frames: int = 4
-    """Consecutive frames earlier than the newest one from which the clock was set back; fewer are
-    late frames.
-    """
-    gap_intervals: float = 4.0
-    """Step in usual intervals above which a gap is reported."""
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            longest_step_s=NumberIn(0.01, 1e6),
-            arrival_agrees_s=NumberIn(0.0, 1e6),
-            late_frames=IntegerIn(1, 10_000),
-            gap_intervals=NumberIn(1.0, 1e6),
-        )
+LONGEST_STEP_S = 10.0
+"""Forward step in seconds above which the clock jumped, if arrival times are unknown."""
+ARRIVAL_AGREES_S = 1.0
+"""Largest difference in seconds between a forward step and the difference of arrival times."""
+LATE_FRAMES = 4
+"""Consecutive frames earlier than the newest one from which the clock was set back; fewer are
+late frames.
+"""
+GAP_INTERVALS = 4.0
+"""Step in usual intervals above which a gap is reported."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +41,7 @@ class Timing:
 class StreamClock:
     """Timestamp correction of a stream, called for each frame."""
 
-    def __init__(self, settings: ClockSettings | None = None) -> None:
-        self.settings = settings or ClockSettings()
+    def __init__(self) -> None:
         self._offset_ns = 0
         self._given_ns: int | None = None
         """Original timestamp of the newest frame."""
@@ -84,7 +63,7 @@ class StreamClock:
         step_ns = pts_ns - self._given_ns
         if step_ns < 0:
             self._late = [*self._late, pts_ns] if not self._late or pts_ns > self._late[-1] else [pts_ns]
-            if len(self._late) < self.settings.late_frames:
+            if len(self._late) < LATE_FRAMES:
                 return Timing(self._shown_ns, OUT_OF_ORDER)
             return self._jump(pts_ns, arrived_ns)
         if self._too_far(step_ns, arrived_ns):
@@ -92,7 +71,7 @@ class StreamClock:
         finding = None
         if step_ns == 0:
             finding = REPEATED_TIME
-        elif self._steps and step_ns > self.settings.gap_intervals * self._usual_ns():
+        elif self._steps and step_ns > GAP_INTERVALS * self._usual_ns():
             finding = GAP
         else:
             self._steps.append(step_ns)
@@ -103,8 +82,8 @@ class StreamClock:
             ahead_ns = step_ns - (arrived_ns - self._arrived_ns)
             # After a stall frames arrive faster than they were captured, so only a step that is
             # long in itself is a jump.
-            return ahead_ns > self.settings.arrival_agrees_s * 1e9 and step_ns > self.settings.arrival_agrees_s * 1e9
-        return step_ns > self.settings.longest_step_s * 1e9
+            return ahead_ns > ARRIVAL_AGREES_S * 1e9 and step_ns > ARRIVAL_AGREES_S * 1e9
+        return step_ns > LONGEST_STEP_S * 1e9
 
     def _jump(self, pts_ns: int, arrived_ns: int | None) -> Timing:
         passed_ns = self._usual_ns()

@@ -7,15 +7,11 @@ the border is that of a strip, which extends to the border. Dense strong constan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import enlarged, luma
-from gsplat_core.endoscope.setting_ranges import check_settings
-from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 LONG_SIDE_PX = 800
 """Longest side in pixels above which pictures are subsampled."""
@@ -23,55 +19,30 @@ SMALLEST_PX = 64
 """Minimum height and width in pixels; smaller pictures are not examined."""
 
 
-@dataclass(frozen=True)
-class StripSettings:
-    """Thresholds of drawn elements.
-
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
-
-    band: float = 0.08
-    """Width of the examined band at each border, as a share of the picture's height or width."""
-    every: int = 4
-    """Number of frames in which all four borders are examined in turn."""
-    first_after: int = 10
-    """Number of examined rounds between decisions."""
-    remembered: int = 40
-    """Time constant of the temporal means, in rounds."""
-    edge_levels: float = 10.0
-    """Smallest step of a strip's edge, in levels."""
-    edge_steadiness: float = 2.5
-    """Smallest ratio of this step to its mean temporal deviation."""
-    edge_share: float = 0.15
-    """Smallest length of an unbroken edge, as a share of the border."""
-    whole_share: float = 0.6
-    """Visible share of the border from which a strip is extended along all of it."""
-    text_levels: float = 25.0
-    """Smallest step of text, in levels."""
-    text_steadiness: float = 5.0
-    """Smallest ratio of this step to its mean temporal deviation."""
-    text_length: float = 0.02
-    """Smallest extent of text as a share of the longer side of the band; a third of it in the other
-    direction.
-    """
-
-    def __post_init__(self) -> None:
-        share, count, levels = NumberIn(0.001, 0.5), IntegerIn(1, 10_000), NumberIn(0.1, 255.0)
-        check_settings(
-            self,
-            band=share,
-            every=count,
-            first_after=count,
-            remembered=count,
-            edge_levels=levels,
-            edge_steadiness=levels,
-            edge_share=NumberIn(0.01, 1.0),
-            whole_share=NumberIn(0.01, 1.0),
-            text_levels=levels,
-            text_steadiness=levels,
-            text_length=share,
-        )
+BAND_SHARE = 0.08
+"""Width of the examined band at each border, as a share of the picture's height or width."""
+EXAMINE_EVERY = 4
+"""Number of frames in which all four borders are examined in turn."""
+DECIDE_EVERY = 10
+"""Number of examined rounds between decisions."""
+REMEMBERED_FRAMES = 40
+"""Time constant of the temporal means, in rounds."""
+EDGE_LEVELS = 10.0
+"""Smallest step of a strip's edge, in levels."""
+EDGE_STEADINESS = 2.5
+"""Smallest ratio of this step to its mean temporal deviation."""
+EDGE_SHARE = 0.15
+"""Smallest length of an unbroken edge, as a share of the border."""
+WHOLE_SHARE = 0.6
+"""Visible share of the border from which a strip is extended along all of it."""
+TEXT_LEVELS = 25.0
+"""Smallest step of text, in levels."""
+TEXT_STEADINESS = 5.0
+"""Smallest ratio of this step to its mean temporal deviation."""
+TEXT_LENGTH = 0.02
+"""Smallest extent of text as a share of the longer side of the band; a third of it in the other
+direction.
+"""
 
 
 class StripDetector:
@@ -79,8 +50,7 @@ class StripDetector:
     border.
     """
 
-    def __init__(self, settings: StripSettings | None = None) -> None:
-        self.settings = settings or StripSettings()
+    def __init__(self) -> None:
         self.mask: NDArray[np.uint8] | None = None
         """Mask uint8 [H, W], 0 on strips and text; None without any. Read-only, and the same array
         until it changes.
@@ -99,11 +69,11 @@ class StripDetector:
             self._start(image.shape)
         if self._bands:
             some = image[:: self._step, :: self._step]
-            turn, slice_of = divmod(self._frames, self.settings.every)
+            turn, slice_of = divmod(self._frames, EXAMINE_EVERY)
             # One border per frame, to distribute the cost evenly.
-            for band in self._bands[slice_of :: self.settings.every]:
-                band.add(some, self.settings)
-            if slice_of == self.settings.every - 1 and (turn + 1) % self.settings.first_after == 0:
+            for band in self._bands[slice_of::EXAMINE_EVERY]:
+                band.add(some)
+            if slice_of == EXAMINE_EVERY - 1 and (turn + 1) % DECIDE_EVERY == 0:
                 self._decide()
         self._frames += 1
         return self.mask
@@ -115,13 +85,13 @@ class StripDetector:
         if min(shape[:2]) >= SMALLEST_PX:
             height, width = (-(-side // self._step) for side in shape[:2])
             self._small = (height, width)
-            depths = [max(8, round(self.settings.band * side)) for side in self._small]
+            depths = [max(8, round(BAND_SHARE * side)) for side in self._small]
             self._bands = [_Band(turns, depths[turns % 2]) for turns in range(4)]
 
     def _decide(self) -> None:
         drawn = np.zeros(self._small, bool)
         for band in self._bands:
-            band.mark(drawn, self.settings)
+            band.mark(drawn)
         # Require two decisions in a row, so that resting tissue is not taken for a strip.
         before, self._before = self._before, drawn
         found = (
@@ -151,7 +121,7 @@ class _Band:
         """Return a view of the band in a picture."""
         return np.rot90(plane, self._turns)[-self._depth_px :]
 
-    def add(self, image: NDArray[np.uint8], settings: StripSettings) -> None:
+    def add(self, image: NDArray[np.uint8]) -> None:
         """Add a frame to the means."""
         grey = luma(np.ascontiguousarray(self._of(image))).astype(np.float32)
         gradient = np.zeros((2, *grey.shape), np.float32)
@@ -161,25 +131,23 @@ class _Band:
         if self._mean is None:
             self._mean, self._deviation = gradient, np.zeros_like(gradient)
             return
-        share = 1 / min(self._count, settings.remembered)
+        share = 1 / min(self._count, REMEMBERED_FRAMES)
         difference = gradient - self._mean
         self._mean += share * difference
         self._deviation += share * (np.abs(difference) - self._deviation)
 
-    def mark(self, drawn: NDArray[np.bool_], settings: StripSettings) -> None:
+    def mark(self, drawn: NDArray[np.bool_]) -> None:
         """Mark drawn pixels near this border in a plane [H, W]."""
         if self._mean is None:
             return
         strength = np.abs(self._mean)
         steadiness = strength / (self._deviation + 1.0)
-        self._of(drawn)[:] |= self._strips(strength[0], steadiness[0], settings) | _text(strength, steadiness, settings)
+        self._of(drawn)[:] |= self._strips(strength[0], steadiness[0]) | _text(strength, steadiness)
 
-    def _strips(
-        self, strength: NDArray[np.float32], steadiness: NDArray[np.float32], settings: StripSettings
-    ) -> NDArray[np.bool_]:
-        edges = (strength >= settings.edge_levels) & (steadiness >= settings.edge_steadiness)
+    def _strips(self, strength: NDArray[np.float32], steadiness: NDArray[np.float32]) -> NDArray[np.bool_]:
+        edges = (strength >= EDGE_LEVELS) & (steadiness >= EDGE_STEADINESS)
         depth, length = edges.shape
-        least = round(settings.edge_share * length)
+        least = round(EDGE_SHARE * length)
         # Join an edge that is tilted by a pixel or interrupted by letters.
         joined = cv2.morphologyEx(
             cv2.dilate(edges.astype(np.uint8), np.ones((3, 1), np.uint8)), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8)
@@ -187,17 +155,17 @@ class _Band:
         runs = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((1, max(3, least)), np.uint8))
         seen = runs.any(axis=0)
         first = np.where(seen, runs.argmax(axis=0), depth)
-        if seen.mean() >= settings.whole_share:
+        if seen.mean() >= WHOLE_SHARE:
             # The rest of its edge is indistinguishable from the background.
             first = np.where(seen, first, int(np.median(first[seen])))
         return np.arange(depth)[:, None] >= first
 
 
-def _text(strength: NDArray[np.float32], steadiness: NDArray[np.float32], settings: StripSettings) -> NDArray[np.bool_]:
-    steady = ((strength >= settings.text_levels) & (steadiness >= settings.text_steadiness)).any(axis=0)
+def _text(strength: NDArray[np.float32], steadiness: NDArray[np.float32]) -> NDArray[np.bool_]:
+    steady = ((strength >= TEXT_LEVELS) & (steadiness >= TEXT_STEADINESS)).any(axis=0)
     joined = cv2.morphologyEx(np.asarray(steady, np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
-    least = settings.text_length * max(steady.shape)
+    least = TEXT_LENGTH * max(steady.shape)
     wide = statistics[:, cv2.CC_STAT_WIDTH] >= least
     high = statistics[:, cv2.CC_STAT_HEIGHT] >= max(3.0, least / 3)
     dense = (

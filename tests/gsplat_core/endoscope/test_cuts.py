@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope import cuts
-from gsplat_core.endoscope.cuts import CutDetector, CutSettings, FrameRate
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope.cuts import CutDetector, FrameRate
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
 
 OTHERS = list(itertools.permutations(PLACES, 2))
@@ -113,7 +112,7 @@ def test_another_size_is_a_new_scene_at_once():
 
 
 def test_another_frame_rate_is_a_new_scene_and_lost_frames_are_not():
-    rate = FrameRate(1.4, 15)
+    rate = FrameRate()
     every = [rate.changed(k, k * 40) for k in range(60)]
     lossy = [rate.changed(60 + 3 * k, 2400 + 120 * k) for k in range(40)]
     assert not any(every) and not any(lossy)
@@ -122,7 +121,7 @@ def test_another_frame_rate_is_a_new_scene_and_lost_frames_are_not():
 
 
 def test_an_unsteady_clock_is_no_other_frame_rate():
-    rate, rng, now = FrameRate(1.4, 15), np.random.default_rng(0), 0
+    rate, rng, now = FrameRate(), np.random.default_rng(0), 0
     found = []
     for k in range(500):
         now += int(rng.choice([10, 40, 40, 80]))
@@ -143,16 +142,12 @@ def test_no_picture_of_any_size_raises(height, width, seed):
             detector.skip()
 
 
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="same_moved"):
-        CutSettings(same_moved=1.2)
-
-
 @pytest.mark.parametrize(
     ("usual", "now", "is_other"), [(10, 14, False), (10, 15, True), (14, 10, False), (14, 9, True), (10, 10, False)]
 )
-def test_a_rate_is_another_one_beyond_a_factor_of_1_4(usual, now, is_other):
-    rate, seq, at = FrameRate(1.4, 3), 0, 0
+def test_a_rate_is_another_one_beyond_a_factor_of_1_4(usual, now, is_other, monkeypatch):
+    monkeypatch.setattr(cuts, "RATE_FRAMES", 3)
+    rate, seq, at = FrameRate(), 0, 0
     said = [rate.changed(seq, at)]
     for interval in [usual] * 3 + [now] * 3:
         seq, at = seq + 1, at + interval

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope import exposure
-from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator, ExposureSettings
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator
 from tests.gsplat_core.endoscope.clips import FRAME_NS, brightened, clip, texture
 
 STILL = ["cutting", "heart"]
@@ -166,11 +165,6 @@ def test_no_picture_of_any_size_raises_or_gives_a_wild_gain(height, width, seed)
         kept = rng.integers(0, 2, (height, width), np.uint8) if rng.random() < 0.5 else None
         gains = estimator.observe(image, kept, int(rng.integers(-(2**60), 2**60)))
         assert all(1 / 8.001 < gain < 8.001 for gain in gains)
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="dead_zone"):
-        ExposureSettings(dead_zone=0.0)
 
 
 def estimator_of(monkeypatch, found, same=(10.0, 10.0), **fields):

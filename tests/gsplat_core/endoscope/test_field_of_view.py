@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.field_of_view import FieldOfView, FieldOfViewSettings
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope import field_of_view
+from gsplat_core.endoscope.field_of_view import FieldOfView
 from tests.gsplat_core.endoscope.clips import clip, texture
 
 HEIGHT, WIDTH = 256, 320
@@ -29,8 +29,8 @@ def seen_through(field, seed=1, count=40, level=5):
     return images
 
 
-def masks(images, settings=None):
-    view = FieldOfView(settings)
+def masks(images):
+    view = FieldOfView()
     return [view.observe(image) for image in images]
 
 
@@ -198,14 +198,11 @@ def test_a_dark_surrounding_of_the_tissue_is_no_field(recordings_dir, name):
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
-    view = FieldOfView(FieldOfViewSettings(window_frames=2))
-    for _ in range(7):
-        image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
-        image[:, : rng.integers(0, width)] = 0
-        mask = view.observe(image)
-        assert mask is None or mask.shape == (height, width)
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="window_frames"):
-        FieldOfViewSettings(window_frames=0)
+    view = FieldOfView()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(field_of_view, "WINDOW_FRAMES", 2)
+        for _ in range(7):
+            image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
+            image[:, : rng.integers(0, width)] = 0
+            mask = view.observe(image)
+            assert mask is None or mask.shape == (height, width)

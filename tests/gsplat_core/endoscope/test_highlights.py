@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.highlights import HighlightSettings, without_highlights
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope.highlights import without_highlights
 from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
 
 SPOTS = [(40, 50, 6), (90, 100, 3), (120, 20, 9)]
@@ -100,11 +99,6 @@ def test_long_pictures_are_no_exception(shape):
     image[shape[0] // 2, shape[1] // 2] = 255
     kept = without_highlights(image)
     assert kept is None or kept.shape == shape
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="most"):
-        HighlightSettings(most=2.0)
 
 
 def spotted(colour, tissue=(200, 150, 150), size=(256, 320), side=9):

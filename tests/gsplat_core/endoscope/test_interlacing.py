@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.interlacing import Deinterlacer, InterlacingSettings, comb_share, without_combs
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope import interlacing
+from gsplat_core.endoscope.interlacing import Deinterlacer, comb_share, without_combs
 from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
-
-DEFAULTS = InterlacingSettings()
 
 
 def woven(images):
@@ -34,7 +32,7 @@ def test_progressive_video_is_not_touched(recordings_dir, name):
     deinterlacer = Deinterlacer()
     for image in clip(recordings_dir, name):
         assert deinterlacer.process(image) is image
-        assert comb_share(image, DEFAULTS) == 0
+        assert comb_share(image) == 0
 
 
 @pytest.mark.recordings
@@ -54,7 +52,7 @@ def test_where_nothing_moves_interlaced_video_keeps_its_lines():
     for image in images:
         image[:, :160] = images[0][:, :160]
     image = woven(images)[10]
-    changed = (without_combs(image, DEFAULTS.stand_out_levels) != image).any(axis=2)
+    changed = (without_combs(image) != image).any(axis=2)
     assert changed[:, 170:].mean() > 5 * changed[:, :150].mean()
 
 
@@ -75,12 +73,13 @@ def test_sensor_noise_is_no_comb():
     rng = np.random.default_rng(0)
     for image in texture(3, 20, 320, 256):
         noisy = np.clip(image + rng.normal(0, 12, image.shape), 0, 255).astype(np.uint8)
-        assert comb_share(noisy, DEFAULTS) < DEFAULTS.comb_share
+        assert comb_share(noisy) < interlacing.COMB_SHARE
 
 
-def test_a_stream_that_has_become_progressive_is_left_alone_again():
+def test_a_stream_that_has_become_progressive_is_left_alone_again(monkeypatch):
+    monkeypatch.setattr(interlacing, "FORGOTTEN_FRAMES", 15)
     images = [np.roll(image, 5 * k, axis=1) for k, image in enumerate(texture(4, 30, 320, 256))]
-    deinterlacer = Deinterlacer(InterlacingSettings(forgotten_frames=15))
+    deinterlacer = Deinterlacer()
     for image in woven(images):
         deinterlacer.process(image)
     assert deinterlacer.interlaced
@@ -92,17 +91,14 @@ def test_a_stream_that_has_become_progressive_is_left_alone_again():
 @given(st.integers(1, 70), st.integers(1, 70), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
-    deinterlacer = Deinterlacer(InterlacingSettings(combed_frames=1))
-    for k in range(4):
-        image = rng.integers(0, 256, (height, width, 3), np.uint8)
-        image[1::2] //= 1 + k
-        assert deinterlacer.process(image).shape == image.shape
-        assert without_combs(cv2.flip(image, 1), 0).shape == image.shape
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="comb_ratio"):
-        InterlacingSettings(comb_ratio=0.5)
+    deinterlacer = Deinterlacer()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interlacing, "COMBED_FRAMES", 1)
+        for k in range(4):
+            image = rng.integers(0, 256, (height, width, 3), np.uint8)
+            image[1::2] //= 1 + k
+            assert deinterlacer.process(image).shape == image.shape
+            assert without_combs(cv2.flip(image, 1)).shape == image.shape
 
 
 def lines(amplitude, slope=0, rows=34, columns=128):
@@ -114,18 +110,18 @@ def lines(amplitude, slope=0, rows=34, columns=128):
 
 @pytest.mark.parametrize(("amplitude", "share"), [(4, 0.0), (6, 0.5), (60, 0.5)])
 def test_the_share_of_combs_is_that_of_the_picture_with_visible_combs(amplitude, share):
-    assert comb_share(lines(amplitude), DEFAULTS) == share
+    assert comb_share(lines(amplitude)) == share
 
 
 @pytest.mark.parametrize(("slope", "share"), [(4, 0.5), (6, 0.0)])
 def test_a_vertical_gradient_hides_combs_that_are_weaker_than_it(slope, share):
     """Lines two apart differ by twice the slope, and neighbouring lines by the amplitude on average."""
-    assert comb_share(lines(12, slope), DEFAULTS) == share
+    assert comb_share(lines(12, slope)) == share
 
 
 @pytest.mark.parametrize(("rows", "columns", "share"), [(33, 128, 0.0), (34, 60, 0.0), (34, 64, 0.5)])
 def test_a_picture_of_less_than_two_blocks_has_no_combs(rows, columns, share):
-    assert comb_share(lines(60, 0, rows, columns), DEFAULTS) == share
+    assert comb_share(lines(60, 0, rows, columns)) == share
 
 
 @pytest.mark.parametrize(("combed", "interlaced"), [((0, 4, 8), False), ((0, 4, 8, 11), True), ((0, 4, 8, 12), False)])
@@ -150,7 +146,7 @@ def test_a_pixel_that_stands_out_from_both_lines_is_replaced_with_two_beside_it(
     image[5, 17:24] = 113
     image[5, 20] = 130
     image[8, 20] = 200
-    repaired = without_combs(image, 4)
+    repaired = without_combs(image)
     assert repaired[5, 16:25, 0].tolist() == [100, 113, 105, 105, 105, 105, 105, 113, 100]
     untouched = np.ones(image.shape, bool)
     untouched[5, 18:23] = untouched[[7, 9], 18:23] = False
@@ -162,4 +158,4 @@ def test_a_pixel_that_stands_out_from_both_lines_is_replaced_with_two_beside_it(
 def test_an_excess_over_both_lines_must_exceed_the_limit(sign, levels, replaced):
     image = np.full((9, 20, 3), 100, np.uint8)
     image[3, 10] = 100 + sign * levels
-    assert (without_combs(image, 4)[3, 10, 0] == 100) == replaced
+    assert (without_combs(image)[3, 10, 0] == 100) == replaced

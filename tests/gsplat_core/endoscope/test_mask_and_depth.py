@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskAndDepthSettings, MaskCheck
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskCheck
 
 
 def mask(tool_columns, size=40):
@@ -80,8 +79,3 @@ def test_nothing_raises(height, width, dtype, seed):
     found = DepthCheck().checked(depth)
     assert found.depth is None or np.isfinite(found.depth).all()
     MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8))
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="usual_depth_ratio"):
-        MaskAndDepthSettings(usual_depth_ratio=1.0)

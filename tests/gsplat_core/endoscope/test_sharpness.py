@@ -11,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope import sharpness
-from gsplat_core.endoscope.sharpness import Appearance, SharpnessGate, SharpnessSettings, appearance
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope.sharpness import Appearance, SharpnessGate, appearance
 from gsplat_core.io.recordings import open_recording
 from tests.gsplat_core.endoscope.clips import PLACES, brightened, clip, texture
 
 
-def faults(images, kept=None, settings=None, fps=30.0):
-    gate = SharpnessGate(settings)
+def faults(images, kept=None, fps=30.0):
+    gate = SharpnessGate()
     return [gate.fault(image, round(k * 1e9 / fps), kept) for k, image in enumerate(images)]
 
 
@@ -204,15 +203,13 @@ def test_what_is_left_out_does_not_count():
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
-    gate = SharpnessGate(SharpnessSettings(recent_frames=1, clear_frames=2))
-    for k in range(6):
-        image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
-        gate.fault(image, k, rng.integers(0, 2, (height, width), np.uint8) if rng.random() < 0.5 else None)
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="blurred_below"):
-        SharpnessSettings(blurred_below=0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sharpness, "RECENT_FRAMES", 1)
+        patch.setattr(sharpness, "CLEAR_FRAMES", 2)
+        gate = SharpnessGate()
+        for k in range(6):
+            image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
+            gate.fault(image, k, rng.integers(0, 2, (height, width), np.uint8) if rng.random() < 0.5 else None)
 
 
 @pytest.mark.parametrize(

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.strip import StripDetector, StripSettings
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.endoscope import strip
+from gsplat_core.endoscope.strip import StripDetector
 from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
 
 HEIGHT, WIDTH = 256, 320
 FRAMES = 2 * 10 * 4 + 4
 
 
-def last_mask(images, options=None):
-    detector = StripDetector(options)
+def last_mask(images):
+    detector = StripDetector()
     for image in images:
         detector.observe(image)
     return detector.mask
@@ -107,13 +107,11 @@ def test_a_recorder_with_text_over_a_beating_heart_is_found(recordings_dir):
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
-    detector = StripDetector(StripSettings(every=1, first_after=2))
     image = rng.integers(0, 256, (height, width, 3), np.uint8)
-    for _ in range(8):
-        mask = detector.observe(image if rng.random() < 0.8 else image[:, ::-1])
-        assert mask is None or mask.shape == (height, width)
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InvalidSetting, match="band"):
-        StripSettings(band=0.9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(strip, "EXAMINE_EVERY", 1)
+        patch.setattr(strip, "DECIDE_EVERY", 2)
+        detector = StripDetector()
+        for _ in range(8):
+            mask = detector.observe(image if rng.random() < 0.8 else image[:, ::-1])
+            assert mask is None or mask.shape == (height, width)

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.ordinary import OrdinarySettings
 from operators.checks import (
     PICTURE_STAGES,
     OrdinaryFrames,
@@ -83,8 +82,6 @@ class Calm(OrdinaryStream):
     """Every frame but the first is ordinary."""
 
     class Pictures:
-        settings = OrdinarySettings()
-
         def reset(self):
             self.calls = 0
 
