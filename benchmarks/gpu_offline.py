@@ -6,7 +6,7 @@
 
 `Reconstructor.fit` as `intrasplat reconstruct` calls it: `ReconstructorConfig.offline`, the same settings for every recording, the
 protocol's held-out frames never trained on. `--steps` is the number of optimiser steps; with `--seconds` it is what fits into that time on an
-idle device: the start and the fastest stretch of a short run before say how many. Each `--set` is a run with other values of `ReconstructorConfig` or `FitSettings`. One JSON line for each moment that is evaluated: seconds of training so far (loading, warm-up of the
+idle device: the start and the fastest stretch of a short run before say how many. Each `--set` is a run with other values of `ReconstructorConfig`. One JSON line for each moment that is evaluated: seconds of training so far (loading, warm-up of the
 kernels and evaluation not counted), mean and worst tissue PSNR over the held-out frames, and over as many training frames.
 """
 
@@ -28,7 +28,6 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.offline import FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.replay import ReplaySettings
 
@@ -67,23 +66,10 @@ def quality(learning: Reconstructor, frames: list[Frame], camera: Camera) -> tup
     return sum(values) / len(values), min(values)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Settings of a training run."""
-
-    config: ReconstructorConfig
-    fit: FitSettings
-
-    def changed(self, values: str) -> Settings:
-        """Return settings changed by one `--set` value: name=value,…"""
-        config, fit = self.config, self.fit
-        for one in filter(None, values.split(",")):
-            name, value = one.split("=")
-            if hasattr(config, name):
-                config = replace(config, **{name: json.loads(value)})
-            else:
-                fit = replace(fit, **{name: json.loads(value)})
-        return Settings(config, fit)
+def changed(config: ReconstructorConfig, values: str) -> ReconstructorConfig:
+    """Return settings changed by one `--set` value: name=value,…"""
+    pairs = (one.split("=") for one in values.split(",") if one)
+    return replace(config, **{name: json.loads(value) for name, value in pairs})
 
 
 def split(frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
@@ -91,13 +77,15 @@ def split(frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
     return [each for each in frames if not is_heldout(each.seq)], [each for each in frames if is_heldout(each.seq)]
 
 
-def steps_within(seconds: float, frames: list[Frame], camera: Camera, settings: Settings, device: torch.device) -> int:
+def steps_within(
+    seconds: float, frames: list[Frame], camera: Camera, config: ReconstructorConfig, device: torch.device
+) -> int:
     """Return the number of steps that fit into `seconds`, start included, from a trial with the most Gaussians.
 
     Its fastest stretch counts: other work on the device slows a trial down, and never makes it faster.
     """
-    trial = settings.changed("densify_rounds=0").changed(f"gaussians={settings.config.max_gaussians}")
-    learning, clock = Reconstructor(trial.config, camera, device=device), Clock(device)
+    trial = replace(config, gaussians=config.max_gaussians)
+    learning, clock = Reconstructor(trial, camera, device=device), Clock(device)
     times_s: list[float] = []
 
     def after_step(step: int, loss: Tensor) -> None:
@@ -106,17 +94,17 @@ def steps_within(seconds: float, frames: list[Frame], camera: Camera, settings: 
             times_s.append(clock.total_s)
             clock.go_on()
 
-    learning.fit(split(frames)[0], STRETCH_STEPS * TRIAL_STRETCHES, after_step, trial.fit)
+    learning.fit(split(frames)[0], STRETCH_STEPS * TRIAL_STRETCHES, after_step)
     step_s = min(later - earlier for earlier, later in itertools.pairwise(times_s)) / STRETCH_STEPS
     start_s = times_s[0] - STRETCH_STEPS * step_s
     return max(1, round((seconds - start_s) / step_s))
 
 
 def trained(
-    frames: list[Frame], camera: Camera, settings: Settings, steps: int, device: torch.device, line: dict
+    frames: list[Frame], camera: Camera, config: ReconstructorConfig, steps: int, device: torch.device, line: dict
 ) -> None:
     """Run and evaluate one `fit`; `line` describes it."""
-    learning = Reconstructor(settings.config, camera, device=device)
+    learning = Reconstructor(config, camera, device=device)
     seen, held = split(frames)
     moments = {max(1, round(steps * share)) for share in MOMENTS}
     clock = Clock(device)
@@ -131,7 +119,7 @@ def trained(
             print(json.dumps(line | rounded | {"gaussians": learning.gaussians}), flush=True)
             clock.go_on()
 
-    learning.fit(seen, steps, after_step, settings.fit)
+    learning.fit(seen, steps, after_step)
 
 
 def main() -> None:
@@ -151,8 +139,7 @@ def main() -> None:
         for name, values in itertools.product(options.fields, options.set or [""]):
             asked = ReplaySettings(path, Path("unused"), field=name)
             config = asked.reconstructor_config(recording.width_px * recording.height_px, offline=True)
-            settings = Settings(config, FitSettings()).changed(values)
-            about = (frames, recording.camera, settings)
+            about = (frames, recording.camera, changed(config, values))
             steps = options.steps
             if device.type == "cuda":
                 steps_within(1.0, *about, device)  # loads the kernels

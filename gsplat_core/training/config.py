@@ -74,16 +74,8 @@ class ReconstructorConfig:
     """Optimiser steps for each new frame."""
     first_frame_steps: int = 60
     """Optimiser steps for the first frame of a scene."""
-    newest_share: float = 0.7
-    """Share of the steps spent on the newest frame; the others train on frames of the window."""
     window_frames: int = 30
     """Number of recent frames that are trained on again to prevent forgetting."""
-    jump_ratio: float = 1.8
-    """Ratio of a new frame's loss to the usual loss from which it counts as a jump (a cut or sudden
-    motion) and gets extra steps.
-    """
-    jump_extra: int = 4
-    """Extra steps for a jump, in multiples of the frame's own steps."""
     bump_spacing_s: float = 0.2
     """Spacing of the basis field's functions in seconds: the shortest time in which motion can
     change.
@@ -140,9 +132,7 @@ class ReconstructorConfig:
             raise InvalidSetting(
                 f"max_gaussians is {self.max_gaussians}, below the {self.gaussians} gaussians to start with"
             )
-        if self.jump_extra < 0:
-            raise InvalidSetting(f"jump_extra is {self.jump_extra}; it must be at least 0")
-        for name in ("bump_spacing_s", "default_depth_mm", "jump_ratio"):
+        for name in ("bump_spacing_s", "default_depth_mm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
         if self.history_s is not None and not 0 < self.history_s < math.inf:
@@ -153,8 +143,6 @@ class ReconstructorConfig:
             raise InvalidSetting(f"ssim_weight is {self.ssim_weight}; it must be between 0 and 1")
         if not 0 <= self.depth_weight < math.inf:
             raise InvalidSetting(f"depth_weight is {self.depth_weight}; it must be at least 0")
-        if not 0 < self.newest_share <= 1:
-            raise InvalidSetting(f"newest_share is {self.newest_share}; it must be in (0, 1]")
 
     @classmethod
     def offline(cls, field: str = "auto") -> ReconstructorConfig:

@@ -135,12 +135,15 @@ def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cp
     return torch.where(torch.isfinite(depth) & (depth > 0), depth, 0.0)
 
 
+NEWEST_SHARE = 0.7
+"""Share of the scheduled steps spent on the newest frame; the others train on older frames of the window."""
+
+
 class ObservationWindow:
     """Bounded window of the newest frames with seeded random selection."""
 
-    def __init__(self, capacity: int, newest_share: float, seed: int) -> None:
+    def __init__(self, capacity: int, seed: int) -> None:
         self._frames: deque[Observation] = deque(maxlen=capacity)
-        self._newest_share = newest_share
         self._random = np.random.default_rng(seed)
 
     def add(self, observation: Observation) -> None:
@@ -196,7 +199,7 @@ class ObservationWindow:
         older = len(self._frames) - 1
         if older == 0:
             return [newest] * steps
-        to_newest = max(1, round(steps * self._newest_share))
+        to_newest = max(1, round(steps * NEWEST_SHARE))
         chosen = [self._frames[int(i)] for i in self._random.integers(0, older, steps - to_newest)]
         # Spread the newest frame's steps evenly among the others, ending with it.
         order: list[Observation] = []

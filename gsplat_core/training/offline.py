@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.registration import EXACT_KD_TREE
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import UNSEEN_PX, densify, on_tissue, shares_of
@@ -84,54 +84,32 @@ MOST_AT_ONCE = 0.5
 """Largest share of the way to the neighbours' mean in one smoothing."""
 
 
-@dataclass(frozen=True)
-class FitSettings:
-    """Settings of `Reconstructor.fit`.
+FINAL_RATE = 0.02
+"""Ratio of the final to the initial learning rates, which decay by a half-cosine."""
+SMOOTHING = 1.5
+"""Strength of temporal smoothing: share of the way to the mean of the temporal neighbours per pass over all frames, scaled by
+the learning rates' factor. It suppresses noise of single frames and is reduced for fast motion (`steadiness`).
+"""
+RIGIDITY = 1.0
+"""Strength of spatial smoothing: share of the way of a Gaussian's motion to its neighbours' mean per pass over all frames,
+scaled by the learning rates' factor. It is reduced for fast motion by the root of `steadiness`.
+"""
+DENSIFY_ROUNDS = 6
+"""Number of densification rounds, which remove invisible Gaussians and split those with large errors."""
+DENSIFY_UNTIL = 0.7
+"""Share of the steps after which the last round takes place; rounds are spread evenly."""
+DENSIFY_FRAMES = 12
+"""Number of random frames in which each round measures the error."""
 
-    Raises:
-        InvalidSetting: for a value out of its range.
-    """
 
-    final_rate: float = 0.02
-    """Ratio of the final to the initial learning rates, which decay by a half-cosine."""
-    smoothing: float = 1.5
-    """Strength of temporal smoothing: share of the way to the mean of the temporal neighbours per
-    pass over all frames, scaled by the learning rates' factor. It suppresses noise of single frames
-    and is reduced for fast motion (`steadiness`). 0 disables it.
-    """
-    rigidity: float = 1.0
-    """Strength of spatial smoothing: share of the way of a Gaussian's motion to its neighbours'
-    mean per pass over all frames, scaled by the learning rates' factor. It is reduced for fast
-    motion by the root of `steadiness`. 0 disables it.
-    """
-    densify_rounds: int = 6
-    """Number of densification rounds, which remove invisible Gaussians and split those with large
-    errors; 0 for none.
-    """
-    densify_until: float = 0.7
-    """Share of the steps after which the last round takes place; rounds are spread evenly."""
-    densify_frames: int = 12
-    """Number of random frames in which each round measures the error."""
+def rate_at(share: float) -> float:
+    """Return the factor of the learning rates after this share of the steps."""
+    return FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share))
 
-    def __post_init__(self) -> None:
-        for name in ("final_rate", "densify_until"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be above 0 and at most 1")
-        for name in ("smoothing", "rigidity"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 0")
-        if self.densify_rounds < 0 or self.densify_frames < 1:
-            raise InvalidSetting(
-                f"densify_rounds is {self.densify_rounds} and densify_frames {self.densify_frames}; they must be at least 0 and 1"
-            )
 
-    def rate_at(self, share: float) -> float:
-        """Return the factor of the learning rates after this share of the steps."""
-        return self.final_rate + (1 - self.final_rate) * 0.5 * (1 + math.cos(math.pi * share))
-
-    def rounds(self, steps: int) -> list[int]:
-        """Return the step numbers of the densification rounds."""
-        return [round(steps * self.densify_until * (k + 1) / self.densify_rounds) for k in range(self.densify_rounds)]
+def densification_rounds(steps: int) -> list[int]:
+    """Return the step numbers of the densification rounds."""
+    return [round(steps * DENSIFY_UNTIL * (k + 1) / DENSIFY_ROUNDS) for k in range(DENSIFY_ROUNDS)]
 
 
 def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observation]) -> list[Observation]:
@@ -158,20 +136,19 @@ class OfflineTraining:
         self,
         step: TrainingStep,
         observations: Sequence[Observation],
-        settings: FitSettings,
         *,
         most_gaussians: int,
         seed: int,
     ) -> None:
-        self._step, self._settings = step, settings
+        self._step = step
         rights = [one.right for one in observations if one.right is not None]
         self._observations = [*observations, *rights]
         """Observations of both eyes."""
         self._first_count, self._most = step.gaussians.count, most_gaussians
-        steady = steadiness(observations) if settings.smoothing or settings.rigidity else 0.0
+        steady = steadiness(observations)
         # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
         # its root.
-        self._smoothing, self._rigidity = settings.smoothing * steady, settings.rigidity * math.sqrt(steady)
+        self._smoothing, self._rigidity = SMOOTHING * steady, RIGIDITY * math.sqrt(steady)
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._rate = 1.0
@@ -182,13 +159,13 @@ class OfflineTraining:
         """Run `steps` steps, calling `progress` after each. Returns the last loss, [] on the
         device.
         """
-        rounds = self._settings.rounds(steps)
+        rounds = densification_rounds(steps)
         loss = torch.zeros(())
         for number in range(steps):
             while rounds and number >= rounds[0] > 0:
-                self._densify(1 - (len(rounds) - 1) / self._settings.densify_rounds)
+                self._densify(1 - (len(rounds) - 1) / DENSIFY_ROUNDS)
                 rounds.pop(0)
-            self._rate = self._settings.rate_at(number / steps)
+            self._rate = rate_at(number / steps)
             loss = self._step(self._next(), rate_scale=self._rate)
             if (number + 1) % SMOOTH_EVERY == 0:
                 self._smooth()
@@ -221,8 +198,7 @@ class OfflineTraining:
         self._neighbours = None
         order = self._random.permutation(len(self._observations)).tolist()
         chosen, others = (
-            [self._observations[index] for index in part]
-            for part in (order[: self._settings.densify_frames], order[self._settings.densify_frames :])
+            [self._observations[index] for index in part] for part in (order[:DENSIFY_FRAMES], order[DENSIFY_FRAMES:])
         )
         shares = shares_of(self._step, chosen)
         # Gaussians hidden in all chosen pictures may be visible in others.

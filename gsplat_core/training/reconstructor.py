@@ -24,7 +24,7 @@ from gsplat_core.training.growth import Covering
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import Following, continued, newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.offline import FitSettings, OfflineTraining
+from gsplat_core.training.offline import OfflineTraining
 from gsplat_core.training.parallax import to_fit
 from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
 from gsplat_core.training.places import LeftScenes
@@ -79,7 +79,7 @@ class Reconstructor:
         self.config, self.camera = config, camera
         self.device = torch.device(device)
         self._seed, self._recording_digest = seed, recording_digest
-        self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
+        self._window = ObservationWindow(config.window_frames, seed)
         self.eyes = BothEyes(config.eyes, self.device)
         self._step: TrainingStep | None = None
         self._left = LeftScenes()
@@ -282,14 +282,13 @@ class Reconstructor:
         if self._growth is not None:
             self._growth.forget()
         self.eyes.forget()
-        self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
+        self._window = ObservationWindow(self.config.window_frames, self._seed)
 
     def fit(
         self,
         frames: Iterable[Frame],
         steps: int,
         progress: Callable[[int, Tensor], None] | None = None,
-        settings: FitSettings | None = None,
     ) -> ObserveReport:
         """Train offline on all frames. `ReconstructorConfig.offline` is a suitable configuration.
 
@@ -298,7 +297,6 @@ class Reconstructor:
             steps: number of training steps.
             progress: called as `progress(step, loss)` after each step; reading the loss, [] on the
                 device, waits for it.
-            settings: training schedule; None for the defaults.
 
         Raises:
             InvalidInput: for less than one step, no frames, or frames out of order.
@@ -316,8 +314,8 @@ class Reconstructor:
             first_new = self.gaussians if number else 0
             self._covering.cover(self._step, frame, observation, first=number == 0)
             tracks.apply(self._step, number, first_new)
-        most, settings = self.config.max_gaussians, settings or FitSettings()
-        loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
+        training = OfflineTraining(self._step, seen, most_gaussians=self.config.max_gaussians, seed=self._seed)
+        loss = training(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:

@@ -20,6 +20,10 @@ from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
+JUMP_RATIO = 1.8
+"""Ratio of a new frame's loss to the usual loss from which it counts as a jump (a cut or sudden motion) and gets extra steps."""
+JUMP_EXTRA = 4
+"""Extra steps for a jump, in multiples of the frame's own steps."""
 USUAL_DECAY = 0.1
 """Weight of the newest frames in the usual first loss."""
 STEP_TIME_DECAY = 0.3
@@ -150,7 +154,6 @@ class WindowSchedule(Schedule):
 
     def __init__(self, config: ReconstructorConfig, device: torch.device) -> None:
         super().__init__(device)
-        self._jump_ratio, self._jump_extra = config.jump_ratio, config.jump_extra
         self._usual_first_loss = math.inf
 
     def train(
@@ -176,7 +179,7 @@ class WindowSchedule(Schedule):
         # Read the loss only now, so that the host does not wait for a GPU before its queue is
         # filled.
         if not budget.is_timed and self._is_jump(first_loss, first):
-            extra = spending.made * self._jump_extra
+            extra = spending.made * JUMP_EXTRA
         for turn in range(extra):
             loss = step(observation.by_turns(turn))
         self._unsettled = observation
@@ -195,12 +198,12 @@ class WindowSchedule(Schedule):
 
     def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:
         """Return True if a frame's first loss shows a cut or a sudden motion. Waits for the loss."""
-        usual = self._jump_ratio * self._usual_first_loss
+        usual = JUMP_RATIO * self._usual_first_loss
         return not first and first_loss is not None and first_loss.item() > usual
 
     def _learn_first_loss(self, first_loss: float) -> None:
         known = self._usual_first_loss if self._usual_first_loss < math.inf else first_loss
-        self._usual_first_loss = known + USUAL_DECAY * (min(first_loss, self._jump_ratio * known) - known)
+        self._usual_first_loss = known + USUAL_DECAY * (min(first_loss, JUMP_RATIO * known) - known)
 
     def _learn_step_time(self, spending: Spending) -> None:
         spending.all_finished()

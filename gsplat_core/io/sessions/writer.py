@@ -147,6 +147,10 @@ _DEPTHS: tuple[TrackName, ...] = ("depth", "depth_confidence")
 _PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", *_DEPTHS)
 
 
+SYNC_S = 1.0
+"""Interval in seconds of forced disk writes; bounds the loss at a power failure."""
+
+
 @dataclass(frozen=True)
 class WriterOptions:
     """Options of session recording."""
@@ -167,8 +171,6 @@ class WriterOptions:
     """Apply both limits to all sessions in the parent folder; earlier sessions are
     deleted first.
     """
-    sync_s: float = 1.0
-    """Interval in seconds of forced disk writes; bounds the loss at a power failure."""
     clock: Callable[[], int] = time.monotonic_ns
 
     def __post_init__(self) -> None:
@@ -176,7 +178,7 @@ class WriterOptions:
         for name, value in positive.items():
             if not value > 0:
                 raise InvalidInput(f"{name} is {value}; it must be positive")
-        for name, bound in (("keep_bytes", self.keep_bytes), ("keep_s", self.keep_s), ("sync_s", self.sync_s)):
+        for name, bound in (("keep_bytes", self.keep_bytes), ("keep_s", self.keep_s)):
             if bound is not None and not bound >= 0:
                 raise InvalidInput(f"{name} is {bound}; it must not be negative")
 
@@ -327,7 +329,7 @@ class SessionWriter:
     def _go_on(self) -> None:
         """Sync, start the next segment and delete old ones when due; called before each line."""
         now = self.options.clock()
-        if now - self._synced_ns >= self.options.sync_s * 1e9:
+        if now - self._synced_ns >= SYNC_S * 1e9:
             self._segment.sync()
             self._synced_ns = now
         if self._segment.bytes >= self.options.segment_bytes or self._segment.full:

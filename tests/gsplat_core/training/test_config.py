@@ -24,10 +24,6 @@ from gsplat_core.training.config import (
         ("sh_degree", 5),
         ("steps_per_frame", 0),
         ("first_frame_steps", -1),
-        ("jump_ratio", 0.0),
-        ("jump_extra", -1),
-        ("newest_share", 0.0),
-        ("newest_share", 1.1),
         ("window_frames", 0),
         ("bump_spacing_s", 0.0),
         ("bump_spacing_s", float("nan")),
@@ -120,8 +116,8 @@ def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
     "settings",
     [
         {"gaussians": 1, "max_gaussians": 1}, {"steps_per_frame": 1}, {"first_frame_steps": 1}, {"window_frames": 1},
-        {"sh_degree": 0}, {"sh_degree": 4}, {"newest_share": 1.0}, {"newest_share": 1e-9}, {"jump_extra": 0},
-        {"ssim_weight": 0.0}, {"ssim_weight": 1.0}, {"depth_weight": 0.0}, {"jump_ratio": 1e-9}, {"history_s": 1e-9},
+        {"sh_degree": 0}, {"sh_degree": 4}, 
+        {"ssim_weight": 0.0}, {"ssim_weight": 1.0}, {"depth_weight": 0.0}, {"history_s": 1e-9},
     ],
 )  # fmt: skip
 def test_settings_at_their_limits_are_taken(settings):
@@ -130,7 +126,7 @@ def test_settings_at_their_limits_are_taken(settings):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("sh_degree", -1), ("history_s", 0.0), ("history_s", float("inf")), ("jump_ratio", float("inf")),
+    ("name", "value"), [("sh_degree", -1), ("history_s", 0.0), ("history_s", float("inf")),
                         ("default_depth_mm", 0.0), ("bump_spacing_s", float("inf")), ("eyes", "right"), ("motion_detail", "some")],
 )  # fmt: skip
 def test_settings_just_beyond_their_limits_are_refused(name, value):
@@ -144,7 +140,7 @@ def test_defaults_are_those_of_the_published_figures():
     rates = made.pop("rates")
     assert made == {
         "field": "auto", "gaussians": 30_000, "max_gaussians": 60_000, "sh_degree": 0, "steps_per_frame": 10,
-        "first_frame_steps": 60, "newest_share": 0.7, "window_frames": 30, "jump_ratio": 1.8, "jump_extra": 4,
+        "first_frame_steps": 60, "window_frames": 30,
         "bump_spacing_s": 0.2, "squared_error": False, "history_s": None, "preallocate": False, "ssim_weight": 0.0,
         "depth_weight": 0.1, "default_depth_mm": 60.0, "eyes": "left", "motion_prior": "bumps", "motion_detail": "full",
         "start_from_motion": False, "depth_from_motion": False,

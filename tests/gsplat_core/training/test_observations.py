@@ -9,11 +9,12 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.training import observations
 from gsplat_core.training.observations import Observation, ObservationWindow
 
 
-def window(make_frame, camera, frames, capacity=30, newest_share=0.5, seed=0):
-    filled = ObservationWindow(capacity, newest_share, seed)
+def window(make_frame, camera, frames, capacity=30, seed=0):
+    filled = ObservationWindow(capacity, seed)
     for seq in range(frames):
         filled.add(Observation.of(make_frame(seq), camera))
     return filled
@@ -88,15 +89,19 @@ def test_a_camera_of_another_size_is_refused(make_frame):
 @pytest.mark.parametrize("steps", [1, 2, 7, 8, 20])
 @pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("frames", [1, 2, 10])
-def test_the_schedule_has_its_length_its_share_and_ends_with_the_newest(make_frame, camera, steps, share, frames):
-    schedule = window(make_frame, camera, frames, newest_share=share).schedule(steps)
+def test_the_schedule_has_its_length_its_share_and_ends_with_the_newest(
+    make_frame, camera, steps, share, frames, monkeypatch
+):
+    monkeypatch.setattr(observations, "NEWEST_SHARE", share)
+    schedule = window(make_frame, camera, frames).schedule(steps)
     assert len(schedule) == steps
     assert schedule[-1].seq == frames - 1
     newest = sum(seen.seq == frames - 1 for seen in schedule)
     assert newest == (steps if frames == 1 else max(1, round(steps * share)))
 
 
-def test_the_newest_frames_turns_are_spread(make_frame, camera):
+def test_the_newest_frames_turns_are_spread(make_frame, camera, monkeypatch):
+    monkeypatch.setattr(observations, "NEWEST_SHARE", 0.5)
     turns = [seen.seq == 4 for seen in window(make_frame, camera, 5).schedule(8)]
     assert turns == [False, True] * 4
 

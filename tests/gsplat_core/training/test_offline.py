@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import math
 from collections import Counter
 
 import numpy as np
@@ -10,11 +9,11 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
-from gsplat_core.errors import InvalidSetting
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import POSITION
+from gsplat_core.training import offline
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, FitSettings, nearest_others
+from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, nearest_others
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
 
@@ -22,46 +21,29 @@ CONFIG = ReconstructorConfig(field="basis", gaussians=300, max_gaussians=500, sq
 
 
 def test_rates_fall_from_all_to_what_is_left():
-    settings = FitSettings(final_rate=0.1)
-    rates = [settings.rate_at(share / 10) for share in range(11)]
+    rates = [offline.rate_at(share / 10) for share in range(11)]
     assert rates[0] == 1
-    assert rates[5] == pytest.approx(0.55)
-    assert rates[10] == pytest.approx(0.1)
+    assert rates[5] == pytest.approx(0.51)
+    assert rates[10] == pytest.approx(0.02)
     assert rates == sorted(rates, reverse=True)
 
 
 def test_rounds_are_spread_evenly_up_to_their_share_of_the_steps():
-    assert FitSettings(densify_rounds=4, densify_until=0.8).rounds(1000) == [200, 400, 600, 800]
-    assert FitSettings(densify_rounds=0).rounds(1000) == []
+    assert offline.densification_rounds(600) == [70, 140, 210, 280, 350, 420]
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"final_rate": 0},
-        {"final_rate": 1.5},
-        {"final_rate": math.nan},
-        {"densify_until": 0},
-        {"smoothing": -0.1},
-        {"smoothing": math.inf},
-        {"densify_rounds": -1},
-        {"densify_frames": 0},
-    ],
-)
-def test_settings_out_of_their_range_are_refused(values):
-    with pytest.raises(InvalidSetting, match=next(iter(values))):
-        FitSettings(**values)
-
-
-def fitted(camera, frames, steps, **settings):
-    learning = Reconstructor(CONFIG, camera)
+def fitted(camera, frames, steps, config=CONFIG, **constants):
+    learning = Reconstructor(config, camera)
     counts = []
-    learning.fit(frames, steps, lambda *_: counts.append(learning.gaussians), FitSettings(**settings))
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in constants.items():
+            patch.setattr(offline, name, value)
+        learning.fit(frames, steps, lambda *_: counts.append(learning.gaussians))
     return learning, counts
 
 
 def test_gaussians_grow_round_by_round_to_the_most_allowed(tissue_video, camera):
-    learning, counts = fitted(camera, tissue_video(4), 40, densify_rounds=4, densify_until=0.8)
+    learning, counts = fitted(camera, tissue_video(4), 40, DENSIFY_ROUNDS=4, DENSIFY_UNTIL=0.8)
     grown = [step for step, (before, after) in enumerate(itertools.pairwise(counts), 1) if after > before]
     assert grown == [8, 16, 24, 32]
     assert counts[-1] == learning.gaussians == CONFIG.max_gaussians
@@ -70,12 +52,12 @@ def test_gaussians_grow_round_by_round_to_the_most_allowed(tissue_video, camera)
 
 def test_fewer_steps_than_rounds_still_end(tissue_video, camera):
     for steps in (1, 2, 3):
-        _, counts = fitted(camera, tissue_video(2), steps, densify_rounds=10)
+        _, counts = fitted(camera, tissue_video(2), steps, DENSIFY_ROUNDS=10)
         assert len(counts) == steps
 
 
 def test_without_rounds_the_gaussians_stay(tissue_video, camera):
-    _, counts = fitted(camera, tissue_video(3), 6, densify_rounds=0)
+    _, counts = fitted(camera, tissue_video(3), 6, DENSIFY_ROUNDS=0)
     assert set(counts) == {counts[0]}
 
 
@@ -94,7 +76,7 @@ def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypat
 
 def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
     def roughness(smoothing):
-        learning, _ = fitted(camera, tissue_video(12), 60, densify_rounds=0, smoothing=smoothing)
+        learning, _ = fitted(camera, tissue_video(12), 60, DENSIFY_ROUNDS=0, SMOOTHING=smoothing)
         weights = learning.snapshot().field.weights
         return float(weights.diff(dim=1).square().sum() / weights.square().sum())
 
@@ -104,16 +86,16 @@ def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
 def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkeypatch):
     amounts = []
     monkeypatch.setattr(BasisField, "smooth_in_time", lambda self, amount: amounts.append(amount))
-    fitted(camera, tissue_video(2), 100, smoothing=5.0)
+    fitted(camera, tissue_video(2), 100, SMOOTHING=5.0)
     assert len(amounts) == 100 // SMOOTH_EVERY
     assert max(amounts) == MOST_AT_ONCE
-    fitted(camera, tissue_video(2), 100, smoothing=0.0)
+    fitted(camera, tissue_video(2), 100, SMOOTHING=0.0)
     assert len(amounts) == 100 // SMOOTH_EVERY
 
 
 def test_neighbours_move_more_alike_the_more_rigid_tissue_is(tissue_video, camera):
     def unlike(rigidity):
-        learning, _ = fitted(camera, tissue_video(6), 60, densify_rounds=1, rigidity=rigidity)
+        learning, _ = fitted(camera, tissue_video(6), 60, DENSIFY_ROUNDS=1, RIGIDITY=rigidity)
         model = learning.snapshot()
         motion = model.field.weights[..., POSITION].flatten(1)
         others = motion[nearest_others(model.gaussians.means)].mean(dim=1)
@@ -127,8 +109,7 @@ def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, 
     config = dataclasses.replace(CONFIG, gaussians=60, max_gaussians=240)
 
     def error(rounds):
-        learning = Reconstructor(config, camera)
-        learning.fit(frames, 150, settings=FitSettings(densify_rounds=rounds))
+        learning, _ = fitted(camera, frames, 150, config, DENSIFY_ROUNDS=rounds)
         model = learning.snapshot()
         target = torch.from_numpy(frames[2].image) / 255
         return float((model.render(frames[2].time_s).image - target).square().mean())
@@ -142,6 +123,6 @@ def test_tissue_that_only_few_frames_show_is_kept(tissue_video, camera):
     mask = np.ones(frames[0].image.shape[:2], np.uint8)
     mask[10:30, 14:40] = 0
     frames = [frame.with_fields(mask=mask) if frame.seq < 11 else frame for frame in frames]
-    learning, _ = fitted(camera, frames, 36, densify_rounds=6, densify_frames=1)
+    learning, _ = fitted(camera, frames, 36, DENSIFY_ROUNDS=6, DENSIFY_FRAMES=1)
     shown = render(learning.snapshot().at(frames[-1].time_s), camera).alpha.numpy()
     assert (shown[12:28, 16:38] > 0.5).mean() > 0.95

@@ -8,8 +8,8 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training import offline
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.offline import FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes, right_tissue
 from gsplat_core.training.schedule import LiveTraining
@@ -174,12 +174,13 @@ def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
     assert psnr(picture[strip], seen(RIGHT)[0][strip]) > psnr(seen(RIGHT, alone)[0][strip], seen(RIGHT)[0][strip]) + 5
 
 
-def test_offline_training_takes_both_eyes():
+def test_offline_training_takes_both_eyes(monkeypatch):
+    monkeypatch.setattr(offline, "DENSIFY_ROUNDS", 1)
     config = dataclasses.replace(CONFIG, depth_from_motion=False)
     views = {}
     for eyes in ("left", "both"):
         learning = Reconstructor(dataclasses.replace(config, eyes=eyes), LEFT)
-        learning.fit([stereo_frame(seq) for seq in range(3)], 200, settings=FitSettings(densify_rounds=1))
+        learning.fit([stereo_frame(seq) for seq in range(3)], 200)
         views[eyes] = psnr(inner(seen(RIGHT, learning.snapshot().at(0.0))[0]), inner(seen(RIGHT)[0]))
     assert views["both"] > views["left"] + 1.5  # 2.8 dB or more with every instruction set
 
@@ -205,8 +206,9 @@ def tinted(seq: int) -> Frame:
 
 
 @pytest.mark.parametrize(("way", "better_db"), [("online", 0.1), ("offline", 0.2), ("live", 4)])
-def test_each_eye_keeps_its_own_colours(way, better_db):
+def test_each_eye_keeps_its_own_colours(way, better_db, monkeypatch):
     """A tint of one eye appears in its own rendered picture and not in that of the other eye."""
+    monkeypatch.setattr(offline, "DENSIFY_ROUNDS", 1)
     frames = [tinted(seq) for seq in range(4)]
     if way == "live":
         config = dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True)
@@ -218,7 +220,7 @@ def test_each_eye_keeps_its_own_colours(way, better_db):
     else:
         learning = Reconstructor(dataclasses.replace(CONFIG, depth_from_motion=False), LEFT)
         if way == "offline":
-            learning.fit(frames, 300, settings=FitSettings(densify_rounds=1))
+            learning.fit(frames, 300)
         else:
             for frame in frames:
                 learning.observe(frame)

@@ -217,7 +217,7 @@ def test_a_log_is_plain_json(session):
 
 
 @pytest.mark.parametrize(
-    "options", [{"segment_bytes": 0}, {"segment_s": -1}, {"keep_bytes": -1}, {"sync_s": float("nan")}]
+    "options", [{"segment_bytes": 0}, {"segment_s": -1}, {"keep_bytes": -1}, {"keep_s": float("nan")}]
 )
 def test_options_out_of_their_range_are_refused(options):
     with pytest.raises(InvalidInput, match=next(iter(options))):
