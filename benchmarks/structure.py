@@ -162,7 +162,7 @@ def settings_fields(product: dict[str, ast.Module]) -> Iterator[tuple[str, str, 
 
 
 def assigned(trees: dict[str, ast.Module], fields: dict[str, list[str]]) -> set[tuple[str, str]]:
-    """Return (class, field) that a call passes: to the class, or to `replace`, `cls` or another function by the field's name."""
+    """Return (class, field) that a call passes: to the class, or by the field's name to `replace`, `cls` or `dict`."""
     found = set()
     for tree in trees.values():
         for node in nodes(tree):
@@ -174,7 +174,7 @@ def assigned(trees: dict[str, ast.Module], fields: dict[str, list[str]]) -> set[
                 names += fields[callee][: len(node.args)]
             for name in names:
                 kinds = [callee] if callee in fields else [kind for kind in fields if name in fields[kind]]
-                if callee in fields or callee in ("replace", "cls") or not callee[:1].isupper():
+                if callee in fields or callee in ("replace", "cls", "dict"):
                     found |= {(kind, name) for kind in kinds}
     return found
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import FrameStatus
 from operators.frame_clock import FrameClock
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
@@ -27,8 +26,8 @@ REPEAT_NS = 200_000_000
 nanoseconds.
 """
 LEAST_LABELLED_PX = 160
-"""Minimum height in pixels of a live picture that is labelled. The label has a minimum size to be
-legible, and would cover much of a smaller picture.
+"""Minimum height in pixels of a live picture that is labelled with its state and age; a picture that is not live always is.
+The label has a minimum size to be legible, and would cover much of a smaller picture.
 """
 WAITING = 4
 """Capacity of the input queue, in pictures."""
@@ -40,48 +39,28 @@ COLOURS = {
 }
 
 
-@dataclass(frozen=True)
-class DisplaySettings:
-    """Age limits of the picture states and the overlays. Raises InvalidSetting for values out of
-    range.
+STALE_AFTER_NS, STALE_AFTER_INTERVALS = 150e6, 3.0
+"""Age beyond which a picture is stale: the larger of a time in nanoseconds and a multiple of the frame interval, because
+pictures of a slow camera are older.
+"""
+FROZEN_AFTER_NS = 1000e6
+"""Age beyond which a picture is frozen, in nanoseconds; at least twice the stale limit applies."""
+
+
+def picture_state(age_ns: float, interval_ns: float, source: SourceState) -> PictureState:
+    """Return the state of the displayed picture.
+
+    Args:
+        age_ns: time since the picture's content arrived, in nanoseconds.
+        interval_ns: usual time between frames, in nanoseconds.
+        source: current state of the source; any state but `LIVE` gives `SOURCE_LOST`.
     """
-
-    stale_after_ms: float = 150.0
-    stale_after_intervals: float = 3.0
-    """Stale limit as a multiple of the frame interval. The larger of both stale limits applies,
-    because pictures of a slow camera are older.
-    """
-    frozen_after_ms: float = 1000.0
-    label: bool = True
-    """Draw state and age into every picture. Live pictures lower than `LEAST_LABELLED_PX` are not
-    labelled; a picture that is not live always is.
-    """
-    mark_remembered: bool = True
-    """Draw tissue that is not visible in the current frame in grey (see `RememberedTissue`)."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.stale_after_ms < self.frozen_after_ms <= 60_000:
-            raise InvalidSetting(
-                f"stale_after_ms is {self.stale_after_ms:g} and frozen_after_ms {self.frozen_after_ms:g}; they must be in"
-                " order and at most 60000"
-            )
-        if not 1 <= self.stale_after_intervals <= 100:
-            raise InvalidSetting(f"stale_after_intervals is {self.stale_after_intervals}; it must be between 1 and 100")
-
-    def state(self, age_ns: float, interval_ns: float, source: SourceState) -> PictureState:
-        """Return the state of the displayed picture.
-
-        Args:
-            age_ns: time since the picture's content arrived, in nanoseconds.
-            interval_ns: usual time between frames, in nanoseconds.
-            source: current state of the source; any state but `LIVE` gives `SOURCE_LOST`.
-        """
-        if source is not SourceState.LIVE:
-            return PictureState.SOURCE_LOST
-        stale_ns = max(self.stale_after_ms * 1e6, self.stale_after_intervals * interval_ns)
-        if age_ns > max(self.frozen_after_ms * 1e6, 2 * stale_ns):
-            return PictureState.FROZEN
-        return PictureState.STALE if age_ns > stale_ns else PictureState.LIVE
+    if source is not SourceState.LIVE:
+        return PictureState.SOURCE_LOST
+    stale_ns = max(STALE_AFTER_NS, STALE_AFTER_INTERVALS * interval_ns)
+    if age_ns > max(FROZEN_AFTER_NS, 2 * stale_ns):
+        return PictureState.FROZEN
+    return PictureState.STALE if age_ns > stale_ns else PictureState.LIVE
 
 
 @dataclass(frozen=True)
@@ -111,7 +90,6 @@ class DisplayOp(Operator):
     Params:
         clock: clock of the run; receives the measured display latency.
         source_state: returns the state of the source; thread-safe.
-        settings: age limits and overlays.
     """
 
     def __init__(
@@ -120,12 +98,10 @@ class DisplayOp(Operator):
         *args: Any,
         clock: FrameClock,
         source_state: Callable[[], SourceState],
-        settings: DisplaySettings | None = None,
         **kwargs: Any,
     ) -> None:
         self.clock = clock
         self.source_state = source_state
-        self.settings = settings or DisplaySettings()
         self._tissue = RememberedTissue()
         self._reset()
         super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
@@ -167,7 +143,7 @@ class DisplayOp(Operator):
             return
         now_ns = self.clock.now_ns()
         age_ns = max(0, now_ns - _content_ns(self._current, now_ns))
-        state = self.settings.state(age_ns, self.clock.interval_ns, self.source_state())
+        state = picture_state(age_ns, self.clock.interval_ns, self.source_state())
         changed = state is not self.state
         repeat = state is not PictureState.LIVE and now_ns - self._sent_ns >= REPEAT_NS
         if arrived is None and not changed and not repeat:
@@ -190,8 +166,8 @@ class DisplayOp(Operator):
         The picture is copied only if something is drawn. The mask is None if nothing is marked.
         """
         image, whole = rendered.image, _is_outdated(rendered, state)
-        remembered = self._tissue.layer(rendered, whole) if self.settings.mark_remembered else None
-        labelled = self.settings.label and image.shape[0] >= LEAST_LABELLED_PX
+        remembered = self._tissue.layer(rendered, whole)
+        labelled = image.shape[0] >= LEAST_LABELLED_PX
         label = labelled or state is not PictureState.LIVE
         if label or remembered is not None:
             image = image.copy()

@@ -24,6 +24,10 @@ SHOWN_WITHIN_S = 0.005
 """Longest wait for a picture to be displayed before rehearsal, in seconds."""
 AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
 """Defaults for `ClockSettings.auto_share`, `auto_most_ms` and `least_share`."""
+FIRST_MS = 20.0
+"""Display deadline of a scene's first frame after its arrival, in milliseconds."""
+FIRST_AT_MOST_STEPS = 60
+"""Maximum number of optimiser steps for the first frame of a scene."""
 CATCH_UP_SHARE = 0.8
 """Largest share of the frame interval that minimal processing may take for queued frames to be
 caught up with.
@@ -61,11 +65,8 @@ class ClockSettings:
     """
     at_most_steps: int = 80
     """Maximum number of optimiser steps before a frame is displayed."""
-    first_ms: float = 20.0
-    """Display deadline of a scene's first frame after its arrival, in milliseconds."""
     first_at_least_steps: int | None = None
     """Minimum number of steps for the first frame of a scene. None: device default."""
-    first_at_most_steps: int = 60
     rehearse_at_most: int = 120
     """Maximum number of rehearsal steps between two frames, also while no frame arrives."""
 
@@ -81,9 +82,9 @@ class ClockSettings:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
             )
-        if self.first_at_least_steps is not None and not 0 < self.first_at_least_steps <= self.first_at_most_steps:
+        if self.first_at_least_steps is not None and not 0 < self.first_at_least_steps <= FIRST_AT_MOST_STEPS:
             raise InvalidSetting(
-                f"first_at_least_steps is {self.first_at_least_steps} and first_at_most_steps {self.first_at_most_steps};"
+                f"first_at_least_steps is {self.first_at_least_steps} and the limit {FIRST_AT_MOST_STEPS};"
                 " they must be in order"
             )
         if self.fewest_steps is not None and not 0 < self.fewest_steps <= (self.at_least_steps or self.at_most_steps):
@@ -137,13 +138,13 @@ class FrameClock:
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
         self._learn_interval(arrived_ns, frame.seq)
-        until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
+        until_ns = arrived_ns + (FIRST_MS * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first and not behind:
             until_ns = max(until_ns, self.now_ns() + (settings.least_share or LEAST_SHARE) * self.interval_ns)
         return Budget.until(
             until_ns * 1e-9,
             at_least=settings.first_at_least_steps or 1 if first else self.least_steps(behind),
-            at_most=settings.first_at_most_steps if first else settings.at_most_steps,
+            at_most=FIRST_AT_MOST_STEPS if first else settings.at_most_steps,
             clock=lambda: self.now_ns() * 1e-9,
         )
 

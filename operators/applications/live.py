@@ -266,7 +266,6 @@ class LiveApplication(Application):
             name="display",
             clock=self.clock,
             source_state=lambda: self.frame_source.state,
-            settings=settings.display,
         )
         log = FrameLog(out / FRAMES_FILE, reserve) if settings.report else None
         self.metrics = OnScreenMetricsOp(self, name="on_screen", log=log, report=settings.report)

@@ -13,7 +13,6 @@ from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.schedule import LiveTraining
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.session import RunSettings
-from operators.display import DisplaySettings
 from operators.frame_clock import ClockSettings
 from operators.settings import LiveOptions
 from operators.tool_mask import check_tool_mask
@@ -87,7 +86,6 @@ class LiveSettings(LiveOptions):
     """
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     """Display deadlines and step limits; `budget_ms` has precedence over its own."""
-    display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining | None = None
     """Training parameters; None: device default."""
 

@@ -28,7 +28,7 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.orbit import Orbit
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
-from operators.display import DisplaySettings, draw_label
+from operators.display import draw_label, picture_state
 from operators.layer_pictures import DepthColours, confidence_picture, mark_unobserved, mark_virtual
 from operators.messages import PictureState, ShownPicture
 from operators.metrics import ScoredFrame
@@ -407,7 +407,7 @@ class Layers:
     def _state(self, screen: PictureState, age_ns: int) -> PictureState:
         """Return the state for a picture of this age; never better than the state of the main
         picture."""
-        own = DisplaySettings().state(age_ns, PERIOD_S[self._device] * 1e9, SourceState.LIVE)
+        own = picture_state(age_ns, PERIOD_S[self._device] * 1e9, SourceState.LIVE)
         order = list(PictureState)
         return max(screen, own, key=order.index)
 

@@ -10,11 +10,12 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.scene.frames import FrameStatus
+from operators import display
 from operators.applications import live as live_module
 from operators.applications.live import live
 from operators.applications.live_settings import LiveSettings
 from operators.checks import CutCounts, MaskAndDepthCounts, SequenceCounts
-from operators.display import COLOURS, DisplaySettings, LiveDisplayResult
+from operators.display import COLOURS, LiveDisplayResult
 from operators.frame_clock import ClockSettings
 from operators.ingest import SourceResult
 from operators.messages import PictureState
@@ -35,8 +36,6 @@ from tests.operators.applications.scripted import (
     torn,
 )
 
-SLOW = DisplaySettings(stale_after_ms=700.0, stale_after_intervals=1.0, frozen_after_ms=1400.0)
-"""A busy machine shows pictures late, and that is not what is tested here."""
 FEW_STEPS = ClockSettings(at_most_steps=4, rehearse_at_most=4)
 """Few steps per frame: the tests check the set of trained frames, not the quality."""
 
@@ -49,11 +48,12 @@ def watched(tmp_path, monkeypatch) -> Callable[..., Watched]:
         watch = Watched(script)
         # The graph's trial run before the stream tells the same listener.
         played = ScriptedSource(script, watch.events.clear, **(source or {}))
+        # A busy machine displays pictures late, which is not tested here.
+        monkeypatch.setattr(display, "STALE_AFTER_NS", 700e6)
+        monkeypatch.setattr(display, "FROZEN_AFTER_NS", 1400e6)
         monkeypatch.setattr(live_module, "open_source", lambda address, options: played)
         monkeypatch.setattr(live_module.RunRecording, "listener", property(lambda self: watch.events.append))
-        wanted = LiveSettings(
-            "scripted", tmp_path / "out", **{"out_of_body": "off", "display": SLOW, "clock": FEW_STEPS, **settings}
-        )
+        wanted = LiveSettings("scripted", tmp_path / "out", **{"out_of_body": "off", "clock": FEW_STEPS, **settings})
         watch.outcome = live(wanted, on_shown=watch.shown.append)
         assert watch.outcome.stop_reason == "end of stream"
         return watch
