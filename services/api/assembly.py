@@ -40,9 +40,8 @@ from services.jobs.replays import RecordingRetention, ReplayRetention, Replays
 from services.jobs.results import Results
 from services.jobs.store import JobStore, uses_recording
 from services.missing_files import StoredFiles, StoredFilesWatch
-from services.recordings.archives import RecordingLimits
 from services.recordings.store import RecordingStore, State
-from services.registry.limits import NICENESS, RegistryLimits
+from services.registry.limits import NICENESS
 from services.registry.models import DATABASE_FILE, ModelRegistry
 from services.schemas.service import CheckResult
 from services.settings import ServiceSettings
@@ -90,7 +89,7 @@ def new_archive(
     recordings = RecordingStore(
         wanted.folder or data / "recordings",
         url,
-        limits=RecordingLimits(unpacked_bytes=wanted.unpacked_bytes, entry_bytes=wanted.unpacked_bytes),
+        most_unpacked_bytes=wanted.unpacked_bytes,
         in_use=uses_recording,
     )
     store = JobStore(url, recordings.path_of)
@@ -260,7 +259,7 @@ def registry_of(settings: ServiceSettings) -> ModelRegistry:
         database_url=None if wanted.database is None else wanted.database.get_secret_value(),
         blobs_url=wanted.blobs,
         blob_options=options or None,
-        limits=RegistryLimits(upload_bytes=settings.limits.model_bytes),
+        most_upload_bytes=settings.limits.model_bytes,
     )
 
 

@@ -11,7 +11,7 @@ import stat
 import struct
 import zipfile
 import zlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -20,32 +20,12 @@ from services.errors import Rejected
 GIB = 1 << 30
 
 
-@dataclass(frozen=True)
-class RecordingLimits:
-    """Inclusive limits for one recording."""
-
-    unpacked_bytes: int = 64 * GIB
-    """Total unpacked size of an archive in bytes."""
-    entry_bytes: int = 16 * GIB
-    """Unpacked size of one file in bytes."""
-    entries: int = 65_000
-    """Number of files and folders in an archive."""
-    ratio: int = 100
-    """Largest compression ratio of a file above one megabyte."""
-    check_memory_bytes: int = 4 * GIB
-    """Memory of the check beyond its libraries, in bytes."""
-    check_s: float = 3600.0
-    """Processor time of the check in seconds. Exceeding it rejects the recording."""
-    check_passed_s: float = 4 * 3600.0
-    """Wall-clock time of the check in seconds. Exceeding it means that the machine is too busy, and
-    the recording is not rejected."""
-    checks_at_once: int = 1
-    """Number of concurrent checks; further checks wait."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ValueError(f"RecordingLimits.{field.name} must be positive, got {getattr(self, field.name)!r}")
+MOST_UNPACKED_BYTES = 64 * GIB
+"""Default for the total unpacked size of an archive in bytes."""
+MOST_ENTRIES = 65_000
+"""Largest number of files and folders in an archive."""
+MOST_RATIO = 100
+"""Largest compression ratio of a file above one megabyte."""
 
 
 ARCHIVE = "archive"
@@ -136,7 +116,7 @@ def check_end(file: BinaryIO) -> int:
     return entries
 
 
-def entries_of(archive: zipfile.ZipFile, file: BinaryIO, stated: int, limits: RecordingLimits) -> list[Entry]:
+def entries_of(archive: zipfile.ZipFile, file: BinaryIO, stated: int, most_bytes: int) -> list[Entry]:
     """Return the files to unpack, in archive order.
 
     Raises:
@@ -145,19 +125,19 @@ def entries_of(archive: zipfile.ZipFile, file: BinaryIO, stated: int, limits: Re
     infos = archive.infolist()
     if len(infos) != stated:
         raise ArchiveInvalid(f"the archive lists {len(infos)} files and says that there are {stated}; pack it again")
-    if stated > limits.entries:
-        raise ArchiveInvalid(f"the archive has {stated} files; at most {limits.entries} are unpacked")
+    if stated > MOST_ENTRIES:
+        raise ArchiveInvalid(f"the archive has {stated} files; at most {MOST_ENTRIES} are unpacked")
     for number, info in enumerate(infos):
-        _check_entry(info, number, limits)
+        _check_entry(info, number)
     whole = sum(info.file_size for info in infos)
-    if whole > limits.unpacked_bytes:
-        raise ArchiveInvalid(f"the archive holds {whole} bytes; at most {limits.unpacked_bytes} are unpacked")
+    if whole > most_bytes:
+        raise ArchiveInvalid(f"the archive holds {whole} bytes; at most {most_bytes} are unpacked")
     _check_places(infos, file, archive.start_dir)
     kept = [Entry(info, PurePosixPath(info.filename)) for info in infos if not info.is_dir() and not _is_left_out(info)]
     return _with_paths_of_their_own(_without_their_common_folder(kept))
 
 
-def _check_entry(info: zipfile.ZipInfo, number: int, limits: RecordingLimits) -> None:
+def _check_entry(info: zipfile.ZipInfo, number: int) -> None:
     which = f"file {number + 1} of the archive"
     name = info.orig_filename
     parts = name.removesuffix("/").split("/")
@@ -175,11 +155,9 @@ def _check_entry(info: zipfile.ZipInfo, number: int, limits: RecordingLimits) ->
         raise ArchiveInvalid(f"{which} is encrypted; pack it without a password")
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ArchiveInvalid(f"{which} is packed by method {info.compress_type}; use `zip`, which stores and deflates")
-    if info.file_size > limits.entry_bytes:
-        raise ArchiveInvalid(f"{which} holds {info.file_size} bytes; at most {limits.entry_bytes} are unpacked")
-    if info.file_size > MIB and info.file_size > limits.ratio * info.compress_size:
+    if info.file_size > MIB and info.file_size > MOST_RATIO * info.compress_size:
         raise ArchiveInvalid(
-            f"{which} holds {info.file_size} bytes, packed into {info.compress_size}: over {limits.ratio} times as many"
+            f"{which} holds {info.file_size} bytes, packed into {info.compress_size}: over {MOST_RATIO} times as many"
         )
 
 
@@ -231,7 +209,7 @@ def _with_paths_of_their_own(entries: list[Entry]) -> list[Entry]:
 PIECE_BYTES = 1 << 20
 
 
-def unpack(archive: Path, folder: Path, limits: RecordingLimits) -> None:
+def unpack(archive: Path, folder: Path, most_bytes: int) -> None:
     """Write the files of `archive` into the new folder `folder`. After an error, files unpacked so
     far remain.
 
@@ -243,7 +221,7 @@ def unpack(archive: Path, folder: Path, limits: RecordingLimits) -> None:
         stated = check_end(file)
         try:
             with zipfile.ZipFile(file) as opened:
-                entries = entries_of(opened, file, stated, limits)
+                entries = entries_of(opened, file, stated, most_bytes)
                 folder.mkdir(mode=0o700)
                 for number, entry in enumerate(entries):
                     _write(opened, entry, folder, number)

@@ -20,7 +20,7 @@ from typing import Any
 
 from gsplat_core.io.recordings import validate_recording
 from services.private_files import keep_files_private
-from services.recordings.archives import ARCHIVE, ArchiveInvalid, RecordingLimits, unpack
+from services.recordings.archives import ARCHIVE, MOST_UNPACKED_BYTES, ArchiveInvalid, unpack
 from services.registry.limits import NICENESS, lower_limit, taken_bytes
 
 UPLOAD = "upload"
@@ -36,24 +36,27 @@ _REPORTED_FACTS = (
     "calibration",
 )
 MOST_PROBLEMS = 3
+CHECK_MEMORY_BYTES = 4 << 30
+"""Memory of the check beyond its libraries, in bytes."""
+CHECK_S = 3600.0
+"""Processor time of the check in seconds. Exceeding it rejects the recording."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Check one upload and print the verdict."""
     keep_files_private()
     options = _options(arguments)
-    limits = RecordingLimits(**json.loads(options.limits))
-    _limit_resources(limits)
+    _limit_resources(options.most_bytes)
     path = options.folder / _file_name(options)
     try:
-        _put(options, path, limits)
+        _put(options, path)
         verdict = _verdict(path, options.folder)
     except ArchiveInvalid as error:
         verdict = {"stage": "rejected", "reason": str(error)}
     except MemoryError:
         verdict = {
             "stage": "rejected",
-            "reason": f"it needs more than {limits.check_memory_bytes} bytes of memory to read",
+            "reason": f"it needs more than {CHECK_MEMORY_BYTES} bytes of memory to read",
         }
     sys.stdout.write(json.dumps(verdict, allow_nan=False) + "\n")
     return 0
@@ -66,28 +69,28 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--kind", required=True, help="archive, or a video's suffix")
     parser.add_argument("--name", required=True, help="original file name")
-    parser.add_argument("--limits", default="{}", help="RecordingLimits as JSON")
+    parser.add_argument("--most-bytes", type=int, default=MOST_UNPACKED_BYTES, help="largest unpacked size in bytes")
     return parser.parse_args(arguments)
 
 
-def _limit_resources(limits: RecordingLimits) -> None:
+def _limit_resources(most_bytes: int) -> None:
     os.nice(NICENESS)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    lower_limit(resource.RLIMIT_FSIZE, max(limits.entry_bytes, 1 << 20))
-    lower_limit(resource.RLIMIT_DATA, taken_bytes() + limits.check_memory_bytes)
-    lower_limit(resource.RLIMIT_CPU, int(limits.check_s) + 1, spare=5)
+    lower_limit(resource.RLIMIT_FSIZE, max(most_bytes, 1 << 20))
+    lower_limit(resource.RLIMIT_DATA, taken_bytes() + CHECK_MEMORY_BYTES)
+    lower_limit(resource.RLIMIT_CPU, int(CHECK_S) + 1, spare=5)
 
 
 def _file_name(options: argparse.Namespace) -> str:
     return str(options.name) if options.kind == ARCHIVE else f"{options.name}{options.kind}"
 
 
-def _put(options: argparse.Namespace, path: Path, limits: RecordingLimits) -> None:
+def _put(options: argparse.Namespace, path: Path) -> None:
     """Move the recording to its place, after deleting leftovers of an interrupted check."""
     upload = options.folder / UPLOAD
     if options.kind == ARCHIVE:
         shutil.rmtree(path, ignore_errors=True)
-        unpack(upload, path, limits)
+        unpack(upload, path, options.most_bytes)
     else:
         path.unlink(missing_ok=True)
         os.link(upload, path)

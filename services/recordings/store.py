@@ -5,7 +5,6 @@ Each change of the table needs a new file in `migrations/versions`.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import secrets
@@ -13,7 +12,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
@@ -23,7 +22,7 @@ import sqlalchemy as sa
 
 from gsplat_core.io.files import sync_folder
 from services.errors import CheckFailed, Conflict, NotFound, StoreUnavailable
-from services.recordings.archives import ARCHIVE, RecordingLimits, kind_of
+from services.recordings.archives import ARCHIVE, MOST_UNPACKED_BYTES, kind_of
 from services.registry.checking import BroughtDown, RunningChecks, run_program
 from services.registry.database import Database, Schema
 from services.registry.records import now
@@ -114,6 +113,10 @@ def _never_in_use(_: sa.Connection, __: str) -> bool:
     return False
 
 
+CHECK_PASSED_S = 4 * 3600.0
+"""Wall-clock time of a check in seconds. Exceeding it means that the machine is too busy, and the recording is not rejected."""
+
+
 class RecordingStore:
     """Recordings by name. Synchronous and thread-safe. Every method raises StoreUnavailable if the
     database or the files are unavailable.
@@ -127,7 +130,7 @@ class RecordingStore:
         folder: Path,
         database_url: str,
         *,
-        limits: RecordingLimits = RecordingLimits(),
+        most_unpacked_bytes: int = MOST_UNPACKED_BYTES,
         in_use: Callable[[sa.Connection, str], bool] = _never_in_use,
         check_program: tuple[str, ...] = PROGRAM,
     ) -> None:
@@ -136,12 +139,13 @@ class RecordingStore:
         Args:
             folder: folder of the recordings.
             database_url: URL of the database.
-            limits: budgets of recordings and checks.
+            most_unpacked_bytes: largest unpacked size of an archive, and of one file, in bytes.
             in_use: returns True if an unfinished job reads a recording; called in the deleting
                 transaction.
             check_program: command that checks a folder.
         """
-        self._folder, self._limits, self._in_use, self._program = folder, limits, in_use, check_program
+        self._folder, self._in_use, self._program = folder, in_use, check_program
+        self._most_unpacked_bytes = most_unpacked_bytes
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
@@ -149,7 +153,7 @@ class RecordingStore:
                 f"recordings cannot be kept in {folder}: {error.strerror}; choose another one"
             ) from error
         self.folder = folder
-        self._checks = threading.BoundedSemaphore(limits.checks_at_once)
+        self._checks = threading.Lock()
         self._running = RunningChecks()
         self._database = Database(database_url, SCHEMA)
         self._database.migrate()
@@ -324,11 +328,11 @@ class RecordingStore:
 
     def _verdict(self, row: sa.RowMapping) -> dict[str, Any]:
         reports: list[dict[str, Any]] = []
-        folder, limits = self._folder / row["folder"], json.dumps(asdict(self._limits))
-        arguments = ["--kind", row["kind"], "--name", row["name"], "--limits", limits]
-        command = [*self._program, str(folder), *arguments]
+        folder = str(self._folder / row["folder"])
+        most_bytes = f"--most-bytes={self._most_unpacked_bytes}"
+        command = [*self._program, folder, "--kind", row["kind"], "--name", row["name"], most_bytes]
         try:
-            words = run_program(command, self._limits.check_passed_s, reports.append, running=self._running)
+            words = run_program(command, CHECK_PASSED_S, reports.append, running=self._running)
         except BroughtDown as error:
             return {"stage": "rejected", "reason": str(error)}
         if not reports:

@@ -21,7 +21,6 @@ from gsplat_core.io.files import beside, sync_folder, write_durably
 from gsplat_core.io.model_files import open_model_file
 from services.errors import Rejected, StoreUnavailable
 from services.registry.bundle_file import PIECE_BYTES, digest_of, members_of
-from services.registry.limits import RegistryLimits
 
 PART_SUFFIX = ".part"
 """Suffix of incomplete files and folders."""
@@ -206,7 +205,7 @@ class StagedUpload:
     tensors_sha256: str
 
 
-def stage(file: Path, incoming: Path, digest: str | None, limits: RegistryLimits) -> StagedUpload:
+def stage(file: Path, incoming: Path, digest: str | None, most_bytes: int) -> StagedUpload:
     """Copy an upload durably into `incoming`, so the caller can no longer change it, and parse its
     container. On errors nothing is left behind.
 
@@ -214,14 +213,14 @@ def stage(file: Path, incoming: Path, digest: str | None, limits: RegistryLimits
         file: the upload.
         incoming: folder for the copy.
         digest: SHA-256 stated by the sender, in hex, or None.
-        limits: budgets of an upload.
+        most_bytes: largest upload in bytes.
 
     Raises:
         Rejected: if the file is too large, has another digest, or another format.
         StoreUnavailable: if the file cannot be read or the disk is full.
     """
     target = beside(incoming / "upload", PART_SUFFIX)
-    copy = _Copy(limits.upload_bytes)
+    copy = _Copy(most_bytes)
     try:
         try:
             with open_model_file(file) as source:

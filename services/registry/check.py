@@ -32,7 +32,16 @@ from gsplat_core.io.model_files import open_model_file
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.scene.model import Model
 from services.private_files import keep_files_private
-from services.registry.limits import NICENESS, lower_limit, taken_bytes
+from services.registry.limits import (
+    CHECK_MEMORY_BYTES,
+    CHECK_S,
+    MOST_GAUSSIANS,
+    MOST_PIXELS,
+    MOST_TENSOR_BYTES,
+    NICENESS,
+    lower_limit,
+    taken_bytes,
+)
 
 FAINTEST = 1 / 255
 """Smallest opacity that changes an 8-bit pixel."""
@@ -53,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     keep_files_private()
     options = _options(arguments)
     say = _say_json if options.json else _say_words
-    _limit_resources(options)
+    _limit_resources(options.device)
     try:
         model = _read(options)
         say({"stage": "validated", **_description(model)})
@@ -72,8 +81,8 @@ def main(arguments: list[str] | None = None) -> int:
         # torch's allocators raise RuntimeError when out of memory.
         if isinstance(error, RuntimeError) and not any(words in str(error).lower() for words in _MEMORY_WORDS):
             raise
-        most = options.memory_bytes
-        say({"stage": "rejected", "reason": f"it needs more memory than the {most} bytes that a check may take"})
+        reason = f"it needs more memory than the {CHECK_MEMORY_BYTES} bytes that a check may take"
+        say({"stage": "rejected", "reason": reason})
     return 0
 
 
@@ -82,31 +91,19 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--json", action="store_true", help="one line of JSON for each step")
     parser.add_argument("--device", default="cpu", help="device of the warm-up render: cpu or cuda")
-    parser.add_argument("--gaussians", type=int, default=2_000_000, help="largest number of Gaussians")
-    parser.add_argument("--model-bytes", type=int, default=4 << 30, help="largest size of the tensors in bytes")
-    parser.add_argument("--pixels", type=int, default=4096 * 4096, help="largest number of camera pixels")
-    parser.add_argument(
-        "--memory-bytes", type=int, default=12 << 30, help="memory limit in bytes, not counting torch itself"
-    )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        default=120.0,
-        help="limit of processor time in seconds, not counting the start of torch",
-    )
     return parser.parse_args(arguments)
 
 
-def _limit_resources(options: argparse.Namespace) -> None:
+def _limit_resources(device: str) -> None:
     """Limit processor time and memory beyond what torch uses at startup, and disable core files.
 
     Memory is not limited on CUDA, which maps far more address space than it uses.
     """
     os.nice(NICENESS)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    if options.device == "cpu":
-        lower_limit(resource.RLIMIT_DATA, taken_bytes() + options.memory_bytes)
-    lower_limit(resource.RLIMIT_CPU, math.ceil(time.process_time() + options.seconds), spare=5)
+    if device == "cpu":
+        lower_limit(resource.RLIMIT_DATA, taken_bytes() + CHECK_MEMORY_BYTES)
+    lower_limit(resource.RLIMIT_CPU, math.ceil(time.process_time() + CHECK_S), spare=5)
 
 
 def _read(options: argparse.Namespace) -> Model:
@@ -120,9 +117,9 @@ def _read(options: argparse.Namespace) -> Model:
         manifest = parse_manifest(file.read(MAX_MANIFEST_BYTES + 1), MANIFEST)
     camera = manifest.camera
     for found, most, what in (
-        (manifest.count, options.gaussians, "Gaussians"),
-        (manifest.tensors_bytes, options.model_bytes, "bytes of tensors"),
-        (camera.width_px * camera.height_px, options.pixels, f"pixels ({camera.width_px}x{camera.height_px})"),
+        (manifest.count, MOST_GAUSSIANS, "Gaussians"),
+        (manifest.tensors_bytes, MOST_TENSOR_BYTES, "bytes of tensors"),
+        (camera.width_px * camera.height_px, MOST_PIXELS, f"pixels ({camera.width_px}x{camera.height_px})"),
     ):
         if found > most:
             raise Unusable(f"the model has {found} {what}; at most {most} are allowed here")

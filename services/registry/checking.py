@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from services.errors import CheckFailed
-from services.registry.limits import RegistryLimits
+from services.registry.limits import CHECK_PASSED_S
 
 PROGRAM = (sys.executable, "-P", "-m", "services.registry.check")
 MOST_LINE_BYTES = 1 << 16
@@ -92,7 +92,6 @@ class RunningChecks:
 
 def run_check(
     folder: Path,
-    limits: RegistryLimits,
     device: str = "cpu",
     validated: Callable[[dict[str, Any]], None] = lambda description: None,
     program: tuple[str, ...] = PROGRAM,
@@ -103,7 +102,6 @@ def run_check(
 
     Args:
         folder: unpacked model.
-        limits: budgets of the check.
         device: device for the warm-up picture, cpu or cuda.
         validated: called with the description once the contents are valid.
         program: command that runs the check.
@@ -112,7 +110,7 @@ def run_check(
     Raises:
         CheckFailed: if the check could not run or was killed by `RunningChecks.end`.
     """
-    command = [*program, str(folder), "--json", "--device", device, *_budgets(limits)]
+    command = [*program, str(folder), "--json", "--device", device]
     verdict, description = None, dict[str, Any]()
 
     def take(line: dict[str, Any]) -> None:
@@ -127,7 +125,7 @@ def run_check(
                 validated(description)
 
     try:
-        words = run_program(command, limits.check_passed_s, take, device=device, running=running)
+        words = run_program(command, CHECK_PASSED_S, take, device=device, running=running)
     except BroughtDown as error:
         return Verdict(str(error))
     if verdict is None:
@@ -163,16 +161,6 @@ def run_program(
         if code != 0:
             _raise_for_the_end(code, late.is_set(), passed_s, said)
         return _last_words(said)
-
-
-def _budgets(limits: RegistryLimits) -> list[str]:
-    return [
-        f"--gaussians={limits.gaussians}",
-        f"--model-bytes={limits.model_bytes}",
-        f"--pixels={limits.pixels}",
-        f"--memory-bytes={limits.check_memory_bytes}",
-        f"--seconds={limits.check_s}",
-    ]
 
 
 @contextlib.contextmanager

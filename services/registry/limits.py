@@ -3,41 +3,26 @@
 from __future__ import annotations
 
 import resource
-from dataclasses import dataclass
 from pathlib import Path
 
 GIB = 1 << 30
 
 
-@dataclass(frozen=True)
-class RegistryLimits:
-    """Inclusive budgets of one version."""
-
-    upload_bytes: int = 4 * GIB
-    """Largest upload in bytes."""
-    gaussians: int = 2_000_000
-    model_bytes: int = 4 * GIB
-    """Largest total size of the tensors in memory, in bytes."""
-    pixels: int = 4096 * 4096
-    """Largest picture of the model's camera, in pixels."""
-    check_memory_bytes: int = 12 * GIB
-    """Memory of the checking process beyond torch itself, in bytes."""
-    check_s: float = 120.0
-    """Processor time of the check in seconds, without the start of torch. Exceeding it rejects the
-    version."""
-    check_passed_s: float = 600.0
-    """Wall-clock time of a check in seconds, including process start. Exceeding it means that the
-    machine is too busy, and the version is not rejected."""
-
-    checks_at_once: int = 1
-    """Number of concurrent checks; further checks wait."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ValueError(f"RegistryLimits.{name} must be positive, got {value!r}")
-
-
+MOST_UPLOAD_BYTES = 4 * GIB
+"""Default for the largest upload in bytes."""
+MOST_GAUSSIANS = 2_000_000
+MOST_TENSOR_BYTES = 4 * GIB
+"""Largest total size of the tensors in memory, in bytes."""
+MOST_PIXELS = 4096 * 4096
+"""Largest picture of the model's camera, in pixels."""
+CHECK_MEMORY_BYTES = 12 * GIB
+"""Memory of the checking process beyond torch itself, in bytes."""
+CHECK_S = 120.0
+"""Processor time of the check in seconds, without the start of torch. Exceeding it rejects the version."""
+CHECK_PASSED_S = 600.0
+"""Wall-clock time of a check in seconds, including process start. Exceeding it means that the machine is too busy, and the
+version is not rejected.
+"""
 NICENESS = 10
 """Nice value of a check; running streams have priority."""
 

@@ -17,7 +17,7 @@ from services.registry.bundle_file import SUFFIX
 from services.registry.checking import PROGRAM, RunningChecks, Verdict, run_check
 from services.registry.database import Database
 from services.registry.folder import FolderLock, UnpackedModels, findings, folder_name, remove_leftovers
-from services.registry.limits import RegistryLimits
+from services.registry.limits import MOST_UPLOAD_BYTES
 from services.registry.records import (
     MODELS,
     UNCHECKED,
@@ -61,7 +61,7 @@ class ModelRegistry:
         database_url: str | None = None,
         blobs_url: str | None = None,
         blob_options: dict[str, Any] | None = None,
-        limits: RegistryLimits = RegistryLimits(),
+        most_upload_bytes: int = MOST_UPLOAD_BYTES,
         device: str = "cpu",
         reached: Callable[[str], None] = _nothing,
         check_program: tuple[str, ...] = PROGRAM,
@@ -73,7 +73,7 @@ class ModelRegistry:
             database_url: `postgresql://…`, or None for SQLite in the folder.
             blobs_url: `s3://BUCKET/PREFIX`, or None to store uploads in the folder.
             blob_options: further options of the fsspec file system, such as an endpoint URL.
-            limits: budgets of uploads and checks.
+            most_upload_bytes: largest upload in bytes.
             device: device on which checks render, cpu or cuda.
             reached: called with the name of each completed step, in the calling thread.
             check_program: command that checks a folder.
@@ -81,7 +81,7 @@ class ModelRegistry:
         Raises:
             SchemaTooNew: if a later version of the program wrote the database.
         """
-        self._folder, self._limits, self._device = folder, limits, device
+        self._folder, self._most_upload_bytes, self._device = folder, most_upload_bytes, device
         self._reached, self._check_program = reached, check_program
         self._incoming = folder / "incoming"
         try:
@@ -93,7 +93,7 @@ class ModelRegistry:
             raise StoreUnavailable(
                 f"the registry cannot use {folder}: {error.strerror or error}; give a folder that can be written"
             ) from error
-        self._checks = threading.BoundedSemaphore(limits.checks_at_once)
+        self._checks = threading.Lock()
         self._running = RunningChecks()
         self._lock = FolderLock(folder / "lock")
         self._database = Database(database_url or f"sqlite:///{folder.absolute() / DATABASE_FILE}")
@@ -118,7 +118,7 @@ class ModelRegistry:
         check_name(name)
         check_by(by)
         with self._lock.shared():
-            staged = stage(file, self._incoming, digest, self._limits)
+            staged = stage(file, self._incoming, digest, self._most_upload_bytes)
             self._reached("upload staged")
             blob = f"{staged.digest}-{secrets.token_hex(8)}{SUFFIX}"
             try:
@@ -132,7 +132,7 @@ class ModelRegistry:
         """Check an uploaded version in a separate process; blocks until it is `ready` or `rejected`
         with a reason.
 
-        At most `RegistryLimits.checks_at_once` checks run concurrently. A version that was already
+        One check runs at a time; further checks wait. A version that was already
         checked is returned unchanged.
 
         Raises:
@@ -152,7 +152,7 @@ class ModelRegistry:
                 return version_record(row)
             with self._lock.shared():
                 folder = self._unpacked.folder_of(row)
-            verdict = run_check(folder, self._limits, self._device, validated, self._check_program, self._running)
+            verdict = run_check(folder, self._device, validated, self._check_program, self._running)
         self._reached("check ended")
         state = State.READY if verdict.reason is None else State.REJECTED
         return self._after_check(name, version, state, verdict)

@@ -11,13 +11,12 @@ from safetensors.torch import save
 from gsplat_core.io.bundle import load_bundle
 from services.errors import Conflict
 from services.registry.bundle_file import pack
-from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 
 
 @pytest.fixture
 def registry(tmp_path):
-    with ModelRegistry(tmp_path / "registry", limits=RegistryLimits(upload_bytes=4 << 20)) as opened:
+    with ModelRegistry(tmp_path / "registry", most_upload_bytes=4 << 20) as opened:
         yield opened
 
 

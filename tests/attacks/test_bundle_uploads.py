@@ -12,7 +12,6 @@ import torch
 
 from services.errors import Rejected, StoreUnavailable
 from services.registry.bundle_file import MANIFEST, TENSORS, pack
-from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 
 BLOCK = 512
@@ -20,7 +19,7 @@ BLOCK = 512
 
 @pytest.fixture
 def registry(tmp_path):
-    with ModelRegistry(tmp_path / "registry", limits=RegistryLimits(upload_bytes=4 << 20)) as opened:
+    with ModelRegistry(tmp_path / "registry", most_upload_bytes=4 << 20) as opened:
         yield opened
 
 

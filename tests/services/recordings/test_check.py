@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from services.recordings import check
-from services.recordings.archives import ArchiveInvalid, RecordingLimits
+from services.recordings.archives import ArchiveInvalid
 
 
 @pytest.fixture
@@ -21,9 +21,9 @@ def checked(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "folder"
     folder.mkdir()
 
-    def run(content: bytes, kind: str = "archive", name: str = "case", **limits):
+    def run(content: bytes, kind: str = "archive", name: str = "case", most_bytes: int = 1 << 20):
         (folder / "upload").write_bytes(content)
-        assert check.main([str(folder), "--kind", kind, "--name", name, "--limits", json.dumps(limits)]) == 0
+        assert check.main([str(folder), "--kind", kind, "--name", name, f"--most-bytes={most_bytes}"]) == 0
         out = capsys.readouterr().out
         assert out.count("\n") == 1
         return json.loads(out)
@@ -43,7 +43,7 @@ def test_a_recording_is_unpacked_in_place_of_leftovers_and_described(checked, pa
 
 def test_a_bad_archive_is_rejected(checked):
     assert checked(b"PK no archive") == {"stage": "rejected", "reason": "the archive is cut off: it has 13 bytes"}
-    verdict = checked(b"", entry_bytes=1)
+    verdict = checked(b"", most_bytes=1)
     assert verdict["stage"] == "rejected"
 
 
@@ -68,7 +68,8 @@ def test_what_cannot_be_read_is_a_verdict_and_not_a_crash(checked, monkeypatch, 
         raise error
 
     monkeypatch.setattr(check, "_put", fail)
-    verdict = checked(b"x", check_memory_bytes=1234)
+    monkeypatch.setattr(check, "CHECK_MEMORY_BYTES", 1234)
+    verdict = checked(b"x")
     assert verdict["stage"] == "rejected"
     assert verdict["reason"] == (
         "no" if isinstance(error, ArchiveInvalid) else "it needs more than 1234 bytes of memory to read"
@@ -81,11 +82,13 @@ def test_the_check_is_limited_as_the_settings_say(monkeypatch):
     monkeypatch.setattr(check.resource, "setrlimit", lambda kind, limits: set_to.update({kind: limits}))
     monkeypatch.setattr(check, "lower_limit", lambda kind, wanted, spare=0: set_to.update({kind: (wanted, spare)}))
     monkeypatch.setattr(check, "taken_bytes", lambda: 1000)
-    check._limit_resources(RecordingLimits(entry_bytes=5 << 20, check_memory_bytes=2000, check_s=60.5))
+    monkeypatch.setattr(check, "CHECK_MEMORY_BYTES", 2000)
+    monkeypatch.setattr(check, "CHECK_S", 60.5)
+    check._limit_resources(5 << 20)
     assert set_to[resource.RLIMIT_CORE] == (0, 0) and niced[0] > 0
     assert set_to[resource.RLIMIT_FSIZE] == (5 << 20, 0)
     assert set_to[resource.RLIMIT_DATA] == (3000, 0)
     seconds, spare = set_to[resource.RLIMIT_CPU]
     assert seconds >= 60.5 and spare > 0, "SIGXCPU comes before the kill"
-    check._limit_resources(RecordingLimits(entry_bytes=1))
+    check._limit_resources(1)
     assert set_to[resource.RLIMIT_FSIZE][0] == 1 << 20, "libraries write small files of their own"

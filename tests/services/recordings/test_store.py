@@ -13,7 +13,6 @@ from alembic.runtime.migration import MigrationContext
 
 from gsplat_core.io.recordings import open_recording
 from services.errors import CheckFailed, Conflict, NotFound, Rejected
-from services.recordings.archives import RecordingLimits
 from services.recordings.store import METADATA, RECORDINGS, State
 from services.registry.records import now
 
@@ -166,16 +165,10 @@ def test_a_check_that_fails_by_itself_leaves_the_recording_waiting(new_store, ad
 
 @pytest.mark.slow
 def test_a_check_that_takes_too_much_rejects_the_recording(new_store, add, packed):
-    store = new_store(limits=RecordingLimits(check_s=1), check_program=(sys.executable, "-c", BURNS))
+    store = new_store(check_program=(sys.executable, "-c", BURNS))
     add(store, "case", packed())
     record = store.check("case")
     assert record.state is State.REJECTED and "SIGXCPU" in record.reason
 
 
 BURNS = "import resource\nresource.setrlimit(resource.RLIMIT_CPU, (1, 2))\nwhile True: pass"
-
-
-@pytest.mark.parametrize("field", ["entries", "ratio", "check_s"])
-def test_limits_are_positive(field):
-    with pytest.raises(ValueError, match=f"{field} must be positive"):
-        RecordingLimits(**{field: 0})

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from services.recordings import archives as unpacking
-from services.recordings.archives import ArchiveInvalid, RecordingLimits
+from services.recordings.archives import ArchiveInvalid
 
 
 def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch):
@@ -19,7 +19,7 @@ def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch
         archive.writestr("session.json", "{}")
         archive.writestr("images/0001.png", "0123456789")
         archive.writestr("images/0002.png", "")
-    unpacking.unpack(tmp_path / "upload", tmp_path / "case", RecordingLimits())
+    unpacking.unpack(tmp_path / "upload", tmp_path / "case", 1 << 20)
     found = {
         str(p.relative_to(tmp_path / "case")): p.read_text() for p in (tmp_path / "case").rglob("*") if p.is_file()
     }

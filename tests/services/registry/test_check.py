@@ -17,23 +17,20 @@ from gsplat_core.io import model_files
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.rendering.alpha import AlphaRenderer
 from services.errors import CheckFailed
-from services.registry import check
+from services.registry import check, checking
 from services.registry.checking import PROGRAM, run_check
-from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import packed_model, save_model
 from tests.services.registry.stub_check import ALWAYS_READY, says
-
-IN_A_SECOND = RegistryLimits(check_passed_s=1.0)
 
 
 @pytest.fixture
 def checked(monkeypatch, capsys):
     """Return the check program's verdicts in this process, without resource limits. Its start takes two seconds."""
-    monkeypatch.setattr(check, "_limit_resources", lambda options: None)
+    monkeypatch.setattr(check, "_limit_resources", lambda device: None)
 
-    def verdicts(folder, *options):
-        assert check.main([str(folder), "--json", *options]) == 0
+    def verdicts(folder):
+        assert check.main([str(folder), "--json"]) == 0
         return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
     return verdicts
@@ -42,7 +39,7 @@ def checked(monkeypatch, capsys):
 def test_a_good_model_is_described_and_rendered(tmp_path):
     folder = save_model(tmp_path / "model")
     seen = []
-    verdict = run_check(folder, RegistryLimits(), validated=lambda description: seen.append(dict(description)))
+    verdict = run_check(folder, validated=lambda description: seen.append(dict(description)))
     assert verdict.reason is None
     (validated,) = seen
     assert validated == {
@@ -66,15 +63,16 @@ def test_words_for_people(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"),
+    ("budget", "most", "reason"),
     [
-        (["--gaussians=4"], "the model has 5 Gaussians; at most 4 are allowed here"),
-        (["--model-bytes=100"], r"bytes of tensors; at most 100"),
-        (["--pixels=191"], r"192 pixels \(16x12\); at most 191"),
+        ("MOST_GAUSSIANS", 4, "the model has 5 Gaussians; at most 4 are allowed here"),
+        ("MOST_TENSOR_BYTES", 100, r"bytes of tensors; at most 100"),
+        ("MOST_PIXELS", 191, r"192 pixels \(16x12\); at most 191"),
     ],
 )
-def test_a_model_over_a_budget_is_rejected_before_it_is_read(tmp_path, options, reason, checked):
-    (verdict,) = checked(save_model(tmp_path / "model"), *options)
+def test_a_model_over_a_budget_is_rejected_before_it_is_read(tmp_path, budget, most, reason, checked, monkeypatch):
+    monkeypatch.setattr(check, budget, most)
+    (verdict,) = checked(save_model(tmp_path / "model"))
     assert verdict["stage"] == "rejected"
     assert re.search(reason, verdict["reason"])
 
@@ -87,14 +85,17 @@ def test_a_model_without_gaussians_is_rejected(tmp_path, checked):
 @pytest.mark.slow
 def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
     folder = save_model(tmp_path / "model", count=40_000)
-    verdict = run_check(folder, RegistryLimits(check_memory_bytes=50 << 20))
+    code = (
+        "import sys\nfrom services.registry import check\ncheck.CHECK_MEMORY_BYTES = 50 << 20\nsys.exit(check.main())"
+    )
+    verdict = run_check(folder, program=(sys.executable, "-c", code))
     assert verdict.reason is not None and "memory" in verdict.reason
 
 
 def test_a_machine_without_memory_says_nothing_about_the_model(tmp_path, monkeypatch, capsys):
     """Through the same program in this process: the reader finds too little memory left."""
     folder = save_model(tmp_path / "model")
-    monkeypatch.setattr(check, "_limit_resources", lambda options: None)
+    monkeypatch.setattr(check, "_limit_resources", lambda device: None)
     monkeypatch.setattr(model_files, "available_bytes", lambda: 100)
     assert check.main([str(folder), "--json"]) == 1
     said = capsys.readouterr()
@@ -111,21 +112,20 @@ def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
 @pytest.mark.slow
 def test_a_check_that_computes_too_long_is_ended(tmp_path):
     endless = (
-        "from services.registry import check\n"
-        "check._limit_resources(check._options(['.', '--seconds=0.1']))\n"
-        "while True: pass\n"
+        "from services.registry import check\ncheck.CHECK_S = 0.1\ncheck._limit_resources('cpu')\nwhile True: pass\n"
     )
     done = subprocess.run([sys.executable, "-c", endless], capture_output=True)
     assert -done.returncode == signal.SIGXCPU
 
 
-def test_a_check_that_lasts_too_long_is_ended_with_what_it_started(tmp_path):
+def test_a_check_that_lasts_too_long_is_ended_with_what_it_started(tmp_path, monkeypatch):
+    monkeypatch.setattr(checking, "CHECK_PASSED_S", 1.0)
     pid_file = tmp_path / "pid"
     program = says(
         f"import subprocess, sys, time; child = subprocess.Popen(['sleep', '60']); open({str(pid_file)!r}, 'w').write(str(child.pid)); time.sleep(60)"
     )
     with pytest.raises(CheckFailed, match="lasted longer than 1 s; check again when this machine is less busy"):
-        run_check(tmp_path, IN_A_SECOND, program=program)
+        run_check(tmp_path, program=program)
     child = int(pid_file.read_text())
     for _ in range(100):
         if not os.path.exists(f"/proc/{child}") or "Z" in Path(f"/proc/{child}/stat").read_text().split():
@@ -138,7 +138,7 @@ def test_a_check_that_lasts_too_long_is_ended_with_what_it_started(tmp_path):
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGSEGV", "SIGXCPU"])
 def test_a_model_that_brings_its_check_down_is_rejected(tmp_path, name):
     program = says(f"import os, signal; os.kill(os.getpid(), signal.{name})")
-    assert f"was ended by {name}" in run_check(tmp_path, RegistryLimits(), program=program).reason
+    assert f"was ended by {name}" in run_check(tmp_path, program=program).reason
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_a_model_that_brings_its_check_down_is_rejected(tmp_path, name):
 )
 def test_a_check_that_cannot_be_run_says_nothing_about_the_model(tmp_path, program, said):
     with pytest.raises(CheckFailed, match=said):
-        run_check(tmp_path, RegistryLimits(), program=program)
+        run_check(tmp_path, program=program)
 
 
 def test_a_check_that_failed_can_be_made_again(tmp_path, files):
@@ -191,7 +191,7 @@ def test_closing_the_registry_ends_its_checks(tmp_path, files):
 def test_credentials_do_not_reach_the_check(tmp_path, monkeypatch):
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
     program = says("import json, os; print(json.dumps({'stage': 'rejected', 'reason': ' '.join(os.environ)}))")
-    names = run_check(tmp_path, RegistryLimits(), program=program).reason.split()
+    names = run_check(tmp_path, program=program).reason.split()
     assert "PATH" in names and not any("AWS" in name or "INTRASPLAT_" in name for name in names)
 
 
@@ -199,13 +199,13 @@ def test_a_flood_of_words_is_not_collected(tmp_path):
     program = says(
         "import sys\nfor _ in range(100_000): sys.stdout.write('x' * 100)\nprint('\\n{\"stage\": \"ready\"}')"
     )
-    assert run_check(tmp_path, RegistryLimits(), program=program).reason is None
+    assert run_check(tmp_path, program=program).reason is None
 
 
 def test_a_picture_that_is_not_finite_is_rejected(tmp_path, monkeypatch, capsys):
     """Through the same program in this process, with a renderer that is broken."""
     folder = save_model(tmp_path / "model")
-    monkeypatch.setattr(check, "_limit_resources", lambda options: None)
+    monkeypatch.setattr(check, "_limit_resources", lambda device: None)
     render = AlphaRenderer.render
 
     def broken(self, camera, time_s, *arguments):

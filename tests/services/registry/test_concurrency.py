@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from services.errors import NotFound
-from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.activating import ROUNDS, activate_together
 from tests.services.registry.made import add_ready, assert_whole, packed_model
@@ -70,8 +69,7 @@ def test_checks_wait_for_each_other(tmp_path, files):
     program = says(
         f'import os, time; os.mkdir({taken!r}); time.sleep(0.2); os.rmdir({taken!r}); print(\'{{"stage": "ready"}}\')'
     )
-    limits = RegistryLimits(checks_at_once=1)
-    with ModelRegistry(tmp_path / "registry", check_program=program, limits=limits) as registry:
+    with ModelRegistry(tmp_path / "registry", check_program=program) as registry:
         for _ in range(3):
             registry.upload("liver", packed_model(files), None, "surgeon")
         with ThreadPoolExecutor(3) as pool:

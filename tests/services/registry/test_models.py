@@ -8,7 +8,6 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from services.errors import BlobDamaged, Conflict, NotFound, Rejected, StillActive, StoreUnavailable
-from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import add_ready, assert_whole, packed_model, sha256
 from tests.services.registry.stub_check import ALWAYS_READY, says
@@ -175,7 +174,7 @@ def test_a_wrong_digest_is_refused_and_nothing_is_kept(sqlite_registry, files, t
 
 def test_a_file_over_the_limit_is_refused(tmp_path, files):
     file = packed_model(files)
-    with ModelRegistry(tmp_path, limits=RegistryLimits(upload_bytes=file.stat().st_size - 1)) as registry:
+    with ModelRegistry(tmp_path, most_upload_bytes=file.stat().st_size - 1) as registry:
         with pytest.raises(Rejected, match="more than"):
             registry.upload("liver", file, None, "surgeon")
         assert not list((tmp_path / "incoming").iterdir())
