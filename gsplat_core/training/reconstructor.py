@@ -87,7 +87,7 @@ class Reconstructor:
         self._schedule: Schedule
         self._growth: PostponedGrowth | None
         if live is None:
-            self._schedule, self._growth = WindowSchedule(config, self.device), None
+            self._schedule, self._growth = WindowSchedule(self.device), None
         else:
             self._schedule = NewestFirstSchedule(live, config, self.device)
             self._growth = PostponedGrowth(config, self.device, self._covering)

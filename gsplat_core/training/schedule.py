@@ -152,7 +152,7 @@ class WindowSchedule(Schedule):
     deadline all remaining ones.
     """
 
-    def __init__(self, config: ReconstructorConfig, device: torch.device) -> None:
+    def __init__(self, device: torch.device) -> None:
         super().__init__(device)
         self._usual_first_loss = math.inf
 
