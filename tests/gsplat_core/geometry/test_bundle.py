@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from gsplat_core.poses.bundle import Bundle, adjust, errors_px
+from gsplat_core.poses.bundle import Bundle, adjust, descend, errors_px, moved, placed
 from gsplat_core.poses.se3 import exp, inverse
 
 FOCAL = 300.0
@@ -98,3 +99,97 @@ def test_a_point_behind_a_camera_is_finite():
     found = adjust(replace(true, points=points), fixed=first_only(true))
     assert torch.isfinite(found.points).all() and torch.isfinite(found.poses).all()
     assert float(errors_px(found)[true.point != 0].max()) < 1
+
+
+@pytest.mark.parametrize("points_move", [True, False])
+def test_exact_derivatives_converge_quadratically(points_move):
+    """With an error in a derivative, steps still improve, but five of them do not reach 1e-7 px from 20 px."""
+    true = known_scene()
+    start = disturbed(true)
+    if not points_move:
+        start = replace(start, points=true.points)
+    assert float(errors_px(start).max()) > 20
+    found = adjust(start, fixed=first_only(true), rounds=5, points_move=points_move)
+    assert float(errors_px(found).max()) < 1e-7
+
+
+def test_errors_are_distances_in_pixels():
+    true = known_scene(cameras=2, points=5)
+    rays = true.rays.clone()
+    rays[3] += torch.tensor([3.0, -4.0], dtype=torch.float64) / FOCAL
+    errors = errors_px(replace(true, rays=rays))
+    torch.testing.assert_close(errors, 5.0 * (torch.arange(10) == 3).double(), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-13, 1e-6, 9e-5, 1.1e-4, 0.01, 0.7, 2.5])
+def test_a_small_motion_is_the_exponential_of_its_twist(size):
+    twist = np.array([0.3, -0.2, 0.5, *(size * np.array([0.6, -0.64, 0.48]))])
+    pose = exp(torch.tensor([1.0, 2.0, -3.0, 0.4, 0.5, -0.6], dtype=torch.float64))
+    generator = torch.zeros(4, 4, dtype=torch.float64)
+    x, y, z = twist[3:]
+    generator[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    generator[:3, 3] = torch.from_numpy(twist[:3])
+    wanted = torch.linalg.matrix_exp(generator) @ pose
+    np.testing.assert_allclose(moved(pose.numpy(), twist), wanted.numpy(), atol=1e-13, rtol=0)
+
+
+def one_camera(index: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    true = known_scene()
+    return true.poses[index].numpy(), true.points.numpy(), true.rays[true.camera == index].numpy()
+
+
+@pytest.mark.parametrize("size", [0.01, 0.05])
+def test_a_camera_before_known_points_is_placed_exactly_in_eight_rounds(size):
+    pose, points, rays = one_camera()
+    start = moved(pose, size * np.array([1.0, -2.0, 3.0, 1.0, -1.0, 0.5]))
+    start[:3, :3] *= 1.001  # a rotation that has accumulated rounding errors
+    found, errors = placed(start, points, rays, FOCAL)
+    np.testing.assert_allclose(found, pose, atol=1e-10)
+    assert errors.max() < 1e-8
+
+
+def test_points_astray_hardly_move_a_placed_camera_and_keep_their_errors():
+    pose, points, rays = one_camera()
+    rays[:15] += np.array([30.0, -40.0]) / FOCAL
+    found, errors = placed(moved(pose, np.full(6, 0.01)), points, rays, FOCAL)
+    assert errors[15:].max() < 0.15 and abs(errors[:15] - 50).max() < 0.15
+    assert np.abs(found[:3, 3] - pose[:3, 3]).max() < 0.05
+
+
+def test_points_behind_a_placed_camera_do_not_hinder_it():
+    pose, points, rays = one_camera()
+    points = points.copy()
+    points[:4, 2] -= 200
+    found, errors = placed(moved(pose, np.full(6, 0.01)), points, rays, FOCAL)
+    assert np.isfinite(errors).all() and errors[4:].max() < 1.5 and np.isfinite(found).all()
+
+
+def test_damping_falls_after_a_success_and_grows_after_a_failure():
+    """Steps succeed while the state is above 3, as the cost then falls."""
+    dampings = []
+
+    def step(state, damping):
+        dampings.append(damping)
+        return state - 1
+
+    state, cost = descend(6.0, step, lambda state: 1.0 + abs(state - 3.2), rounds=100)
+    assert state == 3.0 and cost == pytest.approx(1.2)
+    successes = [1e-4 / 5**number for number in range(4)]
+    assert dampings[:4] == pytest.approx(successes)
+    ratios = np.divide(dampings[4:], dampings[3:-1])
+    assert np.allclose(ratios, 8) or np.allclose(ratios[1:], 8)
+    assert dampings[-1] * 8 > 1e4 >= dampings[-1]
+
+
+def test_a_descent_ends_when_the_cost_hardly_falls_or_after_its_rounds():
+    calls = []
+
+    def step(state, damping):
+        calls.append(damping)
+        return state + 1
+
+    descend(0, step, lambda state: 1.0 - 1e-7 * state, rounds=50)
+    assert len(calls) == 1
+    calls.clear()
+    assert descend(0, step, lambda state: 100.0 - state, rounds=20)[0] == 20
+    assert len(calls) == 20 and min(calls) == pytest.approx(1e-9)
