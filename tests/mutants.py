@@ -15,7 +15,8 @@ functions needs a session of its own. No file of the checkout is changed.
 Only tests that execute the changed line run, for a minute at most; `tests/executed.py` records them.
 A mutant on a line that no test executes survives. A run ends at the first failure. A test that also
 fails without the mutant is flaky: it is listed and excluded, and the remaining tests decide. Mutants
-are drawn at random with a seed, in equal parts from each folder.
+are drawn at random with a seed, in equal parts from each folder. Without a GPU, classes that capture
+CUDA graphs are left out.
 
 The boundary of a comparison (`<` to `<=`) is shifted only where an integer is compared, by its text. Of 63
 boundaries drawn from all folders, the rule leaves out 44. 34 of them compare measured numbers or clock times,
@@ -43,6 +44,7 @@ from types import CodeType, FunctionType
 from typing import Any
 
 import pytest
+import torch
 
 from tests.executed import Executed, bring_up_to_date
 from tests.forks import RAISED, ROOT, Fork, execute_everywhere, import_libraries, pytest_fork
@@ -115,8 +117,20 @@ class Mutant:
 def changeable(path: Path) -> tuple[ast.Module, tuple[tuple[int, int], ...]]:
     """Return the tree of a module, and the node index and change number of each of its mutants."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    places = ((index, number) for index, node in enumerate(ast.walk(tree)) for number in range(len(_changes(node))))
+    unused = set() if torch.cuda.is_available() else {id(node) for each in tree.body for node in _of_graph(each)}
+    places = (
+        (index, number)
+        for index, node in enumerate(ast.walk(tree))
+        if id(node) not in unused
+        for number in range(len(_changes(node)))
+    )
     return tree, tuple(places)
+
+
+def _of_graph(statement: ast.stmt) -> list[ast.AST]:
+    """Return the nodes of a class that captures CUDA graphs, which runs on a GPU only."""
+    nodes = list(ast.walk(statement)) if isinstance(statement, ast.ClassDef) else []
+    return nodes if any(isinstance(node, ast.Name) and node.id == "GraphMemory" for node in nodes) else []
 
 
 def mutant_at(path: Path, index: int, number: int) -> Mutant | None:

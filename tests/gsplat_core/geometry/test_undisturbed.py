@@ -81,3 +81,13 @@ def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
     motion = fitted_undisturbed(tracks, fitted(tracks, HZ))
     assert np.isfinite(motion.terms).all() and np.isfinite(motion.error).all()
     assert np.isfinite(off_px(motion.at(TIMES_S), tracks)).all()
+
+
+def test_a_refit_leaves_out_the_pull() -> None:
+    """The same with few points: errors at the pulled place shrink, and the rest of the motion stays."""
+    points, poses = places(TIMES_S, count=90), swaying(TIMES_S)
+    tracks = tracks_of(pulled(points), poses, TIMES_S)
+    first = fitted(tracks, HZ, rounds=4)
+    again = fitted_undisturbed(tracks, first)
+    before, after = (np.sqrt((distance_errors(each, points, poses) ** 2).mean()) for each in (first, again))
+    assert after < 0.75 * before
