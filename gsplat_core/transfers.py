@@ -1,4 +1,4 @@
-"""Asynchronous copies between host and device memory. CPU tensors are not copied."""
+"""Asynchronous copies of tensors. Between host and device memory, CPU tensors are not copied."""
 
 from __future__ import annotations
 
@@ -24,6 +24,11 @@ def tensor_of(array: NDArray, device: torch.device | str = "cpu") -> Tensor:
     staged = torch.empty(array.shape, dtype=_torch_type(array.dtype), device="cpu", pin_memory=True)
     np.copyto(staged.numpy(), array)
     return staged.to(device, non_blocking=True)
+
+
+def copy_each(to: list[Tensor], values: list[Tensor]) -> None:
+    """Copy each tensor to its counterpart with as few launches as possible."""
+    torch._foreach_copy_(to, values, non_blocking=True)
 
 
 def _torch_type(dtype: np.dtype[Any]) -> torch.dtype:

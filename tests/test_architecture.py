@@ -82,6 +82,28 @@ def test_experimental_methods_are_named_by_registries_only():
     assert list(folder.glob("*.py")) and wrong == []
 
 
+FIELD_MODULES = ("gsplat_core/choices.py", "gsplat_core/deformation/", "gsplat_core/ops/", "gsplat_core/reference/")
+"""Registry entries of the deformation fields, their modules and their kernels."""
+FIELD_NAMES, FIELD_CLASSES = {"basis", "hexplane"}, {"BasisField", "HexPlaneField"}
+
+
+def named_fields(path: Path) -> set[str]:
+    """Return the names of fields in the strings of a file, and their classes in its code."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    strings = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    identifiers = {getattr(node, kind, None) for node in nodes for kind in ("id", "attr", "name")}
+    return strings & FIELD_NAMES | {each for each in identifiers if isinstance(each, str)} & FIELD_CLASSES
+
+
+def test_no_other_module_names_a_deformation_field():
+    assert named_fields(ROOT / "gsplat_core/choices.py") >= {"basis", "hexplane"}
+    assert named_fields(ROOT / "gsplat_core/deformation/__init__.py") >= {"BasisField", "HexPlaneField"}
+    for package in MAY_IMPORT:
+        for path in (ROOT / package).rglob("*.py"):
+            name = path.relative_to(ROOT).as_posix()
+            assert name.startswith(FIELD_MODULES) or not named_fields(path), name
+
+
 def test_geometry_knows_nothing_of_training():
     files = sorted((ROOT / "gsplat_core/geometry").rglob("*.py"))
     assert files

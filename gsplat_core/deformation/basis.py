@@ -27,21 +27,15 @@ from gsplat_core.deformation.basis_bumps import (
     BumpTensors,
     bump_capacity,
 )
-from gsplat_core.deformation.field import (
-    Continuation,
-    DeformationField,
-    FieldKind,
-    FieldRates,
-    NewField,
-    copy_each,
-    displaced,
-    ops_for,
-)
+from gsplat_core.deformation.continuation import Continuation
+from gsplat_core.deformation.field import Capabilities, DeformationField, FieldSlot, displaced, ops_for
+from gsplat_core.deformation.registry import PARAMETER_BYTES, FieldKind, FieldRates, NewField
 from gsplat_core.deformation.regularisers import least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import BASIS_CHANNELS, POSITION, ROTATION, Gaussians
+from gsplat_core.transfers import copy_each
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
@@ -144,10 +138,24 @@ class BasisField(BumpTensors):
     """
 
     kind = "basis"
-    slot_type = BasisSlot
-    continues = True
-    takes_colours = True
-    takes_positions = True
+
+    @property
+    def capabilities(self) -> Capabilities:
+        # The columns of a ring are not in temporal order.
+        in_order = not self.columns.is_ring
+        return Capabilities(
+            rows=self,
+            fixed_rows=self,
+            motion=self,
+            captured_motion=self,
+            continuation=self,
+            frame_deltas=self,
+            slot=self.slot,
+            add_colours=self.add_colours,
+            follow=self.follow if in_order else None,
+            smooth_in_time=self.smooth_in_time if in_order else None,
+            share_motion=self.share_motion,
+        )
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:
@@ -218,15 +226,13 @@ class BasisField(BumpTensors):
         )
 
     def smooth_in_time(self, amount: float) -> None:
-        """Smooth the weights of neighbouring bumps; see `DeformationField.smooth_in_time`."""
-        if self.columns.is_ring:
-            raise InvalidInput(
-                "a field that forgets its past has no columns in the order of time; smooth one that keeps them all"
-            )
+        """Smooth the weights of neighbouring bumps; see `Capabilities.smooth_in_time`. Not for a
+        ring.
+        """
         towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
 
     def share_motion(self, neighbours: Tensor, amount: float) -> None:
-        """Smooth each bump's position weights; see `DeformationField.share_motion`."""
+        """Smooth each bump's position weights; see `Capabilities.share_motion`."""
         towards_others_(self.weights.data[: self.count, : self.bumps, POSITION], neighbours, amount)
 
     @property
@@ -234,10 +240,9 @@ class BasisField(BumpTensors):
         """Number of parameters of the Gaussians and bumps in use."""
         return self.count * self.bumps * (2 + BASIS_CHANNELS)
 
-    @property
-    def has_frame_deltas(self) -> bool:
-        """True for all basis fields."""
-        return True
+    def slot(self, rows: int) -> FieldSlot:
+        """Create a slot for `rows` Gaussians."""
+        return BasisSlot(self, rows)
 
     def frame_time(self, time_s: float) -> float:
         """Return the argument of `frame_deltas` for a time in seconds: its `tau`."""
@@ -261,13 +266,12 @@ class BasisField(BumpTensors):
         return at if self.continuation is None else self.continuation.captured(at)
 
     def scale_positions(self, factor: Tensor) -> None:
-        """Scale position weights and their Adam moments; see `DeformationField.scale_positions`."""
+        """Scale position weights and their Adam moments; see `EditableMotion.scale_positions`."""
         self._scale(POSITION, factor)
 
-    def scale_rotations(self, factor: Tensor) -> bool:
-        """Scale rotation weights and their Adam moments; see `DeformationField.scale_rotations`."""
+    def scale_rotations(self, factor: Tensor) -> None:
+        """Scale rotation weights and their Adam moments; see `EditableMotion.scale_rotations`."""
         self._scale(ROTATION, factor)
-        return True
 
     def _scale(self, channels: slice, factor: Tensor) -> None:
         count, each = len(factor), factor[:, None, None]
@@ -277,47 +281,49 @@ class BasisField(BumpTensors):
             self._moments.second[2][:count, :, channels] /= each.square()
 
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
-        """See `DeformationField.continue_with`."""
+        """Extrapolate after the newest frame; see `Continuable.continue_with`."""
         continuation = Continuation(int(self.weights.shape[0]), self.weights.device)
         continuation.write(velocity, from_s, horizon_s)
         continuation.set_clock(self.tau, self.spacing_s)
         self.continuation = continuation
 
-    def move_to(self, time_s: float, deltas: Tensor) -> bool:
-        """Change weights in proportion to the bump heights; see `DeformationField.move_to`.
+    def move_to(self, time_s: float, deltas: Tensor) -> None:
+        """Change weights in proportion to the bump heights; see `EditableMotion.move_to`.
 
         This is the minimum-norm change that yields the wanted deltas.
         """
         self.move_to_at(self.tau(time_s), deltas)
-        return True
 
     def move_to_at(self, tau: float | Tensor, deltas: Tensor) -> None:
         """Apply `move_to` at a normalised time.
 
         Args:
             tau: time as returned by `self.tau`, float or float32 [1] on the field's device.
-            deltas: [N, 13], also for all rows including reserved ones.
+            deltas: [N, 13], or [N, 16] with ignored columns; also for all rows including reserved
+                ones.
         """
         bumps = (p.data for p in self._parameters_of(deltas.shape[0]))
-        self._ops.basis_field_move_to_(*bumps, tau, deltas)
+        self._ops.basis_field_move_to_(*bumps, tau, deltas[:, :BASIS_CHANNELS].contiguous())
 
-    def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
-        """Fit weights of the initial bumps by least squares; see `DeformationField.follow`.
+    def motion_tensors(self) -> Sequence[Tensor]:
+        """Return centres, log-widths and weights."""
+        return self._whole_parameters()
 
-        The result is bounded by `OVERSHOOT`. Returns False for a ring.
+    def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> None:
+        """Fit weights of the initial bumps by least squares; see `Capabilities.follow`. Not for a
+        ring.
+
+        The result is bounded by `OVERSHOOT`.
         """
-        if self._columns.is_ring:
-            return False
         solution = least_squares_weights([self.tau(time_s) for time_s in times_s], self.bumps)
         weights = torch.einsum("bt,ntc->nbc", solution.to(offsets), offsets)
         low, high = offsets.amin(dim=1, keepdim=True), offsets.amax(dim=1, keepdim=True)
         beyond = OVERSHOOT * (high - low)
         weights = weights.clamp((low - beyond) / BUMPS_PER_SPACING, (high + beyond) / BUMPS_PER_SPACING)
         self.weights.data[rows, : self.bumps, POSITION] = weights
-        return True
 
     def add_colours(self, time_s: float, change: Tensor) -> None:
-        """See `DeformationField.add_colours`."""
+        """Change colour weights in proportion to the bump heights; see `Capabilities.add_colours`."""
         self.add_colours_at(self.tau(time_s), change)
 
     def add_colours_at(self, tau: float | Tensor, change: Tensor) -> None:
@@ -453,6 +459,15 @@ def new_basis_field(wanted: NewField) -> BasisField:
     return field
 
 
+BUMPS_AT_START = 5
+"""Number of bumps per Gaussian beyond one per spacing, for the memory estimate."""
+
+
+def training_bytes(gaussians: int, spacings: float) -> int:
+    """Return the estimated memory of bumps in training."""
+    return PARAMETER_BYTES * gaussians * (BASIS_CHANNELS + 2) * (BUMPS_AT_START + round(spacings))
+
+
 KIND = FieldKind(
     field=BasisField,
     new=new_basis_field,
@@ -465,4 +480,5 @@ KIND = FieldKind(
     rates=BasisLearningRates(),
     training=BasisTraining,
     captured_training=CapturedBasisTraining,
+    training_bytes=training_bytes,
 )

@@ -11,7 +11,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.continuation import ContinuedField
+from gsplat_core.deformation.field import checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
 from gsplat_core.scene.gaussians import BASIS_CHANNELS, Gaussians
@@ -160,7 +161,7 @@ BUMPS_PER_SPACING = math.sqrt(math.pi)
 """Sum at any time of equal bumps of width 1 at unit spacing (within 0.02 %)."""
 
 
-class BumpTensors(DeformationField):
+class BumpTensors(ContinuedField):
     """Centres and log-widths [N, B], weights [N, B, 13], and their moments once trained.
 
     Rows are Gaussians and columns are bumps. Both may include inert spares, for reserved Gaussians
@@ -243,11 +244,11 @@ class BumpTensors(DeformationField):
         self._columns = replace(self._columns, is_ring=True)
         self._history_s, self._fading_s = history_s, fading_s
 
-    def restart(self, time_s: float, count: int) -> bool:
-        """Reset the field in place, see `DeformationField.restart`; requires enough rows."""
+    def restart(self, time_s: float, count: int) -> None:
+        """Reset the field in place; see `FixedRows.restart`."""
         spare_rows = self.weights.shape[0] - count
         if spare_rows < 0:
-            return False
+            raise InvalidInput(f"a field with {self.weights.shape[0]} rows cannot restart with {count} Gaussians")
         self._spare_rows = spare_rows
         self._time_window_s = checked_window((time_s, time_s + COLUMNS_AHEAD * self.spacing_s))
         origin_s = time_s - self.spacing_s
@@ -255,7 +256,6 @@ class BumpTensors(DeformationField):
         for tensor, inert in self._tensors_and_fill():
             tensor.fill_(inert)
         self.centers.data[:count] = self._columns.laid_out(self.centers.data)
-        return True
 
     def extend(self, time_window_s: tuple[float, float], *, hold_at_s: float | None = None) -> None:
         """Advance the window: append bumps at the head and drop expired ones at the tail.
@@ -296,11 +296,11 @@ class BumpTensors(DeformationField):
         self._change_moments(lambda t: t[:used][index])
         self._spare_rows = 0
 
-    def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
+    def append(self, count: int, parents: Tensor | None = None) -> None:
         """Append zero bumps for new Gaussians, or copies of the bumps of `parents`, with new Adam
         state.
         """
-        count, used = count_of(added), self.count
+        used = self.count
         if parents is not None and parents.shape != (count,):
             raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
         if count > self._spare_rows:
@@ -312,8 +312,8 @@ class BumpTensors(DeformationField):
         else:
             self.centers.data[used : used + count] = self._columns.laid_out(self.centers.data)
 
-    def reserve(self, rows: int) -> bool:
-        """See `DeformationField.reserve`."""
+    def reserve(self, rows: int) -> None:
+        """Allocate inert rows; see `FixedRows.reserve`."""
         added = rows - self.weights.shape[0]
         if added > 0:
             widened = (
@@ -323,10 +323,9 @@ class BumpTensors(DeformationField):
             self._set_parameters(*widened)
             self._change_moments(lambda t: torch.cat([t, t.new_zeros(added, *t.shape[1:])]))
             self._spare_rows += added
-        return True
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Apply row moves, see `DeformationField.close_gaps`; tensors keep their addresses."""
+        """Apply row moves, see `FixedRows.close_gaps`; tensors keep their addresses."""
         for tensor, inert in self._tensors_and_fill():
             moves.apply(tensor, inert)
         self._spare_rows += moves.before - moves.count
@@ -334,8 +333,7 @@ class BumpTensors(DeformationField):
     def config(self) -> dict[str, Any]:
         """Return kind, window and column layout."""
         return {
-            "kind": self.kind,
-            "time_window_s": list(self._time_window_s),
+            **super().config(),
             "bumps": self.bumps,
             "channels": BASIS_CHANNELS,
             "origin_s": self._columns.origin_s,
@@ -359,7 +357,7 @@ class BumpTensors(DeformationField):
         return self._copy_of(self.count)
 
     def _copy_of(self, rows: int) -> Self:
-        memo: dict[int, Any] = {id(state): None for state in self._training_state()}
+        memo: dict[int, Any] = {id(self._moments): None}
         for parameter in self._whole_parameters():
             kept = self._columns.in_order(parameter.data[:rows]).clone(memory_format=torch.contiguous_format)
             memo[id(parameter)] = torch.nn.Parameter(kept, requires_grad=False)
@@ -367,9 +365,6 @@ class BumpTensors(DeformationField):
         copied._columns = replace(self._columns, places=self.bumps, oldest=0, is_ring=False)
         copied._history_s, copied._fading_s, copied._spare_rows = None, math.inf, 0
         return copied.requires_grad_(False)
-
-    def _training_state(self) -> Sequence[object]:
-        return (self._moments,)
 
     def _held(self, time_s: float) -> Tensor:
         """Return the deltas [N, 13] that new bumps continue, decayed where training is active."""

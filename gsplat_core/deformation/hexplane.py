@@ -16,15 +16,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import (
-    DeformationField,
-    FieldKind,
-    FieldRates,
-    NewField,
-    WholeFieldSlot,
-    checked_window,
-    ops_for,
-)
+from gsplat_core.deformation.field import Capabilities, DeformationField, WholeFieldSlot, checked_window, ops_for
+from gsplat_core.deformation.registry import FieldKind, FieldRates, NewField
 from gsplat_core.deformation.regularisers import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
@@ -88,7 +81,6 @@ class HexPlaneField(DeformationField):
     """
 
     kind = "hexplane"
-    slot_type = WholeFieldSlot
 
     def __init__(
         self,
@@ -127,19 +119,21 @@ class HexPlaneField(DeformationField):
     ) -> HexPlaneField:
         return cls(gaussians, time_window_s, **architecture)
 
+    @property
+    def capabilities(self) -> Capabilities:
+        # The torch fallback for other sizes cannot be captured in a CUDA graph.
+        has_kernel = takes_layers(self.channels, len(self.levels), self.width, self.depth)
+        return Capabilities(
+            frame_deltas=self if has_kernel else None,
+            slot=lambda rows: WholeFieldSlot(self),
+            smooth_in_time=self.smooth_in_time,
+        )
+
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
         """Normalise positions and time to [N, 4] in [-1, 1], clamped to the box and window."""
         low, high = self.box.to(means.dtype)
         space = (2 * (means - low) / (high - low) - 1).clamp(-1, 1)
         return torch.cat([space, torch.full_like(space[:, :1], self.frame_time(time_s))], dim=1)
-
-    @property
-    def has_frame_deltas(self) -> bool:
-        """True if the kernel supports the network's sizes.
-
-        The torch fallback cannot be captured in a CUDA graph.
-        """
-        return takes_layers(self.channels, len(self.levels), self.width, self.depth)
 
     def frame_time(self, time_s: float) -> float:
         """Map `time_s`, clamped to the time window, to the argument of `frame_deltas`
@@ -252,7 +246,7 @@ class HexPlaneField(DeformationField):
         self._time_window_s = (start, end)
 
     def smooth_in_time(self, amount: float) -> None:
-        """Smooth the rows of the time planes; see `DeformationField.smooth_in_time`."""
+        """Smooth the rows of the time planes; see `Capabilities.smooth_in_time`."""
         for plane in self._named(TIME_PLANES):
             towards_neighbours_(plane.data.transpose(0, 1), amount)
 
@@ -268,8 +262,7 @@ class HexPlaneField(DeformationField):
     def config(self) -> dict[str, Any]:
         """Return kind, window and architecture; the box is stored with the tensors."""
         return {
-            "kind": self.kind,
-            "time_window_s": list(self.time_window_s),
+            **super().config(),
             "channels": self.channels,
             "resolution": list(self.resolution),
             "levels": list(self.levels),
@@ -354,6 +347,8 @@ class HexPlaneTraining:
     """Number of learning rates of `update`: planes and network."""
     reads_positions = True
     """The deltas depend on the Gaussians' positions; `update` adds that part of their gradient."""
+    add_colours = None
+    """Colours do not change over time."""
 
     def __init__(
         self,
@@ -428,10 +423,6 @@ class HexPlaneTraining:
         network_adam_(self._network, gradient.network, self._network_first, self._network_second, of_network)
         self._state = None
 
-    def add_colours(self, change: Tensor, time: Tensor) -> None:
-        """Raise InvalidInput, because a HexPlane does not support colour changes at one time."""
-        raise InvalidInput("the colours of a hexplane field cannot be set at one time; train them")
-
 
 @dataclass(frozen=True)
 class HexPlaneLearningRates(FieldRates):
@@ -462,14 +453,6 @@ def new_hexplane_field(wanted: NewField) -> HexPlaneField:
     return HexPlaneField(wanted.gaussians, wanted.time_window_s, resolution=resolution, levels=(1, 2, 4))
 
 
-def captured_training(field: HexPlaneField) -> HexPlaneTraining | None:
-    """Return the field's trainer for CUDA graphs, or None if the kernels do not support
-    its sizes.
-    """
-    fits = takes_layers(field.channels, len(field.levels), field.width, field.depth)
-    return HexPlaneTraining(field) if fits else None
-
-
 KIND = FieldKind(
     field=HexPlaneField,
     new=new_hexplane_field,
@@ -481,5 +464,6 @@ KIND = FieldKind(
         "depth": IntegerIn(1, 64),
     },
     rates=HexPlaneLearningRates(),
-    captured_training=captured_training,
+    captured_training=HexPlaneTraining,
+    offline_spacing_s=1 / 15,  # finer values were not tried
 )

@@ -110,12 +110,13 @@ class AlphaRenderer:
         gaussians, field = scene.gaussians, scene.field
         if gaussians.device.type != "cuda" or gaussians.dtype != torch.float32 or CUDA_MISSING is not None:
             return None
-        if field is not None and not field.has_frame_deltas:
+        frame_deltas = None if field is None else field.capabilities.frame_deltas
+        if field is not None and frame_deltas is None:
             return None
         return FrameRenderer(
             gaussians,
             self._camera,
-            field,
+            frame_deltas,
             background=self._background,
             precision=self._precision,
             recompute=recompute,

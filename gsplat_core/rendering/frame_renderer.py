@@ -21,7 +21,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import DeformationField
+from gsplat_core.deformation.field import FrameDeltas
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.frame.frame import (
     MAX_SEGMENT,
@@ -242,14 +242,15 @@ class FrameRenderer:
 
     Tensors of the Gaussians and the field are read in place, so in-place changes affect the next
     frame. Exceptions are values computed at construction: half-precision spherical harmonics and
-    the features precomputed by a HexPlane field. With `recompute` they are computed in every frame.
+    values that `FrameDeltas.frame_deltas` precomputes. With `recompute` they are computed in every
+    frame.
     """
 
     def __init__(
         self,
         gaussians: Gaussians,
         camera: Camera,
-        field: DeformationField | None = None,
+        field: FrameDeltas | None = None,
         *,
         background: Tensor | None = None,
         precision: Precision = "fp32",

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField, checked_window, continued_window
+from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import Surface, certainty, render_surface
@@ -76,8 +76,9 @@ class Model:
             raise InvalidInput(
                 f"a model is published with detached copies, but {', '.join(learning)} require gradients"
             )
-        if self.field is not None and self.field.count not in (None, self.gaussians.count):
-            raise InvalidInput(f"the field deforms {self.field.count} Gaussians, the model has {self.gaussians.count}")
+        rows = None if self.field is None else self.field.capabilities.rows
+        if rows is not None and rows.count != self.gaussians.count:
+            raise InvalidInput(f"the field deforms {rows.count} Gaussians, the model has {self.gaussians.count}")
 
     def tensors(self) -> dict[str, Tensor]:
         """Return all tensors by name: `gaussians.*`, then `field.*` in the field's order."""
@@ -127,7 +128,8 @@ class Model:
 
     def clamp_time(self, time_s: float) -> float:
         """Clamp `time_s` to the time window, extended by the field's extrapolation range."""
-        return clamp_time(time_s, continued_window(self.time_window_s, self.field))
+        window_s = self.time_window_s
+        return clamp_time(time_s, window_s if self.field is None else self.field.continued_window(window_s))
 
     def at(self, time_s: float) -> Gaussians:
         """Return the Gaussians at `time_s`, clamped to the window; the last result is cached."""

@@ -18,13 +18,14 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField, FieldSlot, continued_window, copy_each
+from gsplat_core.deformation.field import DeformationField, FieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model, clamp_time
 from gsplat_core.scene.rows import inert_gaussians
+from gsplat_core.transfers import copy_each
 
 ROW_STEP = 1024
 """Granularity of the capacity for Gaussians."""
@@ -105,7 +106,8 @@ class SnapshotSlot:
         rows = math.ceil(wanted / ROW_STEP) * ROW_STEP
         self._gaussians = inert_gaussians(gaussians, rows)
         self._count, self._in_use = 0, []
-        self._field = None if field is None else field.slot(rows)
+        new_slot = None if field is None else field.capabilities.slot
+        self._field = None if new_slot is None else new_slot(rows)
         self.layout += 1
         written = self._overwrite(gaussians, field)
         assert written, "a new slot has capacity for what it was made for"
@@ -164,7 +166,8 @@ class Snapshot:
 
     def clamp_time(self, time_s: float) -> float:
         """Clamp `time_s` to the time window, extended by the field's extrapolation range."""
-        return clamp_time(time_s, continued_window(self.time_window_s, self.slot.field))
+        window_s, field = self.time_window_s, self.slot.field
+        return clamp_time(time_s, window_s if field is None else field.continued_window(window_s))
 
     def at(self, time_s: float) -> Gaussians:
         """Return the Gaussians at `time_s`, clamped to the window, in separate memory."""
@@ -224,7 +227,7 @@ class SnapshotSlots:
     @staticmethod
     def can_hold(field: DeformationField | None) -> bool:
         """Return True if this kind of field can be stored in a slot."""
-        return field is None or field.slot_type is not None
+        return field is None or field.capabilities.slot is not None
 
     def publish(
         self,

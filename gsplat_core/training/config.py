@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from gsplat_core.choices import FIELDS, Eyes
-from gsplat_core.deformation.field import FieldRates, check_rates
+from gsplat_core.deformation.registry import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
@@ -77,14 +77,12 @@ class ReconstructorConfig:
     window_frames: int = 30
     """Number of recent frames that are trained on again to prevent forgetting."""
     bump_spacing_s: float = 0.2
-    """Spacing of the basis field's functions in seconds: the shortest time in which motion can
-    change.
-    """
+    """Shortest time in seconds in which motion can change its course."""
     squared_error: bool = False
     """Compare colours by squared error, which PSNR measures, instead of L1."""
     history_s: float | None = None
-    """Seconds of the past that remain deformable online with the basis field. None keeps all, with
-    memory that grows with the stream.
+    """Seconds of the past that remain deformable online. None keeps all, which for some fields
+    takes memory that grows with the stream.
     """
     preallocate: bool = False
     """Allocate memory for `max_gaussians` at the start, so that CUDA graphs stay valid when
@@ -155,8 +153,7 @@ class ReconstructorConfig:
             field=field,
             gaussians=60_000,
             max_gaussians=80_000,
-            # The time resolution of the HexPlane follows this as well; finer values were not tried.
-            bump_spacing_s=1 / 15 if field == "hexplane" else 0.05,
+            bump_spacing_s=FIELDS[field].offline_spacing_s,
             squared_error=True,
             depth_from_motion=True,
         )

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import CapturedTraining, copy_each
+from gsplat_core.deformation.registry import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
 from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
@@ -28,6 +28,7 @@ from gsplat_core.training.colour_correction import ResidualTarget
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LEFT, RIGHT, LossWeights
+from gsplat_core.transfers import copy_each
 
 
 class StepInputs:
@@ -122,7 +123,7 @@ class FusedStep:
         Args:
             gaussians: parameters, updated in place.
             observation: picture of the camera's size; copied to the device if needed.
-            time: the field's own time, from `DeformationField.frame_time`.
+            time: normalised time from `FrameDeltas.frame_time`.
             gaussian_rates: Adam's learning rates of the Gaussians' tensors by name.
             field_rates: learning rates of the field.
             colour_relaxation: above 0, colours are corrected (`colour_correction`) and depth is not
@@ -219,10 +220,10 @@ class FusedStep:
             gradient[:, COLOUR].zero_()
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if change is not None:
-            if right_sh is None:
-                self._field.add_colours(change, controls.time)
-            else:
+            if right_sh is not None:
                 right_sh[:, 0].add_(change)
+            elif self._field.add_colours is not None:
+                self._field.add_colours(change, controls.time)
         if self._field.reads_positions:
             self._move(scene.means, gradient, of_means, fits)
         return loss.loss

@@ -29,7 +29,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.deformation.field import Continuation, DeformationField, NewestState, displaced
+from gsplat_core.deformation.continuation import Continuation, NewestState
+from gsplat_core.deformation.field import DeformationField, EditableMotion, displaced
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, RAW_COLUMNS, Gaussians
@@ -112,7 +113,7 @@ class DepthFromMotion:
         if not np.any(translation_between(motion.before, motion.after)):
             return
         with torch.no_grad():
-            deltas = step.field.deltas(before_s)[:, POSITION]
+            deltas = motion_of(step).deltas(before_s)[:, POSITION]
             points = step.gaussians.means + deltas
             seen = motion.seen_before(points)
             target = seen.pixels + motion.at(seen.pixels)
@@ -296,7 +297,7 @@ class FlowPrior:
         if not (learns or self._starts_there):
             return
         with torch.no_grad():
-            held = step.field.deltas(before_s)
+            held = motion_of(step).deltas(before_s)
             points = step.gaussians.means + held[:, POSITION]
             ahead = self._motion.ahead(points)
             if last is not None and learns:
@@ -305,7 +306,7 @@ class FlowPrior:
                 # Replace the field's extrapolation at `time_s` by the state at `before_s` moved by
                 # the flow.
                 held[:, POSITION] += ahead
-                step.field.move_to(time_s, held)
+                motion_of(step).move_to(time_s, held)
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
         """See `MotionPrior.velocity`."""
@@ -313,7 +314,7 @@ class FlowPrior:
         if motion is None:
             return None
         with torch.no_grad():
-            deltas = step.field.deltas(self.newest_s) if deltas is None else deltas
+            deltas = motion_of(step).deltas(self.newest_s) if deltas is None else deltas
             moved = motion.arrived(step.gaussians.means + deltas[:, POSITION])
             velocity = moved.new_zeros(moved.shape[0], RAW_COLUMNS)
             velocity[:, POSITION] = self._damping.damped(moved)
@@ -360,13 +361,21 @@ def no_prior(config: ReconstructorConfig) -> None:
 
 
 def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
-    """Create the configured prior, or None if the field has no continuation.
+    """Create the configured prior, or None for a field without continuation or editable motion.
 
     Raises:
         InvalidSetting: for an unknown name.
     """
     prior: MotionPrior | None = MOTION_PRIORS[config.motion_prior](config)
-    return prior if field.continues else None
+    has = field.capabilities
+    return None if has.continuation is None or has.motion is None else prior
+
+
+def motion_of(step: TrainingStep) -> EditableMotion:
+    """Return the editable motion of a field with a prior, as ensured by `new_motion_prior`."""
+    motion = step.capabilities.motion
+    assert motion is not None
+    return motion
 
 
 class Following:
@@ -439,18 +448,19 @@ def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -
     The scene is static after `learned_s`, the time of the newest trained frame, if the prior has
     not processed that frame.
     """
-    if prior is None:
+    continuation = step.capabilities.continuation
+    if prior is None or continuation is None:
         yield
         return
     # Also without a velocity, so that slots whose fields have a continuation from the start need no
     # other memory later.
     velocity = prior.velocity(step) if prior.newest_s == learned_s else None
     still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
-    step.field.continue_with(still if velocity is None else velocity, learned_s, prior.horizon_s)
+    continuation.continue_with(still if velocity is None else velocity, learned_s, prior.horizon_s)
     try:
         yield
     finally:
-        step.field.continuation = None
+        continuation.stop_continuing()
 
 
 def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tuple[Gaussians, NewestState]:
@@ -458,7 +468,7 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
     continuation, without the past and in its own memory.
     """
     with torch.no_grad():
-        deltas = step.field.deltas(learned_s)
+        deltas = motion_of(step).deltas(learned_s)
         velocity = prior.velocity(step, deltas) if prior.newest_s == learned_s else None
         still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
         continuation = Continuation(step.gaussians.count, step.gaussians.device)

@@ -183,12 +183,13 @@ class OfflineTraining:
     def _smooth(self) -> None:
         """Smooth by the amount that belongs to the steps since the last time."""
         each = self._rate * SMOOTH_EVERY / len(self._observations)
-        if self._smoothing:
-            self._step.field.smooth_in_time(min(self._smoothing * each, MOST_AT_ONCE))
-        if self._rigidity and self._step.field.takes_positions:
+        smooth_in_time, share_motion = self._step.capabilities.smooth_in_time, self._step.capabilities.share_motion
+        if self._smoothing and smooth_in_time is not None:
+            smooth_in_time(min(self._smoothing * each, MOST_AT_ONCE))
+        if self._rigidity and share_motion is not None:
             if self._neighbours is None:
                 self._neighbours = nearest_others(self._step.gaussians.means)
-            self._step.field.share_motion(self._neighbours, min(self._rigidity * each, MOST_AT_ONCE))
+            share_motion(self._neighbours, min(self._rigidity * each, MOST_AT_ONCE))
 
     def _densify(self, share: float) -> None:
         """Run a densification round. `share` of all rounds is complete with it, and the number of

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from gsplat_core.deformation.basis import BasisField
+from gsplat_core.deformation.field import CapturedMotion, EditableMotion
 from gsplat_core.depth.maps import possible_depth
 from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, FrameMode, View, render_frame
 from gsplat_core.rendering.frame_renderer import (
@@ -31,7 +31,7 @@ from gsplat_core.rendering.frame_renderer import (
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.gaussians import BASIS_CHANNELS, LOG_SCALE, POSITION, Gaussians
+from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, Gaussians
 from gsplat_core.training.growth import UNCOVERED_ALPHA
 from gsplat_core.training.hole_filling import filled
 from gsplat_core.training.image_motion import NEAREST, Seen, beside
@@ -141,16 +141,16 @@ class CapturedCorrection:
     A frame that overflows the tile lists corrects nothing; the lists are enlarged for the next one.
     """
 
-    def __init__(self, rows: Gaussians, field: BasisField, camera: Camera) -> None:
+    def __init__(self, rows: Gaussians, motion: CapturedMotion, camera: Camera) -> None:
         """Prepare the correction.
 
         Args:
             rows: the scene's tensors with all allocated rows.
-            field: the scene's motion.
+            motion: motion of the scene.
             camera: camera with the size of every frame.
         """
         device, shape = rows.device, (camera.height_px, camera.width_px)
-        self._rows, self._field, self._weights, self._camera = rows, field, field.weights, camera
+        self._rows, self._motion, self._tensors, self._camera = rows, motion, motion.motion_tensors(), camera
         self._controls = FrameControls(device, rates=1)
         self._depth = torch.zeros(shape, device=device)
         self._mask = torch.zeros(shape, dtype=torch.uint8, device=device)
@@ -159,9 +159,10 @@ class CapturedCorrection:
         self._capacity = capacity_for(4 * rows.count)
         self._captured: CapturedSequence[None] | None = None
 
-    def fits(self, rows: Gaussians, field: BasisField, camera: Camera) -> bool:
+    def fits(self, rows: Gaussians, motion: CapturedMotion, camera: Camera) -> bool:
         """Return True if the graph fits these tensors and this size."""
-        same_scene = rows is self._rows and field is self._field and field.weights is self._weights
+        same_scene = rows is self._rows and motion is self._motion
+        same_scene &= all(a is b for a, b in zip(motion.motion_tensors(), self._tensors, strict=True))
         size = self._camera.width_px, self._camera.height_px
         return same_scene and size == (camera.width_px, camera.height_px)
 
@@ -177,8 +178,8 @@ class CapturedCorrection:
             self._capacity, self._captured = capacity_for(needs.instances), None
         self._depth.copy_(depth)
         self._mask.copy_(observation.mask)
-        field = self._field
-        self._controls.set(observation.camera, field.frame_time(observation.time_s), [field.frame_time(shown_s)])
+        time, shown = self._motion.frame_time(observation.time_s), self._motion.frame_time(shown_s)
+        self._controls.set(observation.camera, time, [shown])
         with torch.no_grad():
             if self._captured is None:
                 self._correct()
@@ -189,7 +190,7 @@ class CapturedCorrection:
 
     def _correct(self) -> None:
         scene, controls, camera = self._rows, self._controls, self._camera
-        deltas_at = self._field.frame_deltas(scene)
+        deltas_at = self._motion.frame_deltas(scene)
         seen = deltas_at(controls.time)
         view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px)
         frame = render_frame(scene.left_tensors, seen, view, self._capacity, FrameMode.SHARED)
@@ -203,9 +204,9 @@ class CapturedCorrection:
         pixels = local[:, :2] / local[:, 2:].clamp(min=NEAREST) * focal + middle
         factor = smooth_factor(self._depth, frame.image[..., 3], known, pixels)
         factor = torch.where(scene.logit_opacities.isfinite(), factor, 1.0)  # unused rows keep their values
-        moved = deltas_at(controls.rates)[:, :BASIS_CHANNELS].contiguous()
+        moved = deltas_at(controls.rates)
         move_along_rays_(moved, scene.means, factor, -(rotation * translation[:, None]).sum(0))
-        self._field.move_to_at(controls.rates, moved)
+        self._motion.move_to_at(controls.rates, moved)
 
 
 class Placement:
@@ -263,7 +264,8 @@ class Placement:
         origin = frame.depth_origin
         if frame is self._first or frame.depth is None or origin is None:
             return
-        if observation.camera.model != "pinhole" or not step.field.takes_positions:
+        motion = step.capabilities.motion
+        if observation.camera.model != "pinhole" or motion is None:
             return
         if self.is_placed and origin.initialises_only:
             return
@@ -274,29 +276,31 @@ class Placement:
             return
         with torch.no_grad():
             if not self.is_placed:
-                self.is_placed = _place(step, frame, observation, late)
+                self.is_placed = _place(step, motion, frame, observation, late)
             elif origin.is_of_still_tissue:
-                _correct_all_times(step, observation, possible)
+                _correct_all_times(step, motion, observation, possible)
             else:
-                self._correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
+                self._correct(step, motion, observation, possible, observation.time_s if shown_s is None else shown_s)
 
-    def _correct(self, step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
+    def _correct(
+        self, step: TrainingStep, motion: EditableMotion, observation: Observation, depth: Tensor, shown_s: float
+    ) -> None:
         """Move the scene at one time towards a frame's depth [H, W] (0 = unknown)."""
-        rows, field = step.fixed_rows, step.field
-        if rows is None or rows.device.type != "cuda" or not isinstance(field, BasisField):
-            _correct_at(step, observation, depth, shown_s)
+        rows, captured = step.fixed_rows, step.capabilities.captured_motion
+        if rows is None or rows.device.type != "cuda" or captured is None:
+            _correct_at(step, motion, observation, depth, shown_s)
             return
-        if self._captured is None or not self._captured.fits(rows, field, observation.camera):
-            self._captured = CapturedCorrection(rows, field, observation.camera)
+        if self._captured is None or not self._captured.fits(rows, captured, observation.camera):
+            self._captured = CapturedCorrection(rows, captured, observation.camera)
         self._captured(observation, depth, shown_s)
 
 
-def _place(step: TrainingStep, frame: Frame, observation: Observation, late: LateDepth) -> bool:
+def _place(step: TrainingStep, motion: EditableMotion, frame: Frame, observation: Observation, late: LateDepth) -> bool:
     """Move the whole scene to the distance of its first depth. Returns False if the depth covers
     none of the scene.
     """
     assert late.possible is not None
-    seen = _shown_now(step, observation)
+    seen = _shown_now(step, motion, observation)
     inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(late.possible)
     known = inside & (there > 0)
     if not bool(known.any()):
@@ -313,30 +317,32 @@ def _place(step: TrainingStep, frame: Frame, observation: Observation, late: Lat
     return True
 
 
-def _correct_all_times(step: TrainingStep, observation: Observation, possible: Tensor) -> None:
+def _correct_all_times(step: TrainingStep, motion: EditableMotion, observation: Observation, possible: Tensor) -> None:
     """Move each Gaussian at all times towards the depth [H, W] (0 = unknown) of static tissue."""
-    seen = _shown_now(step, observation)
+    seen = _shown_now(step, motion, observation)
     now, there = seen.depth[:, 0], seen.read(possible)
     target = torch.where(seen.inside[:, 0] & (there > 0), there, now)
     factor = (target / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
     step.scale_about(observation.camera, factor)
 
 
-def _shown_now(step: TrainingStep, observation: Observation) -> Seen:
-    points = step.gaussians.means + step.field.deltas(observation.time_s)[:, POSITION]
+def _shown_now(step: TrainingStep, motion: EditableMotion, observation: Observation) -> Seen:
+    points = step.gaussians.means + motion.deltas(observation.time_s)[:, POSITION]
     return Seen(observation.camera, points)
 
 
-def _correct_at(step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
+def _correct_at(
+    step: TrainingStep, motion: EditableMotion, observation: Observation, depth: Tensor, shown_s: float
+) -> None:
     """Apply the correction of `CapturedCorrection` with separate launches, on any device."""
     camera = observation.camera
     now = step.at(observation.time_s)
     shown = render(now, camera, depth=True)
     known = (depth > 0) & (observation.mask > 0) & (shown.alpha >= UNCOVERED_ALPHA)
     factor = smooth_factor(depth, shown.depth, known, Seen(camera, now.means).pixels)
-    deltas = step.field.deltas(shown_s)
+    deltas = motion.deltas(shown_s)
     move_along_rays_(deltas, step.gaussians.means, factor, beside(now.means, camera.position))
-    step.field.move_to(shown_s, deltas)
+    motion.move_to(shown_s, deltas)
 
 
 def _has_depth(frame: Frame | None) -> bool:

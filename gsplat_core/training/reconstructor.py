@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import NewField
-from gsplat_core.deformation.registry import FIELDS
+from gsplat_core.deformation.registry import FIELDS, NewField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
@@ -120,9 +119,9 @@ class Reconstructor:
 
     def kept(self) -> dict[str, int]:
         """Return the sizes of all stream-dependent stores; each is bounded."""
-        columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
+        parameters = 0 if self._step is None else self._step.field.parameter_count
         archived = 0 if self._growth is None else self._growth.archived
-        held = {"window_frames": len(self._window), "columns": columns, "places": len(self._left.places)}
+        held = {"window_frames": len(self._window), "field_parameters": parameters, "places": len(self._left.places)}
         return {**held, "archived": archived}
 
     @property

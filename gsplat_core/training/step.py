@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField, FieldRates, FieldTraining
-from gsplat_core.deformation.registry import kind_of
+from gsplat_core.deformation.field import DeformationField
+from gsplat_core.deformation.registry import FieldRates, FieldTraining, kind_of
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
@@ -90,6 +90,8 @@ class TrainingStep:
         self, gaussians: Gaussians, field: DeformationField, config: ReconstructorConfig, camera: Camera
     ) -> None:
         self.field = field
+        self.capabilities = field.capabilities
+        """Optional capabilities of the field."""
         self._rates = config.rates
         self._has_no_end = config.history_s is not None
         self._mm_per_px = mm_per_px(gaussians, camera)
@@ -100,7 +102,10 @@ class TrainingStep:
         self._adam = FusedAdam(gaussians.tensors())
         self._rows: GaussianRows | None = None
         """Preallocated rows in which Gaussians are added and removed without moving tensors."""
-        if config.preallocate and field.reserve(config.max_gaussians):
+        fixed = self.capabilities.fixed_rows
+        if config.preallocate and (fixed is not None or self.capabilities.rows is None):
+            if fixed is not None:
+                fixed.reserve(config.max_gaussians)
             self._rows = GaussianRows(gaussians, config.max_gaussians)
             self._adam.reserve(config.max_gaussians)
             gaussians = self._rows.used
@@ -120,11 +125,11 @@ class TrainingStep:
         """Colour relaxation of the newest captured step."""
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
-        if gaussians.device.type == "cuda" and kind.captured_training is not None:
+        frame_deltas = self.capabilities.frame_deltas
+        if gaussians.device.type == "cuda" and kind.captured_training is not None and frame_deltas is not None:
             training = kind.captured_training(field)
-            if training is not None:
-                self._rate_values = training.rate_values
-                self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera)
+            self._rate_values, self._frame_time = training.rate_values, frame_deltas.frame_time
+            self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera)
         self._training: FieldTraining = (
             AutogradTraining(field, self._field_rates) if kind.training is None else kind.training(field)
         )
@@ -143,11 +148,12 @@ class TrainingStep:
             Loss before the update, [] on the device. A captured step is only queued; reading the
                 loss or `settle` waits for it.
         """
+        add_colours = self.capabilities.add_colours
+        relaxation = 0.0 if add_colours is None else colour_relaxation
         if self._captured is not None:
-            self._relaxation = colour_relaxation if self.field.takes_colours else 0.0
+            self._relaxation = relaxation
             return self._captured_step(self._captured, observation, rate_scale)
         deformed = self._training.deform(self.gaussians, observation.time_s)
-        relaxation = colour_relaxation if self.field.takes_colours else 0.0
         right_sh = self.gaussians.right_sh
         of_right = observation.of_right and right_sh is not None
         compared = loss_and_gradients(_seen_by(deformed, observation), observation, self._weights, relaxation)
@@ -159,23 +165,25 @@ class TrainingStep:
         if compared.colour_change is not None:
             if of_right and right_sh is not None:
                 right_sh[:, 0] += compared.colour_change
-            else:
-                self.field.add_colours(observation.time_s, compared.colour_change)
+            elif add_colours is not None:
+                add_colours(observation.time_s, compared.colour_change)
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
         """Move every Gaussian at all times to `factor` [N] times its distance from the camera's
-        centre, and scale it accordingly.
+        centre, and scale it accordingly. The field must have `Capabilities.motion`.
 
         The camera sees the same picture. Adam's moments are converted; learning rates follow with
         `take_distance`.
         """
+        motion = self.capabilities.motion
+        assert motion is not None
         with torch.no_grad():
             scene, each = self.gaussians, factor[:, None]
             centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device, non_blocking=True)
             scene.means.copy_(centre + each * (scene.means - centre))
             scene.log_scales.add_(each.log())
-            self.field.scale_positions(factor)
+            motion.scale_positions(factor)
             count = len(factor)
             self._adam.first_moments["means"][:count].div_(each)
             self._adam.second_moments["means"][:count].div_(each.square())
@@ -187,13 +195,15 @@ class TrainingStep:
 
     def shorten_rotations(self) -> None:
         """Normalise all quaternions, including the field's part, without changing the scene.
-        Training lengthens quaternions, which slows further rotation. Nothing changes if the field
-        does not support it.
+        Training lengthens quaternions, which slows further rotation. Nothing changes without
+        `Capabilities.motion`.
         """
+        motion = self.capabilities.motion
+        if motion is None:
+            return
         quats, count = self.gaussians.quats, self.gaussians.count
         factor = 1 / quats.norm(dim=1).clamp(min=1e-6)
-        if not self.field.scale_rotations(factor):
-            return
+        motion.scale_rotations(factor)
         quats.mul_(factor[:, None])
         self._adam.first_moments["quats"][:count].div_(factor[:, None])
         self._adam.second_moments["quats"][:count].div_(factor.square()[:, None])
@@ -253,7 +263,8 @@ class TrainingStep:
             self.gaussians = self._rows.used
         else:
             self.gaussians = self.gaussians.append(added)
-        self.field.append(added, parents)
+        if self.capabilities.rows is not None:
+            self.capabilities.rows.append(added.count, parents)
         self._adam.append(added.count, usual=self._has_no_end)
 
     def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
@@ -279,22 +290,25 @@ class TrainingStep:
             self._rows.close_gaps(moves)
             self.gaussians = self._rows.used
             self._adam.close_gaps(moves)
-            self.field.close_gaps(moves)
+            if self.capabilities.fixed_rows is not None:
+                self.capabilities.fixed_rows.close_gaps(moves)
         else:
             self.gaussians = self.gaussians.select(moves.order)
             self._adam.select(moves.order)
-            self.field.select(moves.order)
+            if self.capabilities.rows is not None:
+                self.capabilities.rows.select(moves.order)
         return moves
 
     def restart(self, gaussians: Gaussians, time_s: float, camera: Camera) -> bool:
         """Start another scene of the same camera size in the same memory. Returns False, with
         nothing changed, if that is impossible.
         """
-        count = gaussians.count
+        count, fixed = gaussians.count, self.capabilities.fixed_rows
         if gaussians.tensors().keys() != self.gaussians.tensors().keys():
             return False
-        if self._rows is None or count > self._rows.capacity or not self.field.restart(time_s, count):
+        if self._rows is None or fixed is None or count > self._rows.capacity:
             return False
+        fixed.restart(time_s, count)
         self._rows.replace(gaussians)
         self.gaussians = self._rows.used
         self._adam.restart(count)
@@ -320,8 +334,9 @@ class TrainingStep:
                 self._gaussian_rates(rate_scale),
                 self._rate_values(self._field_rates.scaled(self._mm_per_px, rate_scale)),
             )
-        time = self.field.frame_time(observation.time_s)
-        loss = captured(self._all_rows, observation, time, *self._scaled_rates, self._relaxation)
+        loss = captured(
+            self._all_rows, observation, self._frame_time(observation.time_s), *self._scaled_rates, self._relaxation
+        )
         first, self._unsettled_steps = not self._has_settled, self._unsettled_steps + 1
         if first or self._unsettled_steps >= SETTLE_EVERY:
             self.settle(observation, rate_scale)

@@ -59,14 +59,15 @@ class SurfaceTracks:
         by frame `number`. Nothing changes if the field does not support it or the frames do not
         show the motion.
         """
-        if not step.field.takes_positions or not self._show_motion:
+        follow = step.capabilities.follow
+        if follow is None or not self._show_motion:
             return
         times = [one.time_s for one in self._seen]
         with torch.no_grad():
             for start in range(first_row, step.gaussians.count, ROWS_AT_ONCE):
                 rows = slice(start, min(start + ROWS_AT_ONCE, step.gaussians.count))
                 points = step.gaussians.means[rows]
-                step.field.follow(rows, times, self.trajectories(points, number) - points[:, None])
+                follow(rows, times, self.trajectories(points, number) - points[:, None])
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
         """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by

@@ -122,7 +122,7 @@ class Upkeep:
         [N], and split others in sparse tissue.
         """
         since, self._renewed_at = step.steps - self._renewed_at, step.steps
-        if step.field.takes_positions:
+        if step.capabilities.motion is not None:
             step.scale_about(observation.camera, self._towards_surface(step, seen, since, observation))
         step.shorten_rotations()
         if last_seen is not None:

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import math
 
+from gsplat_core.choices import FIELDS
+from gsplat_core.deformation.registry import PARAMETER_BYTES
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.memory import available_bytes
 from gsplat_core.scene.cameras import Camera
@@ -83,19 +85,11 @@ def frames_to_render(window_s: tuple[float, float], fps: float) -> int:
 
 FIXED_BYTES = 16 * 2**20
 """Memory of threads, the video encoder and the report."""
-OTHER_FIELD_BYTES = 256 * 2**20
-"""Memory of a field without basis functions, including training: HexPlane, measured with 30,000
-Gaussians.
-"""
 PIXEL_BYTES = 200
 """Bytes per pixel for training, scoring and the report's pictures."""
 WINDOW_PIXEL_BYTES = 26
 """Bytes per pixel of each frame kept for training."""
-PARAMETER_BYTES = 32
-"""Bytes per model parameter: the value, Adam's two moments, snapshots and the copy for saving."""
 _CANONICAL = 14
-_BUMP = 15
-_BUMPS_AT_START = 5
 RENDER_PIXEL_BYTES = 60
 RENDER_PARAMETER_BYTES = 12
 
@@ -111,16 +105,12 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
     frames = source.frame_count or config.window_frames
     kept = frames if offline else min(frames, config.window_frames)
     pixels = source.width_px * source.height_px
-    # A field of basis functions grows with the duration of the stream.
-    basis = config.chosen_field == "basis"
-    bumps = _BUMPS_AT_START + round(frames / source.fps / config.bump_spacing_s) if basis else 0
     # Offline training ends with all Gaussians. Online, Gaussians are added for new tissue, of which
     # a fixed scope shows little.
     gaussians = config.max_gaussians if offline else config.gaussians
-    model = PARAMETER_BYTES * gaussians * (_CANONICAL + _BUMP * bumps)
-    return (
-        FIXED_BYTES + (0 if basis else OTHER_FIELD_BYTES) + pixels * (PIXEL_BYTES + WINDOW_PIXEL_BYTES * kept) + model
-    )
+    field = FIELDS[config.field].training_bytes(gaussians, frames / source.fps / config.bump_spacing_s)
+    model = PARAMETER_BYTES * gaussians * _CANONICAL + field
+    return FIXED_BYTES + pixels * (PIXEL_BYTES + WINDOW_PIXEL_BYTES * kept) + model
 
 
 def render_bytes(width_px: int, height_px: int, parameters: int) -> int:

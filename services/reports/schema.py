@@ -54,7 +54,7 @@ class RunFacts(Part):
     command: str = "replay"
     """`replay` or `reconstruct`, or another application that writes this report."""
     field: str
-    """Deformation field in use: `basis` or `hexplane`, never `auto`."""
+    """Name of the deformation field in use, never `auto`."""
     renderer: str = "alpha"
     steps_per_frame: int | None = None
     eyes: Eyes = "left"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from gsplat_core.deformation import FIELDS, DeformationField, FieldKind, FieldRates
+from gsplat_core.deformation import FIELDS, Capabilities, DeformationField, FieldKind, FieldRates
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
@@ -50,7 +50,7 @@ class PolynomialRates(FieldRates):
 
 
 class PolynomialField(DeformationField):
-    """A field with state for each Gaussian and a configuration: each one's path is a polynomial in time."""
+    """A field with state of each Gaussian and a configuration: a polynomial in time for each path."""
 
     kind = "polynomial"
 
@@ -68,6 +68,10 @@ class PolynomialField(DeformationField):
         return cls(gaussians.count, time_window_s, **architecture)
 
     @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(rows=self)
+
+    @property
     def count(self) -> int:
         return self.coefficients.shape[0]
 
@@ -80,10 +84,9 @@ class PolynomialField(DeformationField):
     def select(self, index: torch.Tensor) -> None:
         self.coefficients = torch.nn.Parameter(self.coefficients.data[index])
 
-    def append(self, added: int | Gaussians, parents: torch.Tensor | None = None) -> None:
-        new = self.coefficients.data.new_zeros(
-            added if isinstance(added, int) else added.count, *self.coefficients.shape[1:]
-        )
+    def append(self, count: int, parents: torch.Tensor | None = None) -> None:
+        known = self.coefficients.data
+        new = known.new_zeros(count, *known.shape[1:]) if parents is None else known[parents]
         self.coefficients = torch.nn.Parameter(torch.cat([self.coefficients.data, new]))
 
     def config(self) -> dict[str, Any]:

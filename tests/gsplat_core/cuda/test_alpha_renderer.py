@@ -90,7 +90,7 @@ def test_new_states_of_a_growing_scene_capture_nothing_anew(make_gaussians, scen
             captured = len(captures)
         more = make_gaussians(20, sh_degree=1, seed=version).to("cuda")
         scene = scene.append(more)
-        field.append(more)
+        field.append(more.count)
         field.extend((0.0, field.time_window_s[1] + field.spacing_s), hold_at_s=0.5)
         held = snapshot  # noqa: F841 - the last one is held while the next one is published
     assert slots.count <= 3

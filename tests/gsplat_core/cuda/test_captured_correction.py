@@ -43,14 +43,14 @@ def test_one_launch_corrects_as_many_do(gpu, step, hole, later_s):
     observation = Observation.of(found(FRAME, origin=DEPTH_ORIGINS["stereo"]), CAMERA, gpu)
     weights, depth = step.field.weights.data, sloping(gpu, hole)
     before = weights.clone()
-    captured = CapturedCorrection(step.fixed_rows, step.field, CAMERA)
+    captured = CapturedCorrection(step.fixed_rows, step.capabilities.captured_motion, CAMERA)
     for _ in range(3):  # as it is captured, and twice as it was
         start = weights.clone()
         captured(observation, depth, observation.time_s + later_s)
         seen = weights.clone()
         weights.copy_(start)
         with torch.no_grad():
-            _correct_at(step, observation, depth, observation.time_s + later_s)
+            _correct_at(step, step.capabilities.motion, observation, depth, observation.time_s + later_s)
         torch.testing.assert_close(seen, weights, rtol=1e-3, atol=1e-4)
     count = step.gaussians.count
     assert float((weights[:count] - before[:count]).abs().max()) > 1
@@ -60,7 +60,7 @@ def test_one_launch_corrects_as_many_do(gpu, step, hole, later_s):
 def test_a_frame_that_does_not_fit_changes_nothing_and_the_next_one_does(gpu, step):
     observation = Observation.of(found(FRAME, origin=DEPTH_ORIGINS["stereo"]), CAMERA, gpu)
     weights, depth = step.field.weights.data, sloping(gpu)
-    captured = CapturedCorrection(step.fixed_rows, step.field, CAMERA)
+    captured = CapturedCorrection(step.fixed_rows, step.capabilities.captured_motion, CAMERA)
     captured._capacity = 1
     before = weights.clone()
     captured(observation, depth, observation.time_s)

@@ -224,7 +224,7 @@ def test_restarting_is_a_new_field_in_the_same_memory():
         watch(field, frame * FRAME_S, newest)
         newest = frame * FRAME_S
     at = addresses(field)
-    assert field.restart(50.0, 3)
+    field.restart(50.0, 3)
     fresh = online(3)
     fresh.restart(50.0, 3)
     assert addresses(field) == at and field.config() == fresh.config()
@@ -233,6 +233,12 @@ def test_restarting_is_a_new_field_in_the_same_memory():
         for each in (field, fresh):
             watch(each, 50.0 + frame * FRAME_S, 50.0 + max(0, frame - 1) * FRAME_S)
     assert torch.equal(field.deltas(54.0), fresh.deltas(54.0))
+
+
+def test_more_gaussians_than_rows_are_refused_at_a_restart():
+    field = online(3)
+    with pytest.raises(InvalidInput, match="a field with 3 rows cannot restart with 4 Gaussians"):
+        field.restart(0.0, 4)
 
 
 def test_a_saved_ring_is_its_window(tmp_path, make_gaussians):

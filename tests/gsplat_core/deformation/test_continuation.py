@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
-from gsplat_core.deformation.field import Continuation
+from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -77,7 +77,7 @@ def test_a_slot_follows_and_stops() -> None:
     slot = field.slot(8)
     assert slot is not None and slot.overwrite(field)
     torch.testing.assert_close(slot.exact_copy().deltas(0.6), field.deltas(0.6).detach())  # type: ignore[attr-defined]
-    field.continuation = None
+    field.stop_continuing()
     assert slot.overwrite(field)
     torch.testing.assert_close(slot.exact_copy().deltas(0.6), field.deltas(0.6).detach())  # type: ignore[attr-defined]
 
@@ -114,11 +114,21 @@ def test_moving_a_field_at_a_time_changes_it_there_by_just_that() -> None:
     before, far = field.deltas(0.5).detach(), field.deltas(0.0).detach()
     change = torch.randn(5, 13, generator=torch.Generator().manual_seed(2))
     change[3] = math.nan
-    assert field.move_to(0.5, before + change)
+    field.move_to(0.5, before + change)
     expected = before + change
     expected[3] = before[3]
     torch.testing.assert_close(field.deltas(0.5).detach(), expected)
     assert (field.deltas(0.0).detach() - far).abs().max() < 0.2 * change[:3].abs().max()
+
+
+def test_moving_at_a_normalised_time_is_the_same_and_ignores_further_columns() -> None:
+    field, expected = moving_field(), moving_field()
+    tau = torch.tensor([field.frame_time(0.5)])
+    wanted = field.frame_deltas(some_gaussians())(tau) + 0.25
+    field.move_to_at(tau, wanted)
+    expected.move_to(0.5, wanted[:, :13])
+    assert torch.equal(field.weights, expected.weights)
+    torch.testing.assert_close(field.deltas(0.5).detach(), wanted[:, :13])
 
 
 def test_scaling_positions_scales_them_at_all_times() -> None:

@@ -108,7 +108,7 @@ def test_a_scene_that_grows_within_the_capacity_keeps_its_addresses(make_gaussia
     del first
     field.extend((0.0, 2.0), hold_at_s=1.0)
     more = make_gaussians(30, seed=1).to(device)
-    field.append(more)
+    field.append(more.count)
     stir(field, 2)
     gaussians = gaussians.append(more)
     second = publish(slots, gaussians, field, version=2)

@@ -122,7 +122,7 @@ def test_what_a_field_follows_is_bounded_between_and_beyond_the_frames(times_s: 
     random = torch.Generator().manual_seed(5)
     field = BasisField(50, (0.0, 0.23), bumps=8)
     offsets = torch.rand(50, len(times_s), 3, generator=random) ** 8 * 2000
-    assert field.follow(slice(0, 50), times_s, offsets)
+    field.follow(slice(0, 50), times_s, offsets)
     low, high = offsets.amin(1), offsets.amax(1)
     beyond = 0.3 * (high - low) + 0.02 * high
     for time_s in np.linspace(-0.1, 0.4, 51):
