@@ -2,8 +2,8 @@
 
     python benchmarks/batch_kill.py --recordings 200 --workers 2
 
-Makes small recordings, runs `intrasplat batch` over them, and meanwhile sends SIGKILL to attempts and, now and then, to the batch itself, which is then
-started again. Prints one JSON object, and fails where a result is missing, was put in its place twice, or differs from the others of the same recording.
+Makes small recordings and runs `intrasplat batch` over them. Meanwhile SIGKILL is sent to attempts and sometimes to the batch, which is then restarted.
+Prints one JSON object. Fails if a result is missing, was published twice, or differs from the others of the same recording.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     python benchmarks/causal.py RECORDING... [--steps 40] [--device cuda] [--frames N] [--scale S] [--prior flow|learned] [--live]
 
-One JSON line a recording: mean tissue PSNR in dB of the prediction, of the newest state held still, of a copy of the previous frame and of that
-frame moved on by half of the last optical flow (DIS, medium preset), all over the same frames, the first two left out; of the model on the
-frame that it has just learned (`live_db`) and before its first step on it (`start_db`). `--set name=value` changes a setting of `ReconstructorConfig`.
+One JSON line per recording: mean tissue PSNR in dB over the same frames, without the first two. Figures: the prediction; the newest state held; a copy of the
+previous frame; the previous frame warped by half of the last optical flow (DIS, medium preset); the model on the frame just learned (`live_db`) and before its
+first step on it (`start_db`). `--set name=value` changes a setting of `ReconstructorConfig`.
 """
 
 from __future__ import annotations

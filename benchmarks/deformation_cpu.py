@@ -1,7 +1,7 @@
 """Measure the deformation fields on the CPU, as JSON: `python benchmarks/deformation_cpu.py [--gaussians N] [--threads N]`.
 
-Measures what a viewer pays for a new time (limits: HexPlane 15 ms with the cache, basis field 6 ms, for 50,000 Gaussians) and
-what a training step pays, next to the same work in plain torch.
+Measures the cost of a new time for a viewer (limits for 50,000 Gaussians: HexPlane 15 ms with the cache, basis field 6 ms) and of a training step, next to the
+same work in plain torch.
 """
 
 from __future__ import annotations

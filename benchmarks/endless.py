@@ -3,15 +3,12 @@
 Usage: python benchmarks/endless.py RECORDING [--minutes 60] [--device cuda] [--steps 4] [--rehearse 4] [--scale 1] [--places] [--out FILE]
        python benchmarks/endless.py RECORDING --clock [--once] [--fps 30] ...
 
-Without `--clock` each frame gets a fixed number of steps, so that an hour takes as long as its work. With it, frames come at the recording's rate, or
-at `--fps`, and get the steps that a live run has time for. Per frame it does what a live run does: observe, publish, render, grow, rehearse. The
-next frame is begun while a GPU still works on the last picture, as a live run's threads do. With `--once` the recording is played once and does not
-repeat; nothing grows then that could be compared, and its one line and the retention are printed.
+Each frame is processed as in a live run: observe, publish, render, grow, rehearse. Without `--clock` it gets a fixed number of steps. With `--clock`, frames
+arrive at the recording's rate, or at `--fps`, and get the steps that a live run has time for. With `--once` the recording is played once.
 
-One JSON line for each minute of stream, then one with the growth since the second minute and with what the last 5 s look like when they are
-rendered again at the end. A minute is as many whole turns of the recording as come closest to 60 s, and in each the same frames are scored, so
-that minutes can be compared. `--out` also writes the lines into a file, each at once; a run that is stopped (Ctrl-C, SIGTERM) ends with what it
-reached. With `--places` each turn begins as a new scene, as after a cut, so that the place is left and found again.
+One JSON line per minute of stream, then one line with the growth since the second minute and the score of the last 5 s, rendered again at the end. A minute is
+the number of whole loops closest to 60 s, and the same frames are scored in each. `--out` also writes the lines into a file. A run that is stopped (Ctrl-C,
+SIGTERM) prints its last line too. With `--places` each loop starts a new scene, as after a cut.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Measure the processor time per live frame of one thread outside training: analysis, display and scoring.
 
-One JSON line for each stage: milliseconds a frame at p50, p95 and the most, over all frames after the first second. `analysis` is the sum of its
-chains, which live runs side by side. The picture that is shown is the frame before. Masks that come with a recording are left out, so that tools are looked for.
+One JSON line per stage: milliseconds per frame (p50, p95, maximum) over all frames after the first second. `analysis` is the sum of its chains, which live runs in
+parallel. The displayed picture is the previous frame. Recorded masks are ignored, so that tools are detected.
 
 Usage: python benchmarks/frame_path_cpu.py RECORDING_OR_ADDRESS... [--frames 150]
 For example ../shared/recordings/cutting "synthetic:?width=1280&height=1024"

@@ -1,15 +1,13 @@
 """Count the frames that the gates withhold, by reason, for recordings from inside, altered copies of them, and pictures from outside.
 
-One JSON line for each recording and change: `frames`, `withheld` (by reason; the out-of-body gate's with its evidence), and `longest_s`, the
-longest stretch of withheld frames, in seconds by the recording's clock: so old the newest picture becomes. Every frame of a recording is
-examined unchanged, the first --frames of it changed. The gates are those of a live run, in its order, with the built-in tool mask.
+One JSON line per recording and alteration: `frames`, `withheld` (by reason; for the out-of-body gate with its evidence), and `longest_s`, the longest stretch of
+withheld frames in seconds. Every frame of a recording is examined unchanged, the first --frames of it altered. The gates are those of a live run, in the same
+order, with the built-in tool mask.
 
-With --margins instead, one line for each threshold of the out-of-body gate: the most extreme value of frames from inside whose other measure
-exceeds its own threshold, by recording, and how many frames of each recording a threshold would withhold that was chosen on the others
-alone, half-way between their extreme value and the pictures from outside.
+With --margins, one line per threshold of the out-of-body gate: the most extreme value of frames from inside whose other measure exceeds its own threshold, by
+recording; and the number of frames of each recording withheld by a threshold chosen on the others alone, half-way to the pictures from outside.
 
 Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--margins]
-FOLDER_OF_RECORDINGS is laid out as benchmarks/README.md says.
 """
 
 from __future__ import annotations

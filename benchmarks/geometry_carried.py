@@ -2,8 +2,8 @@
 
     python benchmarks/geometry_carried.py RECORDING [--every 8]
 
-RECORDING comes from `intrasplat synthesize --third`. No reconstruction from the left eye alone is expected to be much better: what differs is what changes with the
-place from which it is seen, highlights above all. One JSON line a view: PSNR over the pixels of tissue that both cameras see, mean of the frames.
+RECORDING comes from `intrasplat synthesize --third`. A reconstruction from the left eye alone can hardly score better, because highlights depend on the viewpoint.
+One JSON line per view: mean PSNR over the tissue pixels that both cameras see.
 """
 
 from __future__ import annotations

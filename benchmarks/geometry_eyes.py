@@ -4,14 +4,14 @@
     python benchmarks/geometry_eyes.py heart/left.mp4 --right heart/right.mp4 --below 0.5 --fps 30 --device cuda
     python benchmarks/geometry_eyes.py RECORDING --fit 1500 --scale 0.5
 
-With `--steps` each frame gets so many optimiser steps before it is shown and half as many rehearsal steps after it, with live's settings for the
-device: figures that do not depend on the machine's speed. With `--fps` steps are made until 0.6 of a frame's time is over (at most 17 ms), then rehearsal
-until the next frame would come; scoring stops the clock. With `--fit` all frames are trained on offline, so many steps.
+With `--steps` each frame gets this number of optimiser steps before it is shown and half as many rehearsal steps after it, with the device's live settings. With
+`--fps` steps run until 0.6 of the frame interval (at most 17 ms), then rehearsal until the next frame; scoring stops the clock. With `--fit` all frames are
+trained on offline.
 
-A JSON line for each run. left_db: PSNR of the newest frame in the left eye, the mean over every tenth frame from the second second on, and over all of
-them (`left_all_db`). right_db: the same frames in the right eye by `gsplat_core.evaluation.views`, next to its trivial baselines. depth_px: median
-error of the disparity against the depth that was given, where there is any. Two videos have no calibration: the focal length is 0.9 of the width, the distance
-between the eyes puts the typical disparity at 60 mm, `--below` says by how many pixels the right picture shows everything lower.
+One JSON line per run. left_db: PSNR of the newest frame in the left eye, mean over every tenth frame after the first second (`left_all_db`: all frames).
+right_db: the same for the right eye by `gsplat_core.evaluation.views`, next to its baselines. depth_px: median disparity error against the given depth. For two
+videos without calibration, the focal length is 0.9 of the width, the baseline puts the typical disparity at 60 mm, and `--below` is the vertical offset of the
+right picture in pixels.
 """
 
 from __future__ import annotations

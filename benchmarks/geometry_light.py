@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/geometry_light.py [--pictures DIR]
 
-A line of JSON for each recording. `error` is the root mean square after one factor per frame, in shares of the median depth. `level` and `plane` are those of the level
-plane and of the best-fit plane (`gsplat_core.evaluation.depth`). `believed` is the share of the pixels with a confidence of at least 0.5. `doubted` is the share of the
-frames without an answer, which count as a level plane.
+One JSON line per recording. `error` is the RMS error after one factor per frame, relative to the median depth. `level` and `plane` are the errors of the level plane and
+of the best-fit plane (`gsplat_core.evaluation.depth`). `believed` is the share of pixels with a confidence of at least 0.5. `doubted` is the share of frames without
+an estimate, which count as a level plane.
 """
 
 from __future__ import annotations

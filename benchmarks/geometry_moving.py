@@ -1,12 +1,11 @@
-"""Depth of rendered tissue that breathes, beats and is pulled by a tool, before a moving scope whose poses are given: each frame's depth map against the
-truth, without a model in between.
+"""Measure depth maps of rendered tissue that breathes, beats and is pulled by a tool, seen by a moving scope with given poses, without a model.
 
     python benchmarks/geometry_moving.py [--frames 150] [--fps 30] [--width 320] [--height 256] [--seeds 0 1 2 3]
         [--breathing-ratio 2] [--rate-wander 0.15] [--scope-path seeded]
 
-One JSON line a seed: the frequencies that were found (of each window), doubts, relative errors (root mean square over all tissue of all frames, the
-same where depth is believed, the share that is believed, the median of the absolute value, after one scale for all frames), the root mean square relative errors of the
-level plane and of the best-fit plane of each frame (`gsplat_core.evaluation.depth`), and processor seconds. The last three options are those of `intrasplat synthesize`.
+One JSON line per seed: estimated frequencies (per window), doubts, relative depth errors, and processor seconds. Errors: RMS over all tissue of all frames; RMS where depth
+is trusted, with that share; median absolute error; RMS after one scale for all frames; RMS of each frame's level plane and best-fit plane
+(`gsplat_core.evaluation.depth`). The last three options are those of `intrasplat synthesize`.
 """
 
 from __future__ import annotations

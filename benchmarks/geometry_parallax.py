@@ -2,8 +2,8 @@
 
     python benchmarks/geometry_parallax.py RECORDING [--scale 0.5] [--depth none parallax]
 
-RECORDING is a folder with poses and `sfm_points.npz`. Each line of the output is JSON: a choice of `--depth`, PSNR and depth of what is shown for each frame
-as it comes, depth of the last model at all frames, and the processor time that finding depth takes for a frame.
+RECORDING is a folder with poses and `sfm_points.npz`. One JSON line per choice of `--depth`: PSNR and depth of each displayed frame, depth of the final model at all
+frames, and the processor time of depth estimation per frame.
 """
 
 from __future__ import annotations

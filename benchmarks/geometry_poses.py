@@ -3,13 +3,15 @@
     python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--way WAY] [--causal] [--assume F] [--depth]
         [--breathing-ratio 2] [--rate-wander 0.15] [--scope-path seeded]
 
-One JSON line a recording: ATE (root mean square of the distance between both ways after the best similarity) as a share of the given way, errors in
-pixels, processor seconds, and where tissue was found to breathe the frequencies and how much of the way is said to be uncertain. `--synthetic 150` adds a
-rendered recording of so many frames, 320x256, with a moving scope before tissue that breathes and is pulled; `--rigid` the same before tissue that stands
-still. `--way back` has the scope go sideways until it sees none of what it saw at first, and back again, `--way circle`
-round a circle as wide, and adds how far off the last pose is, which is the first one. `--causal` estimates frame by frame, as live and `replay` do, on one
-thread, and gives the processor's milliseconds a frame. `--depth` adds the error of depth maps of tissue that breathes (`moving_tissue`) with these poses, of every fifth frame, after one scale. `--assume 0.9` does without the calibration: the focal length is assumed to be 0.9 of the longer
-side, and the estimate is printed next to the true one, in the same unit.
+One JSON line per recording: ATE after the best similarity, relative to the length of the recorded path; errors in pixels; processor seconds; for breathing tissue
+the frequencies and the stated uncertainty.
+
+--synthetic N   adds a rendered recording of N frames, 320x256: a moving scope in front of tissue that breathes and is pulled; with --rigid, tissue at rest
+--way back      the scope moves sideways until it sees nothing of the first view, and returns; --way circle: around a circle of that width. Adds the error of
+                the last pose, which equals the first one
+--causal        estimates frame by frame, as live and `replay` do, on one thread; adds processor milliseconds per frame
+--depth         adds the depth error of breathing tissue (`moving_tissue`) with these poses, for every fifth frame, after one scale
+--assume 0.9    ignores the calibration, assumes this focal length in units of the longer side, and prints the estimate next to the true one
 """
 
 from __future__ import annotations

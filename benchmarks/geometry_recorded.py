@@ -2,9 +2,9 @@
 
     python benchmarks/geometry_recorded.py RECORDING [--depth recorded light none] [--steps 2000] [--device cuda] [--scale 1]
 
-A JSON line for each choice, trained offline on all frames and frame by frame: root mean square error over the median depth, as it is and after one scale, next to the
-level plane (`level`) and the best-fit plane (`plane`) of each frame; median of the absolute error after that scale. Every third frame is compared, where its own depth is
-not doubted (`measured_confidence`); `all_pixels` is the error after one scale with what is doubted.
+One JSON line per choice, trained offline on all frames and frame by frame: RMS depth error relative to the median depth, before and after one scale, next to the level
+plane (`level`) and the best-fit plane (`plane`) of each frame; median absolute error after that scale. Every third frame is compared where its recorded depth is
+trusted (`measured_confidence`); `all_pixels` is the error after one scale over all pixels.
 """
 
 from __future__ import annotations

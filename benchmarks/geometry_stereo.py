@@ -2,9 +2,9 @@
 
     python benchmarks/geometry_stereo.py --recordings FOLDER [--pictures OUT] [--device cuda] [--without synthetic heart …]
 
-One JSON line for each: `scared_pair` (disparity against its truth), `scared_raw` and `hamlyn_pair` (rectified from their calibrations: vertical residual of
-SIFT matches, and the surface), `heart` (its measure), synthetic pairs (depth against the truth) and the time of a frame on one thread. `--pictures` writes
-the left picture next to its depth: near is red, far is blue, black is not believed. The settings are the same for all of them.
+One JSON line each: `scared_pair` (disparity against ground truth), `scared_raw` and `hamlyn_pair` (rectified from their calibrations: vertical residual of SIFT
+matches, and distances), `heart` (right picture warped from the left one), synthetic pairs (depth against ground truth), and the time per frame on one thread.
+`--pictures` writes the left picture next to its depth: near is red, far is blue, black has low confidence. All use the same settings.
 """
 
 from __future__ import annotations

@@ -1,19 +1,18 @@
 """Measure the 3D accuracy of reconstructions of synthetic recordings, for each kind of missing input.
 
-One line for each case:
-* depth: root mean squared error as a share of the median depth, as it is and after one scale; of each frame's median depth everywhere
-  (level), of its best-fit plane; the mean angle of normals, and of those two planes;
-* third: PSNR of the third camera, which training never gets, as it is and after one scale; of the left picture as it is, and shifted;
-* points: median error of followed points of the tissue in mm, as it is, after one scale, and of no motion; in px, and of no motion;
-* which shares of the pictures' change motion, colour and size explain; the trajectory's error after similarity, as a share of the path.
+One line per case:
+* depth: RMS error relative to the median depth, before and after one scale, next to the level plane and the best-fit plane of each frame; mean angle of normals,
+  next to both planes;
+* third: PSNR in a third camera that training never sees, before and after one scale, next to the left picture and the shifted left picture;
+* points: median error of tracked tissue points in mm, before and after one scale, next to no motion; the same in px;
+* shares of the picture changes explained by motion, colour and size; trajectory error after similarity, relative to the path.
 
-`--json` for all figures. The recording is made once; training gets a copy without what the case lacks, so that nothing that is left out
-can be used.
+`--json` prints all figures. Training gets a copy of the recording without the inputs that the case lacks.
 
     fixed       one eye at rest, pictures and tool masks alone
     stereo      both eyes at rest
-    poses       one moving eye whose poses are given
-    no-poses    one moving eye, whose poses are estimated first, as `intrasplat poses` does it
+    poses       one moving eye with given poses
+    no-poses    one moving eye, with poses estimated as by `intrasplat poses`
     depth       one eye at rest, with depth
 
 Usage: python benchmarks/geometry_synthetic.py [CASE...] [--scene open|colon] [--steps 400 | --replay 10] [--frames 36] [--width 160] [--height 128]

@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/geometry_views.py [--frames N] [--width W] [--moving] [--weights 0.0003 0.02 0.1 0.2]
 
-A synthetic recording is replayed with its depth for each weight (`ReconstructorConfig.depth_weight`). One line of JSON each: live PSNR, and over the
-tissue of every fourth frame, in percent of its median depth: root mean squared, median absolute and mean error of the splats' centres, of the ray's
-expected and of its median depth; the spread that the model states; in degrees the median error of the blended normals, and of those from depth.
+Replays a synthetic recording with its depth for each weight (`ReconstructorConfig.depth_weight`). One JSON line each: live PSNR, and over the tissue of every fourth
+frame, in percent of its median depth: RMS, median absolute and mean error of the splats' centres, of the ray's expected depth and of its median depth; the spread
+that the model states; in degrees the median error of the blended normals, and of normals from depth.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
     python benchmarks/gpu_eager.py
     PYTHONPATH=build/peers python benchmarks/gpu_eager.py --scenes surgical50k_640x512 --packed
 
-Both are given the same tensors and called as programs call them: RGB and expected depth of one camera; forward without gradients,
-and forward with the backward pass of a mean absolute difference. Prints one JSON object per line with times (gpu_timing.py), launches
-on the GPU per call, and memory beyond what was there before; last whether the pictures agree.
+Both get the same tensors: RGB and expected depth of one camera; forward without gradients, and forward with the backward pass of a mean absolute difference. Prints one
+JSON object per line with times (gpu_timing.py), launches on the GPU per call, and additional memory; the last line compares the pictures.
 """
 
 from __future__ import annotations

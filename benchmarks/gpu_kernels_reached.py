@@ -1,13 +1,12 @@
 r"""List the CUDA kernels that the tests launch and miss, and select a few tests that launch all reached kernels.
 
     python benchmarks/gpu_kernels_reached.py                                     # all CUDA tests; fails if a kernel is not launched
-    xargs -d '\n' python benchmarks/gpu_kernels_reached.py < benchmarks/sanitized_tests.txt  # of those tests alone
+    xargs -d '\n' python benchmarks/gpu_kernels_reached.py < benchmarks/sanitized_tests.txt  # these tests alone
     python benchmarks/gpu_kernels_reached.py --cover benchmarks/sanitized_tests.txt
 
-With `--cover FILE` the few tests are written to FILE, for `gpu_sanitize.sh`: every kernel is launched by one of them that gives it
-about as much work as any quick test does. Tests that record CUDA graphs are not among them, for two of compute-sanitizer's tools do
-without torch's memory cache, which recording needs. Other arguments go to pytest. Needs a GPU, cuobjdump, and kernels built for that
-GPU alone.
+With `--cover FILE` the selected tests are written to FILE, for `gpu_sanitize.sh`. They launch every kernel with about as much work as any quick test does. Tests that
+capture CUDA graphs are excluded, because two tools of compute-sanitizer disable torch's memory cache, which capturing needs. Other arguments are passed to pytest.
+Needs a GPU, cuobjdump, and kernels built for that GPU alone.
 """
 
 from __future__ import annotations

@@ -4,10 +4,9 @@
     python benchmarks/gpu_offline.py RECORDING --device cpu --scale 0.25 --steps 500
     python benchmarks/gpu_offline.py RECORDING --set smoothing=0 --set smoothing=2,bump_spacing_s=0.05
 
-`Reconstructor.fit` as `intrasplat reconstruct` calls it: `ReconstructorConfig.offline`, the same settings for every recording, the
-protocol's held-out frames never trained on. `--steps` is the number of optimiser steps; with `--seconds` it is what fits into that time on an
-idle device: the start and the fastest stretch of a short run before say how many. Each `--set` is a run with other values of `ReconstructorConfig`. One JSON line for each moment that is evaluated: seconds of training so far (loading, warm-up of the
-kernels and evaluation not counted), mean and worst tissue PSNR over the held-out frames, and over as many training frames.
+Calls `Reconstructor.fit` as `intrasplat reconstruct` does, with `ReconstructorConfig.offline` and the protocol's held-out frames. `--steps` is the number of optimiser
+steps. `--seconds` derives it from a short run before. Each `--set` is a run with other values of `ReconstructorConfig`. One JSON line per evaluation:
+seconds of training so far (without loading, kernel warm-up and evaluation), mean and worst tissue PSNR over the held-out frames and over as many training frames.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
     python benchmarks/gpu_splat.py
     python benchmarks/gpu_splat.py --scenes volume1m_1080p --repetitions 100
 
-Two ways of ours are timed: the frame path (raw Gaussians in, picture out, captured as a CUDA graph) and `rasterization()`, which
-has gsplat's arguments and is called like it. The picture is RGB and expected depth, the loss the mean absolute difference to a
-noise picture, as in the peers' measurements. Times are explained in gpu_timing.py. Prints one JSON object per line.
+Times the frame path (raw Gaussians in, picture out, captured as a CUDA graph) and `rasterization()`, called with gsplat's arguments. The picture is RGB and expected depth.
+The loss is the mean absolute difference to a noise picture, as in the peers' measurements. Times are explained in gpu_timing.py. Prints one JSON object per line.
 """
 
 from __future__ import annotations

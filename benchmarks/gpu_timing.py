@@ -1,12 +1,11 @@
 """Timing methods for an NVIDIA GPU and the comparison line that the `gpu_*.py` benchmarks print.
 
-Three times for each piece of work, in milliseconds:
+Three times per function call, in milliseconds:
 
-- `ms`: median over calls of the time between two CUDA events around one call, the GPU idle before it. The host's part is in it
-  as far as the GPU waits for the host. Peers are measured so everywhere, and the limits are for this time.
-- `queued_ms`: many calls between two events, divided by their number: what a stream of frames costs each.
-- `kernel_ms`: how long anything ran on the GPU (kernels, copies, fills), from torch.profiler: no host, no gaps. Where one kernel
-  begins before the one before it has ended, their common time counts once.
+- `ms`: median over calls of the time between two CUDA events around one call, with the GPU idle before. It includes the host's part as far as the GPU waits for it.
+  Peers are measured in this way, and limits are for this time.
+- `queued_ms`: many calls between two events, divided by their number; the cost per frame of a stream.
+- `kernel_ms`: time in which anything ran on the GPU (kernels, copies, fills), from torch.profiler. Overlapping kernels count once.
 """
 
 from __future__ import annotations

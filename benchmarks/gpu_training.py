@@ -3,9 +3,9 @@
     python benchmarks/gpu_training.py
     python benchmarks/gpu_training.py --fields basis --repetitions 100
 
-Masked L1 against a picture at 640x512, Adam over Gaussians and field, every step at another time. Ours is `TrainingStep`, which the
-reconstructor uses. The peer is plain PyTorch on gsplat (peers/), once with torch's fused Adam and once with its default one; ratios are
-to the faster. Times are explained in gpu_timing.py. Prints one JSON object per line.
+Masked L1 against a picture at 640x512, Adam over Gaussians and field, each step at another time. Ours is `TrainingStep`, which the reconstructor uses. The peer is plain
+PyTorch on gsplat (peers/), with torch's fused Adam and with its default one; ratios are to the faster. Times are explained in gpu_timing.py. Prints one JSON object per
+line.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     python benchmarks/live_depth.py RECORDING [--depth stereo] [--late 0 3 10] [--every 3] [--steps 2] [--rehearsed 2] [--scale 0.5]
 
-Steps are counted and not timed, so that figures do not depend on the machine: live's settings for a CPU, `--steps` before a frame is shown and `--rehearsed` after it. With `--late 0` every frame
-has its depth when it is trained on; with more, every `--every`-th frame's is learned after so many newer frames. A JSON line for each: PSNR of what is shown, and how far its
-depth is off: against the recording's own `depth/`, which training does not get, or at the points of `sfm_points.npz` after one factor (medians over all frames and over the last third).
+Steps are counted, not timed: live's settings for a CPU, `--steps` before a frame is shown and `--rehearsed` after it. With `--late 0` every frame is trained on with its
+depth. Otherwise the depth of every `--every`-th frame is learned that many frames later. One JSON line each: PSNR of the displayed pictures, and depth error against the
+recording's own `depth/`, which training does not get, or at the points of `sfm_points.npz` after one factor (medians over all frames and over the last third).
 """
 
 from __future__ import annotations

@@ -2,12 +2,11 @@
 
     python benchmarks/live_steps.py RECORDING... [--steps 60] [--rehearse 60] [--like cuda] [--frames 100] [--scale 0.5] [--fps 60]
 
-`--steps` are taken on each frame before it is shown, `--rehearse` after it. `--like` chooses the settings that `intrasplat live` has on that
-device; `--device` is where the work is done. One JSON line per recording, over the frames after the first second: tissue PSNR in dB of the shown
-pictures (which were trained on), of a copy of the previous frame, and of the next frame shown before it is trained on (`next_db`, no training
-error); `retention_db` is the last `--retained` seconds as the model shows them at the end. `--set` and `--set-live` change fields of
-`ReconstructorConfig` and `LiveTraining`. `--engine replay` takes the steps as `intrasplat replay --steps` does. `--analysed` examines the frames
-first, as a live run does: tools and a limited field of view are left out, blurred frames are withheld, a cut begins a new scene.
+Each frame gets `--steps` before it is shown and `--rehearse` steps after it. `--like` selects the settings of `intrasplat live` on that device; `--device` does the
+work. One JSON line per recording, over the frames after the first second: tissue PSNR in dB of the displayed pictures (training error), of a copy of the previous
+frame, and of the next frame before it is trained on (`next_db`). `retention_db` is the score of the last `--retained` seconds, rendered by the final model. `--set` and
+`--set-live` change fields of `ReconstructorConfig` and `LiveTraining`. `--engine replay` trains as `intrasplat replay` does. `--analysed` runs the live checks first:
+tool mask, field of view, withheld frames, cuts.
 """
 
 from __future__ import annotations

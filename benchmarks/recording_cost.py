@@ -1,7 +1,7 @@
 """Measure the cost of recording a session: processor time and bytes per frame by part, and waits of the graph thread.
 
-A frame comes in with its masks and is handed on with another loss mask, then its picture is shown. First each part is written by itself in this
-thread, then all of it through `SessionRecorder` at the recording's rate, in its own thread.
+A frame arrives with its masks and leaves with another loss mask, then its picture is shown. First each part is written in this thread, then all of it through
+`SessionRecorder` at the recording's rate, in its own thread.
 
 Usage: python benchmarks/recording_cost.py RECORDING [--frames 100] [--scale 1.0]
 """

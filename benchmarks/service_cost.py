@@ -2,8 +2,7 @@
 
     python benchmarks/service_cost.py --width 640 --height 512 --frames 300
 
-Prints one JSON object. Everything runs in one process, whose CPU time is that of sender, receiver and ZeroMQ's threads together; nothing is
-trained, so that it does not depend on how much of the machine is free.
+Prints one JSON object. Everything runs in one process, whose CPU time includes sender, receiver and ZeroMQ's threads. Nothing is trained, so other load has little effect.
 """
 
 from __future__ import annotations

@@ -2,10 +2,9 @@
 
     python benchmarks/service_kills.py engine --kills 20     also: capture, control
 
-A real `intrasplat serve` with one stream. Two viewers watch raw pictures and two the reconstruction, over WebSocket; when the control plane itself is
-killed two subscribers watch what capture and engine publish, and the clock stops when the next control plane has taken both over and shows
-pictures again. Meanwhile a model is activated and rolled back all the time; at the end every answered change has to be in the audit log and in the
-registry, and the log has to be whole. Prints one JSON object.
+Runs `intrasplat serve` with one stream. Two viewers watch raw pictures and two the reconstruction, over WebSocket. If the control plane is killed, two subscribers watch
+the pictures of capture and engine, and the clock stops when the next control plane has adopted both and shows pictures. Meanwhile a model is activated and rolled back
+repeatedly. At the end every answered change must be in the audit log and in the registry, and the log must be intact. Prints one JSON object.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python benchmarks/service_layers.py --seconds 20 [--snapshots 5]
 
-With 0 seconds only the snapshots are measured. A capture and an engine process as `intrasplat serve` runs them; the watchers only read. Prints one line of JSON for each part.
+Runs a capture and an engine process as `intrasplat serve` does, with subscribers that only read. With 0 seconds only snapshots are measured. Prints one JSON line per part.
 """
 
 from __future__ import annotations

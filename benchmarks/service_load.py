@@ -2,8 +2,8 @@
 
     python benchmarks/service_load.py --viewers 50 --slow 10 --requests 200
 
-Without viewers, with them, and without them again: rates of capture and engine; ages of pictures at the healthy viewers, from a frame's arrival at
-the capture process; times of answers of the API. All viewers are in this one process, and nothing is decoded. Prints one JSON object.
+Measures without viewers, with them, and without them again: rates of capture and engine; ages of pictures at the healthy viewers, from a frame's arrival at the capture
+process; response times of the API. All viewers are in this process, and nothing is decoded. Prints one JSON object.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
     python benchmarks/service_overhead.py --seconds 15 --rounds 2
 
-Bare and served runs take turns. Served: without a viewer, then with one of the reconstruction, one of the raw picture, and a subscriber
-that reads the ages. Processor time is user
-and system time of all processes, the control plane among them. Prints one JSON object.
+Bare and served runs alternate. The served stream runs without a viewer, then with one viewer of the reconstruction, one of the raw picture, and a subscriber that reads
+the ages. Processor time is user and system time of all processes, including the control plane. Prints one JSON object.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
     python benchmarks/service_swaps.py --swaps 100
 
-Every picture that the engine publishes is looked at: whether a frame went without one, whether it is to the pixel what the version it names draws,
-and whether that version was active then. From a call's answer to the first picture of the new version the one before is shown on: `followed_ms`.
-Prints one JSON object.
+Examines every picture that the engine publishes: whether a frame has no picture, whether the pixels equal the rendering of the named version, and whether that version was
+active. `followed_ms` is the time from a call's answer to the first picture of the new version. Prints one JSON object.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python benchmarks/source_latency.py [RECORDING ...]
 
-Each recording (by default two synthetic sizes) is played by the clock, looped. One JSON line a case: milliseconds from the moment of release to the
-return of `read` (p50, p90, p99, worst), the time that a copy of the picture takes alone, processor time per frame of both processes, and what was dropped.
+Each recording (by default two synthetic sizes) is played in real time, looped. One JSON line per case: milliseconds from the release of a frame to the return of `read`
+(p50, p90, p99, worst), the time of copying the picture, processor time per frame of both processes, and dropped frames.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Measure rendered depth at structure-from-motion points, for recordings without dense depth.
 
-The points were triangulated from the same pictures, apart from the model. Each is compared only in frames in which it was found. Lengths are in the unit
-of the poses; one factor for the whole recording, the median of true over rendered depth, is taken out.
+The points were triangulated from the same pictures, independently of the model. Each is compared only in frames that show it. Lengths are in the unit of the poses, after
+one factor for the whole recording: the median of true over rendered depth.
 """
 
 from __future__ import annotations

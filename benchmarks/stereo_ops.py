@@ -2,8 +2,8 @@
 
     python benchmarks/stereo_ops.py [--device cuda] [--threads 1]
 
-One JSON line for each size. `match_ms`, `fit_ms` and `smooth_ms` are medians of the device's own time (CUDA events; on the CPU the wall clock). `frame_ms` is
-how long a thread waits for the depth of a frame, `frame_cpu_ms` what the processor works for it, `look_ms` the frame in which the pair is looked at, too.
+One JSON line per size. `match_ms`, `fit_ms` and `smooth_ms` are medians of device time (CUDA events; wall clock on the CPU). `frame_ms` is the time that a thread waits for
+a frame's depth, `frame_cpu_ms` its processor time, `look_ms` the time of a frame in which the pair is also validated.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Measure tool segmentation (hits and false positives), the out-of-body gate, and the processor time of both.
 
-One JSON line for each recording, on one core: `iou` (tool class, mean and minimum over the frames with a tool, where the recording has
-masks), `recall`, `found_share` (pixels called tool: false ones where there is no tool), `withheld` (frames that the gate did not let
-pass) and processor time a frame, which other programs on the machine change less than the clock's. With --copies also for changed copies of the first recording: tint, brightness, noise, smoke, size.
+One JSON line per recording, on one core: `iou` (tool class, mean and minimum over the frames with a tool, if the recording has masks), `recall`, `found_share` (share of
+pixels called tool: false ones if there is no tool), `withheld` (frames that the gate withheld) and processor time per frame. With --copies also for altered copies of
+the first recording: tint, brightness, noise, smoke, size.
 
 Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|onnx:PATH] [--copies]
 A picture file is a recording of one frame.

@@ -2,9 +2,8 @@
 
     python benchmarks/trace_frame.py [--seconds 5] [--source synthetic:]
 
-A server runs with one stream and one viewer. Every Python process of it records the code objects that are called: first for some seconds of
-live frames, then while another stream is created. Modules that are called for other reasons meanwhile, such as heartbeats, are counted, too. A
-module counts with all of its lines.
+Runs a server with one stream and one viewer. Each of its Python processes records the code objects that are called: first during some seconds of live frames, then while
+another stream is created. Modules called for other reasons at that time, such as heartbeats, are included. A module counts with all of its lines.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The documents say what is there: links lead somewhere, commands and flags exist, decisions are numbered, no private places are named."""
+"""Documents agree with the program: links, commands, flags, routes, settings and files exist; no private places are named."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ TEXT_SUFFIXES = {".py", ".md", ".toml", ".lock", ".cpp", ".h", ".txt", ".css", "
 
 @cache
 def tracked() -> tuple[Path, ...]:
-    """Files under version control; in an unpacked archive without git, every file that git would not ignore by name."""
+    """Return files under version control; in an archive without git, every file that git would not ignore by name."""
     try:
         listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
         names = [ROOT / line for line in listed.splitlines()]
@@ -61,7 +61,7 @@ DOCUMENTS = [path for path in tracked() if path.suffix == ".md"]
 
 
 def anchors(document: Path) -> set[str]:
-    """The anchors of a document's headings, as repository hosts make them."""
+    """Return the anchors of a document's headings, as repository hosts generate them."""
     text = CODE_BLOCK.sub("", document.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
@@ -81,7 +81,7 @@ def test_relative_links_resolve(document):
 
 
 def commands() -> dict[str, set[str]]:
-    """The options of each command, those of a group's commands under its name; those of the program itself under the empty name."""
+    """Return the options per command. A group includes its commands' options; the program's own are under the empty name."""
     group = program()
     options = {name: {"--help"} for name in ["", *group.commands]}
     for name, command in [("", group), *group.commands.items()]:
@@ -114,12 +114,12 @@ def test_commands_and_flags_exist(document):
 
 @cache
 def program() -> Any:
-    """The command line's definition."""
+    """Return the definition of the command line."""
     return typer.main.get_command(app)
 
 
 def misuse(line: str) -> str | None:
-    """The reason for which a command line does not parse; None where it does. Values are not converted: RECORDING stands for a path."""
+    """Return why a command line does not parse, or None. Values are not converted, since RECORDING stands for a path."""
     command = program()
     words = shlex.split(line.partition(" #")[0].partition(" > ")[0].partition(" | ")[0])
     while getattr(command, "commands", None):
@@ -182,7 +182,7 @@ def test_command_lines_that_do_not_parse_are_noticed(line):
 
 @cache
 def routes() -> tuple[tuple[str, str], ...]:
-    """Method and path of each route of the service; WebSockets begin as GET."""
+    """Return method and path of each route of the service; WebSockets start as GET."""
     routers: list[Any] = []
     for module in pkgutil.iter_modules(service_routes.__path__):
         found = importlib.import_module(f"{service_routes.__name__}.{module.name}")
@@ -262,7 +262,7 @@ def test_the_training_program_in_the_guide_works(tmp_path):
 
 
 def test_guides_state_no_measured_quality():
-    """Measured figures belong into RESULTS.md, which is generated from logs, or into benchmarks/results with their commit."""
+    """Measured figures belong in RESULTS.md, which is generated from logs, or in benchmarks/results."""
     found = []
     for document in GUIDES:
         if "docs" in document.relative_to(ROOT).parts and "adr" not in document.parts:
@@ -279,6 +279,22 @@ def test_the_index_names_every_page():
         page for page in pages if page != "README.md" and not page.startswith("adr/") and f"({page})" not in index
     ]
     assert unlisted == []
+
+
+def test_files_that_documents_name_exist():
+    """Covers paths from the root in every document, and names of Python modules in guides."""
+    modules = {path.name for path in tracked()}
+    built = {"gsplat_core/gsplat_core_cuda.so", "deploy/secrets/admin.key", "deploy/secrets/server.crt"}
+    folders = "gsplat_core|operators|services|tests|benchmarks|examples|deploy|docker|docs"
+    unknown = []
+    for document in DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        named = re.findall(rf"`((?:{folders})/[\w/.-]+)`", text)
+        unknown += [f"{document.name}: {name}" for name in named if name not in built and not (ROOT / name).exists()]
+        if document in GUIDES:
+            named = re.findall(r"`(\w+\.py)`", text)
+            unknown += [f"{document.name}: {name}" for name in named if name not in modules]
+    assert unknown == []
 
 
 def test_command_lines_are_found():
@@ -355,7 +371,7 @@ def test_every_locked_package_has_its_licence():
 
 
 def json_examples(name: str) -> list[dict]:
-    """The JSON blocks of a document."""
+    """Return the JSON blocks of a document."""
     text = (ROOT / "docs" / name).read_text(encoding="utf-8")
     return [json.loads(block) for block in re.findall(r"^```json\n(.*?)^```", text, re.MULTILINE | re.DOTALL)]
 

@@ -20,7 +20,7 @@ from gsplat_core.scene.model import Model
 
 
 class TamperedBundle:
-    """A bundle of five Gaussians and a way to change what it says, digests included: an attacker can compute one too."""
+    """Bundle of five Gaussians with methods that change it and recompute its digests, as an attacker can."""
 
     def __init__(self, folder: Path, kind: str = "basis", **architecture: Any) -> None:
         self.folder = folder
@@ -53,13 +53,13 @@ class TamperedBundle:
         self.edit(change)
 
     def replace_tensors(self, payload: bytes) -> None:
-        """Another tensor file, with a digest that fits."""
+        """Replace the tensor file, with a matching digest."""
         self.tensors.write_bytes(payload)
         tensors = {"bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()}
         self.edit(lambda manifest: manifest.update(tensors=tensors))
 
     def header_and_data(self) -> tuple[bytes, bytes]:
-        """The tensor file's header and what follows it."""
+        """Return the tensor file's header and data."""
         payload = self.tensors.read_bytes()
         (size,) = struct.unpack("<Q", payload[:8])
         return payload[8 : 8 + size], payload[8 + size :]

@@ -1,4 +1,4 @@
-"""Programs that know these files, and what is read of the files for several tests."""
+"""Validators of deployment files, and parsed files shared by tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def missing(message: str) -> NoReturn:
-    """End a test that cannot be run here."""
+    """Skip a test that this machine cannot run."""
     if os.environ.get("INTRASPLAT_REQUIRE_DEPLOY_TOOLS") == "1":
         pytest.fail(message)
     pytest.skip(message)
@@ -33,7 +33,7 @@ def missing(message: str) -> NoReturn:
 
 @pytest.fixture
 def kubernetes_takes() -> Callable[[dict], None]:
-    """Holds a resource against Kubernetes' schemas."""
+    """Validate a resource with Kubernetes' schemas."""
     try:
         import kubernetes_validate
     except ImportError as error:
@@ -43,7 +43,7 @@ def kubernetes_takes() -> Callable[[dict], None]:
 
 @pytest.fixture
 def tool() -> Run:
-    """Runs a program. Where it is not installed the test is skipped, unless INTRASPLAT_REQUIRE_DEPLOY_TOOLS says that it must be there."""
+    """Run a program. If it is not installed, skip the test; fail if INTRASPLAT_REQUIRE_DEPLOY_TOOLS is set."""
 
     def run(name: str, *arguments: str | Path, **options: object) -> subprocess.CompletedProcess[str]:
         places = f"{Path(sys.executable).parent}:{ROOT / 'build' / 'tools'}:{os.environ['PATH']}"

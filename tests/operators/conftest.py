@@ -77,7 +77,7 @@ def fake_time() -> FakeTime:
 
 @dataclass
 class FakeOutput:
-    """Remembers what was emitted."""
+    """Output port that keeps emitted messages."""
 
     emitted: list[tuple[str, Any]] = field(default_factory=list)
 

@@ -1,4 +1,4 @@
-"""A report as a run would make it, keyframes to go with it, and databases: SQLite, and PostgreSQL from Debian's package."""
+"""A typical report with key frames, and databases: SQLite, and PostgreSQL from Debian's package."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PATH = "source,tool_mask,reconstruct,deform,rasterize,video"
 
 @pytest.fixture(autouse=True)
 def same_umask() -> Iterator[None]:
-    """Programs of the service that a test calls in this process set a umask, which must end with the test."""
+    """Restore the umask after each test, since programs called in this process set it."""
     before = os.umask(0o022)
     os.umask(before)
     yield

@@ -21,7 +21,7 @@ QUICK = ("--steps-per-frame", "2")
 
 @dataclass(frozen=True)
 class Done:
-    """A finished command."""
+    """Result of a command."""
 
     code: int
     out: str
@@ -71,7 +71,7 @@ def tiny(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def finished(tiny, tmp_path_factory) -> Path:
-    """The output of a replay of `tiny`; not to be changed."""
+    """Output of a replay of `tiny`; not to be changed."""
     out = tmp_path_factory.mktemp("outputs") / "finished"
     assert run(["replay", str(tiny), "--out", str(out), "--heldout", *QUICK]) == 0
     return out
@@ -79,7 +79,7 @@ def finished(tiny, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def fingerprints() -> Callable[[Path], dict[str, str]]:
-    """SHA-256 of every file below a folder."""
+    """Return the SHA-256 of every file below a folder."""
 
     def take(folder: Path) -> dict[str, str]:
         return {
@@ -93,7 +93,7 @@ def fingerprints() -> Callable[[Path], dict[str, str]]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 12 MiB: a tmpfs where this process may mount one."""
+    """Return a file system of 12 MiB: a tmpfs if this process may mount one."""
     if os.geteuid() != 0:
         pytest.skip(
             "only root may mount a small tmpfs; tests/operators/sinks/test_video.py shows the same with a reserve"

@@ -8,4 +8,4 @@ import torch
 
 @pytest.fixture(scope="session", autouse=True)
 def needs_gpu(gpu: torch.device) -> None:
-    """Skips, or fails, without one."""
+    """Require a GPU; skip without one, or fail in CI."""

@@ -1,4 +1,4 @@
-"""Small videos whose figures are known by hand."""
+"""Small videos with scores that are known analytically."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def make_frame(seq: int, level: int = 100, **fields: Any) -> Frame:
 
 
 def make_picture(level: float, version: int = 1, depth: float = 0.0) -> Picture:
-    """A rendered picture of one grey level, which may lie between two of 8 bits."""
+    """Return a rendered picture of one grey level, which need not be an 8-bit level."""
     unrounded = np.full((HEIGHT, WIDTH, 3), level / 255, np.float32)
     image = np.rint(unrounded * 255).astype(np.uint8)
     return Picture(image, unrounded, np.full((HEIGHT, WIDTH), depth, np.float32), version)
@@ -38,5 +38,5 @@ def picture() -> Callable[..., Picture]:
 
 @pytest.fixture
 def decibels() -> Callable[[float], float]:
-    """PSNR of a picture that differs by so many grey levels everywhere."""
+    """Return the PSNR of a picture that differs by this number of grey levels everywhere."""
     return lambda difference: float(-20 * np.log10(difference / 255))

@@ -1,4 +1,4 @@
-"""Ops are tested with the work shared by two threads, however many the tests around them use."""
+"""Run the tests of ops with two threads."""
 
 from __future__ import annotations
 

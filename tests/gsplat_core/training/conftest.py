@@ -15,7 +15,7 @@ WIDTH_PX, HEIGHT_PX = 48, 40
 
 
 def texture(width: int, height: int, shift_px: float) -> NDArray[np.uint8]:
-    """Smooth coloured waves some 15 px long, moved to the right by `shift_px`."""
+    """Return smooth coloured waves of about 15 px, shifted to the right by `shift_px`."""
     y, x = np.mgrid[:height, :width] + 0.5
     x = x - shift_px
     waves = [np.sin(0.40 * x + 0.15 * y), np.sin(0.31 * x - 0.28 * y + 1), np.sin(0.22 * x + 0.37 * y + 2)]
@@ -24,7 +24,7 @@ def texture(width: int, height: int, shift_px: float) -> NDArray[np.uint8]:
 
 @pytest.fixture
 def camera() -> Camera:
-    """Sees the frames of `make_frame`."""
+    """Camera of the frames of `make_frame`."""
     return Camera.from_focal(50.0, WIDTH_PX, HEIGHT_PX)
 
 

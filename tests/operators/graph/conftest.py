@@ -1,4 +1,4 @@
-"""Operators to wire, engines to run them on, and a guard that turns a hang into a failure."""
+"""Operators for tests, engines to run them on, and a guard that turns a hang into a failure."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Source(Operator):
 
 
 class Apply(Operator):
-    """Emits function(value); nothing where that is None."""
+    """Emits function(value), or nothing if that is None."""
 
     def setup(self, spec):
         spec.input("in")
@@ -83,7 +83,7 @@ class Collect(Operator):
 
 
 class Join(Operator):
-    """Pairs of its two inputs."""
+    """Emits pairs of its two inputs."""
 
     def setup(self, spec):
         spec.input("left")
@@ -95,7 +95,7 @@ class Join(Operator):
 
 
 class Recorder:
-    """Makes operators note their life in one list."""
+    """Lets operators record their life-cycle calls in one list."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, str]] = []
@@ -138,13 +138,13 @@ class Wired(Application):
         return kind(self, CountCondition(self, count), **kwargs)
 
     def chain(self, *operators: Operator, **kwargs: Any) -> None:
-        """Connect one after the other."""
+        """Connect operators in a row."""
         for one, other in itertools.pairwise(operators):
             self.add_flow(one, other, **kwargs)
 
 
 def guarded(call: Callable[[], Any], timeout_s: float = GUARD_S, on_hang: Callable[[], None] | None = None) -> Any:
-    """The call's result or exception; fails when it does not return in time."""
+    """Return the call's result or exception; fail if it does not return in time."""
     outcome: dict[str, Any] = {}
 
     def work() -> None:
@@ -189,7 +189,7 @@ class Runner:
         return guarded(lambda: run(app, self.engine), on_hang=app.stop_execution)
 
     def in_background(self, app: Application) -> tuple[threading.Thread, list[Any]]:
-        """A started run; join the thread, then the list holds its result or exception."""
+        """Start a run. After the thread has been joined, the list holds its result or exception."""
         self.prepare(app)
         outcome: list[Any] = []
 

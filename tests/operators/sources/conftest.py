@@ -70,7 +70,7 @@ def rtsp_server(gstreamer_python):
 
 
 class Reading:
-    """Reads a source in the test's thread, with a limit that says what the source said."""
+    """Reader of a source with a time limit, whose failure includes the source's state."""
 
     def __init__(self, source) -> None:
         self.source = source
@@ -84,7 +84,7 @@ class Reading:
         raise AssertionError(self.source.state_sentence)
 
     def until(self, condition) -> None:
-        """Read until something holds; frames on the way are forgotten."""
+        """Read until a condition holds, discarding frames."""
         end = time.monotonic() + SOON_S
         while not condition():
             assert time.monotonic() < end, self.source.state_sentence
@@ -93,7 +93,7 @@ class Reading:
 
 @pytest.fixture
 def reading():
-    """Opens a source for reading, and closes it after the test."""
+    """Return a function that opens a source; it is closed after the test."""
     opened = []
 
     def begin(source):

@@ -27,7 +27,7 @@ _spec.loader.exec_module(fakes)
 
 @dataclass(frozen=True)
 class Plane:
-    """An application that runs."""
+    """Running application with clients."""
 
     app: FastAPI
     client: TestClient

@@ -24,7 +24,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def new_store(tmp_path: Path, database_url: str | None) -> Iterator[Callable[[], JobStore]]:
-    """Open the test's store, again and again if wanted, on each database in turn."""
+    """Return a function that opens the test's store, repeatedly if needed; parametrised over databases."""
     opened = []
 
     def new() -> JobStore:
@@ -47,7 +47,7 @@ def store(tmp_path: Path) -> Iterator[JobStore]:
 
 
 class FakeRunner:
-    """Attempts that live until the test ends them."""
+    """Runner whose attempts run until the test ends them."""
 
     def __init__(self) -> None:
         self.tasks: dict[str, Task] = {}
@@ -90,7 +90,7 @@ def runner() -> FakeRunner:
 
 @pytest.fixture
 def new_pool(tmp_path: Path, store: JobStore, runner: FakeRunner) -> Callable[..., JobPool]:
-    """A pool whose steps look at everything."""
+    """Return a pool that examines all jobs in each step."""
 
     def new(runner: FakeRunner = runner, **settings) -> JobPool:
         pool = JobPool(store.database, Results(tmp_path / "results"), runner, PoolSettings(**settings))

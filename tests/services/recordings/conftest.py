@@ -36,7 +36,7 @@ def packed(recording: Path, tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def new_store(tmp_path: Path) -> Iterator[Callable[..., RecordingStore]]:
-    """Open the test's store, again and again if wanted."""
+    """Return a function that opens the test's store, repeatedly if needed."""
     opened = []
 
     def new(**options: Any) -> RecordingStore:

@@ -24,7 +24,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def new_registry(tmp_path: Path, database_url: str | None) -> Iterator[Callable[..., ModelRegistry]]:
-    """Open the test's registry, again and again if wanted, on each database in turn."""
+    """Return a function that opens the test's registry, repeatedly if needed; parametrised over databases."""
     opened = []
 
     def new(**options: Any) -> ModelRegistry:
@@ -45,7 +45,7 @@ def registry(new_registry: Callable[..., ModelRegistry]) -> ModelRegistry:
 
 @pytest.fixture
 def sqlite_registry(tmp_path: Path) -> Iterator[ModelRegistry]:
-    """An empty registry where the database does not matter."""
+    """An empty registry on SQLite."""
     with ModelRegistry(tmp_path / "registry", check_program=ALWAYS_READY) as registry:
         yield registry
 

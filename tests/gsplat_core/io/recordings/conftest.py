@@ -1,4 +1,4 @@
-"""Small recordings to read, and to break."""
+"""Small recordings of each layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 48, 40
 
 
 def frame_image(index: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """RGB image whose colour tells the frame: red grows with the index, green with the column, blue with the row."""
+    """Return an RGB image that identifies its frame: red grows with the index, green with the column, blue with the row."""
     image = np.zeros((height, width, 3), np.uint8)
     image[..., 0] = 20 * index + 10
     image[..., 1] = np.linspace(0, 255, width).astype(np.uint8)
@@ -39,7 +39,7 @@ def write_images(
 
 
 def write_masks(folder: Path, count: int, size: tuple[int, int] = (WIDTH, HEIGHT), tool_columns: int = 12) -> None:
-    """255 = tool in the leftmost columns."""
+    """Write masks with the tool (255) in the leftmost columns."""
     mask = np.zeros((size[1], size[0]), np.uint8)
     mask[:, :tool_columns] = 255
     for index in range(count):
@@ -72,7 +72,7 @@ def write_video(
 
 @pytest.fixture
 def make() -> SimpleNamespace:
-    """The builders above, for tests that make their own recordings."""
+    """Builders of recordings, for tests that need their own."""
     return SimpleNamespace(
         width=WIDTH,
         height=HEIGHT,
@@ -96,7 +96,7 @@ def video_folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def endonerf_folder(tmp_path: Path) -> Path:
-    """Six frames in the EndoNeRF layout with everything it can have."""
+    """Six frames in the EndoNeRF layout with all optional files."""
     root = tmp_path / "endo"
     write_images(root / "images", 6, "frame-{:06d}.color.png")
     write_images(root / "images_right", 6, "frame-{:06d}.color.png")
@@ -143,7 +143,7 @@ def synthetic_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def refused() -> Callable[..., str]:
-    """Check that a recording is refused, and that opening (or reading) it and validating it say the same."""
+    """Check that a recording is refused, with the same message by opening (or reading) and by `validate`."""
 
     def check(path: Path, error: type[RecordingError], *fragments: str) -> str:
         with pytest.raises(error) as caught:

@@ -19,7 +19,7 @@ def frames() -> list[Frame]:
 
 @pytest.fixture
 def record(tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    """Records frames, and what was done with them, into a folder."""
+    """Record frames and training calls into a folder."""
     begun: list[SessionWriter] = []
 
     def write(frames: list[Frame], options: WriterOptions | None = None, *, close: bool = True) -> Path:
