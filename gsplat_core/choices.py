@@ -6,7 +6,6 @@ from here. A new implementation is a module and one line in this file.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsplat_core.registry import Registry
@@ -33,7 +32,7 @@ RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.
 CONTRIBUTING.md, "A renderer", describes how to add one.
 """
 
-DEPTHS: Registry[Callable[..., Estimator]] = Registry(
+DEPTHS: Registry[type[Estimator]] = Registry(
     "depth",
     {
         "recorded": "gsplat_core.depth.registry:RecordedDepth",
@@ -41,10 +40,11 @@ DEPTHS: Registry[Callable[..., Estimator]] = Registry(
         "light": "gsplat_core.experimental.light:LightDepth",
         "parallax": "gsplat_core.depth.multiview:ParallaxDepth",
         "onnx": "gsplat_core.depth.learned:LearnedDepth",
+        "breathing": "gsplat_core.experimental.breathing_depth:BreathingDepth",
         "none": "gsplat_core.depth.registry:NoDepth",
     },
 )
-"""Factories of depth estimators by name. A factory takes an address if its name is in `DEPTHS_WITH_ADDRESS`."""
+"""Depth estimators by name. The constructor takes an address if the name is in `DEPTHS_WITH_ADDRESS`."""
 DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
 """Names that are followed by a colon and an address, with an example of the syntax."""
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import cv2
 
-from gsplat_core.depth.registry import DepthFinder, check_depth
+from gsplat_core.depth.registry import DepthFinder, check_depth, evidence, keeps_recorded
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
@@ -167,17 +167,11 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
         fields: names of the fields that the recording's frames have.
         config: reconstruction settings; its `default_depth_mm` is quoted in the note.
     """
-    if "depth" in fields and choice in ("auto", "recorded"):
+    if "depth" in fields and keeps_recorded(choice):
         return None
-    ways = []
-    if "right_image" in fields and choice in ("auto", "stereo"):
-        ways.append("the two eyes")
-    if choice == "light":
-        ways.append("light and shade")
-    if choice.startswith("onnx:"):
-        ways.append("answers of the depth network")
-    if "pose" in fields and (config.depth_from_motion or choice in ("auto", "parallax")):
-        ways.append("the given poses")
+    ways = evidence(choice, fields)
+    if config.depth_of_recording is not None:
+        ways += [each for each in evidence(config.depth_of_recording, fields) if each not in ways]
     found = f"unless {' or '.join(ways)} show how far away it is, " if ways else ""
     lacking = (
         f"the recording's depth is left out (depth is {choice!r})"
@@ -196,8 +190,6 @@ all.
 """
 SHARE_OF_FEW = 0.25
 """Share of one core's time for depth estimation on a throttled machine."""
-KEEPS = ("auto", "recorded")
-"""Values of the setting `depth` with which a frame keeps its recorded depth."""
 
 
 class BackgroundDepth:
@@ -337,7 +329,7 @@ class BackgroundDepthOp(Operator):
         frame: `Frame`.
 
     Outputs:
-        frame: `Frame`; its depth is removed unless `beside.choice` is in `KEEPS`.
+        frame: `Frame`; its depth is removed if `beside.choice` leaves recorded depth out.
 
     Params:
         beside: the background depth estimator; started and stopped with this operator.
@@ -361,7 +353,7 @@ class BackgroundDepthOp(Operator):
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame = given = op_input.receive("frame")
-        if frame.depth is not None and self.beside.choice not in KEEPS:
+        if frame.depth is not None and not keeps_recorded(self.beside.choice):
             given = frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
         self._given.take(frame, given)
         self.beside.raise_failure()

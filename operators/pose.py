@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
+from gsplat_core.depth.registry import may_be_metric
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
@@ -124,4 +125,4 @@ def pose_operators(fragment: Any, choice: Poses, camera: Camera, depth: str) -> 
     """
     if choice == "given":
         return ()
-    return (PoseOp(fragment, name="pose", camera=camera, measured=depth in ("auto", "recorded", "stereo")),)
+    return (PoseOp(fragment, name="pose", camera=camera, measured=may_be_metric(depth)),)

@@ -106,8 +106,8 @@ class DepthSection(Section):
     depth: Annotated[
         str,
         Option(
-            "Depth of the frames: stereo from the two eyes, parallax of a moving scope with poses, light of one fixed eye"
-            " (relative), onnx by a network of yours (relative)"
+            "Depth of the frames: stereo from the two eyes, parallax of a moving scope with poses, onnx by a network of yours"
+            " (relative). Experimental: light of one fixed eye, breathing tissue before a moving scope (both relative)"
         ),
         Names(DEPTHS, DEPTHS_WITH_ADDRESS, ("auto",)),
     ] = "auto"

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import DepthMap, doubted
+from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.endoscope.onnx import Finite, OnnxNetwork, PictureSettings, Positive
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
@@ -192,10 +192,13 @@ def _network(path: Path, stamps: tuple[tuple[int, int] | None, ...]) -> OnnxNetw
     return network
 
 
-class LearnedDepth:
+class LearnedDepth(Estimator):
     """Depth estimator of one stream that runs a network at intervals and keeps its scale steady.
     The depth is never metric.
     """
+
+    origin = LEARNED
+    evidence = "answers of the depth network"
 
     def __init__(self, address: str) -> None:
         """Load the network.

@@ -13,8 +13,10 @@ a fair share of the relief that they show, a level plane is as accurate as they 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -80,11 +82,19 @@ def doubted(shape: tuple[int, int], origin: DepthOrigin, doubt: str) -> DepthMap
     return DepthMap(nothing, nothing, origin, metric=False, doubt=doubt)
 
 
-class Estimator(Protocol):
-    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The
-    same frames give the same bytes.
+class Estimator(ABC):
+    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The same frames give the
+    same bytes.
     """
 
+    origin: ClassVar[DepthOrigin | None] = None
+    """Origin of the depth; None if it is that of the frame, or if there is none."""
+    needs: ClassVar[str | None] = None
+    """Field of `Frame` without which nothing is estimated; None if the picture is enough."""
+    evidence: ClassVar[str | None] = None
+    """Noun phrase for what shows the distance, for messages; None if nothing is estimated."""
+
+    @abstractmethod
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """Estimate the depth of a frame.
 
@@ -94,6 +104,33 @@ class Estimator(Protocol):
 
         Returns:
             The depth map, or None if the frame contains nothing to estimate depth from.
+        """
+
+
+class RecordingDepth(NamedTuple):
+    """Depth of a complete recording."""
+
+    frames: list[Frame]
+    """Frames; some have depth in the unit of the camera positions. Depth without confidence is an extrapolation."""
+    doubts: Mapping[str, int]
+    """Reasons why other frames have none, as sentences with numbers of frames."""
+    at_rest: bool = False
+    """True if depth was estimated for static tissue; differences between frames are then errors, not motion."""
+
+
+@runtime_checkable
+class OfRecording(Protocol):
+    """Estimator that uses all frames of a recording at once. Training on a complete recording calls it in place of
+    `estimate`.
+    """
+
+    def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
+        """Estimate depth for frames of a recording. Frames are returned unchanged if the estimator does not apply, for
+        example because they have depth.
+
+        Args:
+            frames: frames in temporal order.
+            cameras: camera of each frame, with its pose.
         """
         ...
 

@@ -18,15 +18,17 @@ uniquely the views match. Deforming or textureless tissue gets no confidence, an
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Look, agree, doubted
+from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Estimator, Look, RecordingDepth, agree, doubted
 from gsplat_core.geometry.tracks import followed
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED, PARALLAX
@@ -519,19 +521,25 @@ STREAM_PX = 160
 MOST_KEY_FRAMES = 8
 """Largest number of key frames. When it is exceeded, one of the two closest key frames is removed.
 """
+MOST_OFFLINE = 32
+"""Number of frames of a complete recording that get depth, spread evenly."""
 LONGEST_S = 3.0
-"""Largest age of a key frame in seconds, limited because tissue deforms."""
+"""Largest time difference in seconds of compared frames, limited because tissue deforms."""
 EVERY_S = 0.2
 """Time between two depth estimates in seconds; until the first one every frame is tried."""
 
 
-class ParallaxDepth:
+class ParallaxDepth(Estimator):
     """Depth estimator by parallax for streams, with bounded memory and time per frame.
 
     Depth is estimated every `EVERY_S` and not for the frames between. A depth map is returned only
     if it agrees with the previous one (`depth_agreement`). Frames without a pose, and cameras other
     than pinholes, get no depth.
     """
+
+    origin = PARALLAX
+    needs = "pose"
+    evidence = "the given poses"
 
     def __init__(self) -> None:
         self._kept: list[tuple[float, View]] = []
@@ -562,6 +570,13 @@ class ParallaxDepth:
         if self._is_elsewhere(camera):
             self._keep(now_s, view)
         return found
+
+    def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
+        """See `OfRecording`. Key frames of a moving camera get depth, assuming static tissue."""
+        moves = any(not np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
+        if not moves or cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
+            return RecordingDepth(list(frames), {})
+        return _confirmed(*_compared(frames, cameras), cameras)
 
     def _confirmed(self, found: DepthMap, camera: Camera, now_s: float) -> DepthMap | None:
         """Return the depth if it agrees with the previous depth map, a rejected map if not, or None
@@ -597,3 +612,54 @@ class ParallaxDepth:
 
 def _apart(one: View, other: View) -> float:
     return float(np.linalg.norm(one.camera.position - other.camera.position))
+
+
+def _confirmed(frames: list[Frame], doubts: Counter[str], cameras: Sequence[Camera]) -> RecordingDepth:
+    """Keep the depth of all frames if most are confirmed by a neighbour, else of none.
+
+    One decision is made for the whole recording, because frames with and without depth would start
+    at different distances. `agree` compares two depth maps. Reasons are added to
+    `doubts`.
+    """
+    numbers = [number for number, frame in enumerate(frames) if frame.depth is not None]
+    looks = [
+        Look.of(depth, frames[number].depth_confidence, cameras[number])
+        for number in numbers
+        if (depth := frames[number].depth) is not None
+    ]
+    confirmed: set[int] = set()
+    for (one, first), (other, second) in pairwise(zip(numbers, looks, strict=True)):
+        if agree(first, second):
+            confirmed |= {one, other}
+    if 2 * len(confirmed) < len(numbers):
+        for number in numbers:
+            frames[number] = frames[number].with_fields(depth=None, depth_confidence=None, depth_origin=None)
+            doubts[UNCONFIRMED] += 1
+    return RecordingDepth(frames, doubts, at_rest=True)
+
+
+def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
+    """Estimate depth for key frames assuming static tissue. Returns all frames and the reasons for
+    rejected depth.
+    """
+    given, doubts = list(frames), Counter[str]()
+    views = [view_of(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
+    count = min(MOST_OFFLINE, len(frames))
+    for number in np.linspace(0, len(frames) - 1, count).round().astype(int).tolist():
+        frame = frames[number]
+        near = [
+            view for view, other in zip(views, frames, strict=True)
+            if other is not frame and abs(other.time_s - frame.time_s) <= LONGEST_S
+        ]  # fmt: skip
+        found = depth_of_view(views[number], near, frame.image.shape[:2])
+        if found.doubt is not None:
+            doubts[found.doubt] += 1
+            continue
+        if not np.any(found.believed):
+            doubts[DEFORMS] += 1
+        given[number] = _with(frame, found)
+    return given, doubts
+
+
+def _with(frame: Frame, found: DepthMap) -> Frame:
+    return frame.with_fields(depth=found.depth, depth_confidence=found.confidence, depth_origin=found.origin)

@@ -11,13 +11,13 @@ import numpy as np
 
 from gsplat_core.choices import DEPTHS
 from gsplat_core.choices import DEPTHS_WITH_ADDRESS as WITH_ADDRESS
-from gsplat_core.depth.maps import DepthMap, Estimator, OnDevice, measured_confidence
+from gsplat_core.depth.maps import DepthMap, Estimator, OfRecording, OnDevice, measured_confidence
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 
-class RecordedDepth:
+class RecordedDepth(Estimator):
     """Depth that is part of the frame. Without a confidence in the frame, outlier pixels are
     rejected (`measured_confidence`).
     """
@@ -33,7 +33,7 @@ class RecordedDepth:
         return DepthMap(frame.depth, confidence, frame.depth_origin, frame.depth_is_metric)
 
 
-class NoDepth:
+class NoDepth(Estimator):
     """Depth source that ignores all depth, including the frame's own."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
@@ -85,6 +85,33 @@ def with_surface(frame: Frame, camera: Camera) -> Frame:
     return smoothed
 
 
+def _kinds(choice: str) -> dict[str, type[Estimator]]:
+    """Return the estimators that a setting may use, by name."""
+    return {name: DEPTHS[name] for name in (AUTO_WITH_TIME if choice == "auto" else (choice.partition(":")[0],))}
+
+
+def keeps_recorded(choice: str) -> bool:
+    """Return True if a frame keeps its recorded depth with a setting."""
+    return RecordedDepth in _kinds(choice).values()
+
+
+def may_be_metric(choice: str) -> bool:
+    """Return True if depth by a setting can have a known scale."""
+    kinds = _kinds(choice).values()
+    return RecordedDepth in kinds or any(kind.origin is not None and kind.origin.scale != "relative" for kind in kinds)
+
+
+def evidence(choice: str, fields: frozenset[str]) -> list[str]:
+    """Return what may show the distance in frames with some fields of `Frame`, as noun phrases."""
+    kinds = _kinds(choice).values()
+    return [kind.evidence for kind in kinds if kind.evidence and (kind.needs is None or kind.needs in fields)]
+
+
+def of_recording(choice: str) -> str | None:
+    """Return the name of the estimator among those of a setting that needs a complete recording, or None."""
+    return next((name for name, kind in _kinds(choice).items() if issubclass(kind, OfRecording)), None)
+
+
 def depth_inputs(choice: str) -> tuple[Path, ...]:
     """Return the files that a depth source reads."""
     name, _, address = choice.partition(":")
@@ -95,7 +122,8 @@ def depth_inputs(choice: str) -> tuple[Path, ...]:
 def new_estimator(choice: str) -> Estimator:
     """Create the estimator `choice` for one stream. Raises like `check_depth`."""
     name, _, address = choice.partition(":")
-    return DEPTHS[name](address) if name in WITH_ADDRESS else DEPTHS[name]()
+    new: Callable[..., Estimator] = DEPTHS[name]
+    return new(address) if name in WITH_ADDRESS else new()
 
 
 class Sentences:

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.depth.maps import DepthMap, doubted
+from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
 from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
@@ -358,13 +358,17 @@ points in pixels (row offsets are corrected), and deviation of the axes.
 """
 
 
-class StereoDepth:
+class StereoDepth(Estimator):
     """Depth estimator for rectified stereo pairs.
 
     Without the right camera's calibration depth is relative, in units of the baseline, assuming
     parallel cameras with a common principal point. On a GPU it runs on its own stream concurrently
     with training; only the calling thread waits.
     """
+
+    origin = STEREO
+    needs = "right_image"
+    evidence = "the two eyes"
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
         self.work_on(device)

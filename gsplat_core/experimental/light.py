@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import DepthMap, doubted
+from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.experimental.relief import Array, Grid, Places, find_change, find_reliefs
 from gsplat_core.experimental.shading import Change, Follower, Look, Shading, look_at
 from gsplat_core.scene.cameras import Camera
@@ -103,10 +103,13 @@ UNSEEN = "too little of the picture is well exposed tissue for depth by shading"
 FLAT = "brightness does not change more than pigment could explain, so depth by shading is no better than a plane"
 
 
-class LightDepth:
+class LightDepth(Estimator):
     """Depth estimator by shading for one stream. It tracks the tissue while the scope does not
     move.
     """
+
+    origin = LIGHT
+    evidence = "light and shade"
 
     def __init__(self) -> None:
         self._forget()

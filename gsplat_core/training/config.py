@@ -106,8 +106,10 @@ class ReconstructorConfig:
     start_from_motion: bool = False
     """Move the scene by the motion prior to a new frame before its first step."""
     depth_from_motion: bool = False
-    """Estimate the scene's depth from camera motion if poses but no depth are given: online by the
-    motion prior, offline in key frames before training (`training/parallax.py`).
+    """Estimate the scene's depth online from camera motion by the motion prior, if poses but no depth are given."""
+    depth_of_recording: str | None = None
+    """Estimator of depth from all frames before training on a complete recording: a name in `DEPTHS` whose class has
+    `of_recording`. None uses the frames' own depth only.
     """
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
@@ -155,7 +157,7 @@ class ReconstructorConfig:
             max_gaussians=80_000,
             bump_spacing_s=FIELDS[field].offline_spacing_s,
             squared_error=True,
-            depth_from_motion=True,
+            depth_of_recording="parallax",
         )
 
     def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_core.depth.maps import OfRecording
+from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.registration import EXACT_KD_TREE
 from gsplat_core.scene.frames import Frame
@@ -127,6 +130,50 @@ def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observat
                 " frames must come in order"
             )
     return [observation_of(frame) for frame in frames]
+
+
+class ToFit(NamedTuple):
+    """Input of offline training."""
+
+    frames: list[Frame]
+    """Frames from which the scene is created and grown."""
+    seen: list[Observation]
+    """Observations to train on."""
+    doubts: Mapping[str, int]
+    """See `RecordingDepth`."""
+    at_rest: bool = False
+
+
+def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], depth: str | None) -> ToFit:
+    """Prepare frames for offline training; `frames` is modified.
+
+    Without depth a scene starts on a plane. A plane at the wrong distance turns camera motion into
+    apparent tissue motion, which must be learned separately for every time and does not interpolate.
+
+    Args:
+        frames: frames in temporal order. Depth of an origin with a `surface` function is smoothed.
+        observation_of: converts a frame.
+        depth: name of an estimator of depth from all frames, see `of_recording`; None for none.
+
+    Raises:
+        InvalidInput: if there are no frames, or if they are out of temporal order.
+    """
+    seen = observed(frames, observation_of)
+    cameras = [each.camera for each in seen]
+    for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
+        surface = with_surface(frame, camera)
+        if surface is not frame:
+            frames[number], seen[number] = surface, observation_of(surface)
+    estimator = None if depth is None else new_estimator(depth)
+    if not isinstance(estimator, OfRecording):
+        return ToFit(frames, seen, {})
+    found = estimator.of_recording(frames, cameras)
+    # Unconfident depth is an extrapolation: it initialises the scene but is not trained on.
+    start = [
+        frame if frame is given else frame.with_fields(depth_confidence=None)
+        for given, frame in zip(frames, found.frames, strict=True)
+    ]
+    return ToFit(start, observed(found.frames, observation_of), found.doubts, found.at_rest)
 
 
 class OfflineTraining:

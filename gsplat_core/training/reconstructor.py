@@ -23,8 +23,7 @@ from gsplat_core.training.growth import Covering
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import Following, continued, newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.offline import OfflineTraining
-from gsplat_core.training.parallax import to_fit
+from gsplat_core.training.offline import OfflineTraining, to_fit
 from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
 from gsplat_core.training.places import LeftScenes
 from gsplat_core.training.right_eye import BothEyes, for_eyes
@@ -302,7 +301,7 @@ class Reconstructor:
         """
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
-        given = to_fit(list(frames), partial(self.eyes.observation, camera=self.camera), self.config.depth_from_motion)
+        given = to_fit(list(frames), partial(self.eyes.observation, camera=self.camera), self.config.depth_of_recording)
         frames, seen, self.depth_doubts = given.frames, given.seen, given.doubts
         self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None

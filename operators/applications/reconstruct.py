@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from gsplat_core.depth.registry import DepthFinder
+from gsplat_core.depth.registry import DepthFinder, of_recording
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
@@ -147,9 +147,8 @@ def _fit(
             raise _StopFitting
 
     frames = FirstFrames(source, description.frame_count)
-    # `fit` computes offline parallax from all frames at once, so it is not estimated per frame
-    # here.
-    choice = "none" if settings.depth == "parallax" else settings.depth
+    # `fit` estimates depth that needs all frames at once.
+    choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
     finder = DepthFinder(choice, description.camera, device=settings.device)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
         chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
@@ -160,5 +159,5 @@ def _fit(
             )
         learning.fit(chosen, steps, after_step)
     for doubt, count in sorted(learning.depth_doubts.items()):
-        notes.append(f"{count} key frames were given no depth to learn from by parallax: {doubt}")
+        notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
     return learning.snapshot(), learning.eyes, done

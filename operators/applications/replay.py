@@ -26,7 +26,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from gsplat_core.depth.registry import check_depth, depth_inputs
+from gsplat_core.depth.registry import check_depth, depth_inputs, of_recording
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.frame_codec import camera_of
 from gsplat_core.io.recordings import is_heldout, open_recording
@@ -109,7 +109,7 @@ class ReplaySettings(ReplayOptions):
         """
         config = self.applied_to(ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig())
         if offline:
-            config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
+            config = replace(config, depth_of_recording=of_recording(self.depth))
         if pixels is not None:
             # One Gaussian per `PIXELS_PER_GAUSSIAN` pixels is the useful maximum.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)

@@ -240,6 +240,6 @@ def test_without_frames_there_is_nothing_to_say():
     ],
 )
 def test_a_note_names_the_ways_to_depth(choice, fields, motion, ways):
-    config = SimpleNamespace(depth_from_motion=motion, default_depth_mm=50.0)
+    config = SimpleNamespace(depth_of_recording="parallax" if motion else None, default_depth_mm=50.0)
     note = without_depth(choice, frozenset(fields), config)
     assert (note is None) if ways is None else (ways in note and "a plane 50 mm away" in note)

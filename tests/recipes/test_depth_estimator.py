@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.choices import DEPTHS
-from gsplat_core.depth.maps import DepthMap
+from gsplat_core.depth.maps import DepthMap, Estimator
 from gsplat_core.geometry.measure import Measurement
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
@@ -22,8 +22,11 @@ DISTANCE_MM = 80.0
 PROBE = DepthOrigin("probe", relative_error=0.1, scale="metric", loss_weight_online=2.0)
 
 
-class ProbeDepth:
+class ProbeDepth(Estimator):
     """Depth of a level plane at the distance that a probe touched."""
+
+    origin = PROBE
+    evidence = "the probe"
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap:
         size = frame.image.shape[:2]

@@ -9,12 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, disagreement
-from gsplat_core.depth.multiview import ParallaxDepth
+from gsplat_core.depth.multiview import ParallaxDepth, _confirmed
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.parallax import _confirmed
 from tests.gsplat_core.geometry.test_key_frames import answers, stream
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 100.0
@@ -121,7 +120,7 @@ def test_offline_all_depth_is_kept_where_most_looks_are_confirmed(factors: tuple
         )
         for number, (camera, factor) in enumerate(zip(cameras, factors, strict=True))
     ]
-    given = _confirmed(frames, cameras, Counter())
+    given = _confirmed(frames, Counter(), cameras)
     assert sum(frame.depth is not None for frame in given.frames) == kept
     assert given.doubts.get(UNCONFIRMED, 0) == 5 - kept and given.at_rest
 

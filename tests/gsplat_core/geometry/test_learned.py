@@ -274,7 +274,7 @@ def test_settings_of_tool_networks_are_refused(network):
         ("onnx:", "depth is 'onnx:'; it needs an address: onnx:FILE"),
         (
             "light:net.onnx",
-            "depth is 'light:net.onnx'; choose auto, recorded, stereo, light, parallax, onnx:FILE, none",
+            "depth is 'light:net.onnx'; choose auto, recorded, stereo, light, parallax, onnx:FILE, breathing, none",
         ),
         ("auto:net.onnx", "depth is 'auto:net.onnx'; choose auto"),
         ("onnx:net.onnx?values=metres", "has values 'metres'; choose inverse or depth"),

@@ -143,11 +143,11 @@ def test_defaults_are_those_of_the_published_figures():
         "first_frame_steps": 60, "window_frames": 30,
         "bump_spacing_s": 0.2, "squared_error": False, "history_s": None, "preallocate": False, "ssim_weight": 0.0,
         "depth_weight": 0.1, "default_depth_mm": 60.0, "eyes": "left", "motion_prior": "bumps", "motion_detail": "full",
-        "start_from_motion": False, "depth_from_motion": False,
+        "start_from_motion": False, "depth_from_motion": False, "depth_of_recording": None,
     }  # fmt: skip
     assert rates == {"means_px": 0.03, "quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh": 5e-3,
                      "right_share": 0.1, "field": None}  # fmt: skip
     offline = ReconstructorConfig.offline()
     assert (offline.gaussians, offline.max_gaussians, offline.bump_spacing_s) == (60_000, 80_000, 0.05)
     assert ReconstructorConfig.offline("hexplane").bump_spacing_s == pytest.approx(1 / 15)
-    assert offline.depth_from_motion
+    assert offline.depth_of_recording == "parallax"

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsplat_core.depth import multiview
+from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
-from gsplat_core.training import parallax
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.parallax import frames_with_parallax, to_fit
+from gsplat_core.training.offline import to_fit
 from tests.gsplat_core.geometry.moving_scope import (
     FIRST,
     HEIGHT,
@@ -23,7 +24,7 @@ from tests.gsplat_core.geometry.moving_scope import (
 
 def test_every_frame_of_a_short_recording_gets_depth() -> None:
     frames, cameras = video(6, SIDEWAYS)
-    given, doubts, at_rest = frames_with_parallax(frames, cameras)
+    given, doubts, at_rest = ParallaxDepth().of_recording(frames, cameras)
     assert not doubts
     assert at_rest
     for frame in given:
@@ -37,7 +38,7 @@ def test_every_frame_of_a_short_recording_gets_depth() -> None:
 
 def test_only_what_is_believed_is_learned_from() -> None:
     frames, cameras = video(6, SIDEWAYS)
-    frame = frames_with_parallax(frames, cameras).frames[0]
+    frame = ParallaxDepth().of_recording(frames, cameras).frames[0]
     assert frame.depth is not None
     assert frame.depth_confidence is not None
     learned = Observation.of(frame, cameras[0]).depth
@@ -47,24 +48,26 @@ def test_only_what_is_believed_is_learned_from() -> None:
 
 
 def test_key_frames_are_spread_over_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallax, "MOST_KEY_FRAMES", 3)
+    monkeypatch.setattr(multiview, "MOST_OFFLINE", 3)
     frames, cameras = video(9, SIDEWAYS)
-    given = frames_with_parallax(frames, cameras).frames
+    given = ParallaxDepth().of_recording(frames, cameras).frames
     assert [number for number, frame in enumerate(given) if frame.depth is not None] == [0, 4, 8]
 
 
 def test_what_is_long_ago_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallax, "WINDOW_S", 0.05)
+    monkeypatch.setattr(multiview, "LONGEST_S", 0.05)
     frames, cameras = video(6, SIDEWAYS)
     apart = [frame.with_fields(pts_ns=number * 100_000_000) for number, frame in enumerate(frames)]
-    given, doubts, _ = frames_with_parallax(apart, cameras)
+    given, doubts, _ = ParallaxDepth().of_recording(apart, cameras)
     assert doubts == {"the scope does not move": 6}
     assert all(frame.depth is None for frame in given)
 
 
 def test_wrong_poses_are_said() -> None:
     frames, _ = video(6, SIDEWAYS)
-    given, doubts, _ = frames_with_parallax(frames, [camera_at((0.0, 0.02 * number, 0.0)) for number in range(6)])
+    given, doubts, _ = ParallaxDepth().of_recording(
+        frames, [camera_at((0.0, 0.02 * number, 0.0)) for number in range(6)]
+    )
     assert all(frame.depth is None for frame in given)
     assert sum(doubts.values()) == 6
     assert any("poses" in doubt for doubt in doubts)
@@ -72,12 +75,12 @@ def test_wrong_poses_are_said() -> None:
 
 def test_still_cameras_known_depth_and_other_projections_are_left_alone() -> None:
     frames, cameras = video(4, SIDEWAYS)
-    assert frames_with_parallax(frames, [FIRST] * 4) == (frames, {}, False)
+    assert ParallaxDepth().of_recording(frames, [FIRST] * 4) == (frames, {}, False)
     known = [frames[0].with_fields(depth=depth_of_surface()), *frames[1:]]
-    assert frames_with_parallax(known, cameras) == (known, {}, False)
+    assert ParallaxDepth().of_recording(known, cameras) == (known, {}, False)
     for model in ("fisheye", "ortho"):
         others = [Camera(each.K, WIDTH, HEIGHT, each.world_to_camera, model) for each in cameras]  # type: ignore[arg-type]
-        assert frames_with_parallax(frames, others) == (frames, {}, False)
+        assert ParallaxDepth().of_recording(frames, others) == (frames, {}, False)
 
 
 def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
@@ -90,7 +93,7 @@ def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
     frames = [
         frame.with_fields(depth=depth, depth_confidence=sure, depth_origin=DEPTH_ORIGINS["stereo"]) for frame in frames
     ]
-    found = to_fit(list(frames), lambda frame: Observation.of(frame, cameras[0]), finds_depth=False)
+    found = to_fit(list(frames), lambda frame: Observation.of(frame, cameras[0]), depth=None)
     for frame, one in zip(found.frames, found.seen, strict=True):
         assert frame.depth is not None and one.depth is not None
         learned = one.depth.numpy()
@@ -98,5 +101,5 @@ def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
         off, before = np.std(frame.depth / true - 1), np.std(depth / true - 1)
         assert off < 0.5 * before
     measured = [frame.with_fields(depth_origin=DEPTH_ORIGINS["measured"]) for frame in frames]
-    as_it_was = to_fit(list(measured), lambda frame: Observation.of(frame, cameras[0]), finds_depth=False)
+    as_it_was = to_fit(list(measured), lambda frame: Observation.of(frame, cameras[0]), depth=None)
     assert all(frame.depth is depth for frame in as_it_was.frames)

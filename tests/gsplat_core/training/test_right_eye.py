@@ -176,7 +176,7 @@ def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
 
 def test_offline_training_takes_both_eyes(monkeypatch):
     monkeypatch.setattr(offline, "DENSIFY_ROUNDS", 1)
-    config = dataclasses.replace(CONFIG, depth_from_motion=False)
+    config = dataclasses.replace(CONFIG, depth_of_recording=None)
     views = {}
     for eyes in ("left", "both"):
         learning = Reconstructor(dataclasses.replace(config, eyes=eyes), LEFT)
@@ -218,7 +218,7 @@ def test_each_eye_keeps_its_own_colours(way, better_db, monkeypatch):
             learning.grow(frame)
             learning.rehearse(10)
     else:
-        learning = Reconstructor(dataclasses.replace(CONFIG, depth_from_motion=False), LEFT)
+        learning = Reconstructor(dataclasses.replace(CONFIG, depth_of_recording=None), LEFT)
         if way == "offline":
             learning.fit(frames, 300)
         else:

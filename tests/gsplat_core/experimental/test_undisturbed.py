@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth.periodic_motion import PeriodicMotion, fitted, fitted_undisturbed, off_px, together_px
+from gsplat_core.experimental.periodic_motion import PeriodicMotion, fitted, fitted_undisturbed, off_px, together_px
 from gsplat_core.geometry.grid_tracks import GridTracks
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.depth import moving_tissue
-from gsplat_core.depth.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue, Pull
+from gsplat_core.experimental import breathing_depth
+from gsplat_core.experimental.breathing_depth import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue, Pull
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
@@ -18,10 +18,10 @@ FOCAL_PX = 100.0
 
 @pytest.mark.parametrize(("length_s", "count"), [(3.0, 1), (8.0, 1), (8.5, 2), (12.0, 2), (12.5, 3), (20.0, 4)])
 def test_windows_of_8_seconds_overlap_by_half_or_more(monkeypatch, length_s, count):
-    monkeypatch.setattr(moving_tissue, "seen_by", lambda frame, camera: (frame, camera))
+    monkeypatch.setattr(breathing_depth, "seen_by", lambda frame, camera: (frame, camera))
     times = 5 + np.arange(round(length_s * 30) + 1) / 30
     frames = list(range(len(times)))
-    windows = moving_tissue._windows(frames, frames, times)
+    windows = breathing_depth._windows(frames, frames, times)
     assert len(windows) == count
     assert windows[0][1][0] == times[0] and windows[-1][1][-1] == times[-1]
     for pictures, seen_s in windows:
@@ -33,8 +33,8 @@ def test_windows_of_8_seconds_overlap_by_half_or_more(monkeypatch, length_s, cou
 
 
 def test_a_slow_stream_is_looked_at_whole(monkeypatch):
-    monkeypatch.setattr(moving_tissue, "seen_by", lambda frame, camera: frame)
-    ((pictures, _),) = moving_tissue._windows(list(range(11)), list(range(11)), np.arange(11) * 0.5)
+    monkeypatch.setattr(breathing_depth, "seen_by", lambda frame, camera: frame)
+    ((pictures, _),) = breathing_depth._windows(list(range(11)), list(range(11)), np.arange(11) * 0.5)
     assert pictures == list(range(11))
 
 
@@ -51,12 +51,12 @@ def decided(monkeypatch, points=100, hz=(0.5,), off_px=1.0, cycles=4.0, error=0.
 
     motion = SimpleNamespace(at=lambda times_s: None, error=np.full(points, motion_error))
     found = SimpleNamespace(hz=hz, error=error)
-    monkeypatch.setattr(moving_tissue, "follow_grids", follow)
-    monkeypatch.setattr(moving_tissue, "found_in", lambda tracks: found)
-    monkeypatch.setattr(moving_tissue, "fitted", lambda tracks, frequencies: motion)
-    monkeypatch.setattr(moving_tissue, "fitted_undisturbed", lambda tracks, motion: motion)
-    monkeypatch.setattr(moving_tissue, "off_px", lambda at, tracks: np.full((41, points, 2), [off_px, 0.0]))
-    return moving_tissue._found([None] * 41, times), keys
+    monkeypatch.setattr(breathing_depth, "follow_grids", follow)
+    monkeypatch.setattr(breathing_depth, "found_in", lambda tracks: found)
+    monkeypatch.setattr(breathing_depth, "fitted", lambda tracks, frequencies: motion)
+    monkeypatch.setattr(breathing_depth, "fitted_undisturbed", lambda tracks, motion: motion)
+    monkeypatch.setattr(breathing_depth, "off_px", lambda at, tracks: np.full((41, points, 2), [off_px, 0.0]))
+    return breathing_depth._found([None] * 41, times), keys
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def window_of(start_s=0.0, error=0.0, points=3, off=0.0):
     """Points at rest at 50, seen by a camera at the origin at five times a second apart."""
     times = start_s + np.arange(5.0)
     where = np.array([[-10.0, 0, 50], [0, 5, 50], [10, 0, 50]])[:points]
-    return moving_tissue._Window(
+    return breathing_depth._Window(
         middle_s=start_s + 2.0, error=error, off=np.full((5, points, 2), off),
         motion=SimpleNamespace(at=lambda times_s: np.repeat(where[None], len(times_s), 0), error=np.full(points, 0.01)),
         tracks=SimpleNamespace(
@@ -102,7 +102,7 @@ def window_of(start_s=0.0, error=0.0, points=3, off=0.0):
 
 @pytest.mark.parametrize(("time_s", "share"), [(2.0, 1.0), (3.0, 0.5), (1.0, 0.5), (4.0, 0.02), (0.0, 0.02)])
 def test_a_window_counts_most_in_its_middle(time_s, share):
-    assert moving_tissue._share(window_of(), time_s) == pytest.approx(share)
+    assert breathing_depth._share(window_of(), time_s) == pytest.approx(share)
 
 
 def surface_of(monkeypatch, window, time_s):
@@ -113,8 +113,8 @@ def surface_of(monkeypatch, window, time_s):
         passed.update(pixels=pixels, depth=depth, error=error, size=size)
         return np.full(size, 1.0), np.full(size, error[0]), np.ones(size)
 
-    monkeypatch.setattr(moving_tissue, "surface_through", through)
-    _, confidence = moving_tissue._surface(window, Camera.from_focal(FOCAL_PX, 32, 24), time_s)
+    monkeypatch.setattr(breathing_depth, "surface_through", through)
+    _, confidence = breathing_depth._surface(window, Camera.from_focal(FOCAL_PX, 32, 24), time_s)
     return passed, confidence
 
 
@@ -153,31 +153,31 @@ def test_a_pull_moves_points_along_the_line_of_sight_and_is_uncertain_by_two_fif
         asked.append(len(rays))
         return Pull(np.array([0.6, 0.0, -0.8]), 0.5)
 
-    monkeypatch.setattr(moving_tissue, "pull_of", pull_of)
+    monkeypatch.setattr(breathing_depth, "pull_of", pull_of)
     rays, off = np.array([[0.0, 0.0]]), np.array([[0.03, 0.0]])
-    nearer, own = moving_tissue._pulled(window, 3, np.eye(4), rays, off)
+    nearer, own = breathing_depth._pulled(window, 3, np.eye(4), rays, off)
     # 3 px across, by 0.6 of each unit: 5 units of 0.01 but for the head-on term, 9 / 10 of which are sure; 0.8 of them towards the camera.
     amount = 0.03 * 0.6 / (0.36 + 0.05**2)
     along = -0.8 * amount * 0.9
     assert nearer == pytest.approx([along])
     assert own == pytest.approx([3 * (0.03 - 0.6 * amount) + 0.4 * abs(along)])
-    moving_tissue._pulled(window, 0, np.eye(4), rays, off)
+    breathing_depth._pulled(window, 0, np.eye(4), rays, off)
     assert asked == [5, 3]
 
 
 @pytest.mark.parametrize("pull", [None, Pull(np.array([0.6, 0.0, -0.8]), 1.01)])
 def test_without_a_clear_pull_points_stay_where_their_motion_has_them(monkeypatch, pull):
-    monkeypatch.setattr(moving_tissue, "pull_of", lambda *given: pull)
-    nearer, own = moving_tissue._pulled(window_of(), 2, np.eye(4), np.zeros((1, 2)), np.array([[0.03, 0.04]]))
+    monkeypatch.setattr(breathing_depth, "pull_of", lambda *given: pull)
+    nearer, own = breathing_depth._pulled(window_of(), 2, np.eye(4), np.zeros((1, 2)), np.array([[0.03, 0.04]]))
     assert nearer == [0.0] and own == pytest.approx([0.15])
 
 
 def tissue(monkeypatch, windows, surfaces, frames):
     found = iter(windows)
-    monkeypatch.setattr(moving_tissue, "_windows", lambda *given: [(None, None)] * len(windows))
-    monkeypatch.setattr(moving_tissue, "_found", lambda *given: next(found))
+    monkeypatch.setattr(breathing_depth, "_windows", lambda *given: [(None, None)] * len(windows))
+    monkeypatch.setattr(breathing_depth, "_found", lambda *given: next(found))
     monkeypatch.setattr(
-        moving_tissue, "_surface",
+        breathing_depth, "_surface",
         lambda window, camera, time_s: [np.full((24, 32), value) for value in surfaces[window.middle_s]],
     )  # fmt: skip
     return MovingTissue(frames, [Camera.from_focal(FOCAL_PX, 32, 24)] * len(frames))

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gsplat_core.depth import moving_tissue
-from gsplat_core.depth.moving_tissue import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
+from gsplat_core.experimental import breathing_depth
+from gsplat_core.experimental.breathing_depth import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
@@ -55,7 +55,7 @@ def test_depth_of_every_frame() -> None:
 
 @pytest.mark.slow
 def test_a_frame_that_is_not_looked_at_is_between_its_neighbours(monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr(moving_tissue, "RATE_HZ", FPS / 2)
+    monkeypatch.setattr(breathing_depth, "RATE_HZ", FPS / 2)
     frames, cameras = given()
     found = MovingTissue(frames, cameras)
     before, here, after = (found.depth_of(number).depth.astype(np.float64) for number in (20, 21, 22))

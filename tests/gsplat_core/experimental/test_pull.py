@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth.moving_tissue import Pull, pull_of
+from gsplat_core.experimental.breathing_depth import Pull, pull_of
 
 FOCAL_PX = 280.0
 DIRECTION = np.array([0.38, 0.25, -0.89]) / np.linalg.norm([0.38, 0.25, -0.89])

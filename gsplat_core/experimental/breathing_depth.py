@@ -1,24 +1,18 @@
-"""Depth of every frame of a recording with a moving scope and breathing tissue, from poses and all pictures.
-
-Tissue pulled by a tool gets its motion along the line of sight from its image motion.
-
-Motion along the line of sight of tissue pulled by a tool, estimated from its image motion.
-
-Tissue dragged by a tool moves in one direction, with an amplitude that decreases with the distance from the tool. The
-image motion of such points converges to a vanishing point, like that of static tissue in front of a translating
-scope. The vanishing point gives the share of the motion along the line of sight.
-
-Depth of every frame of a recording with a moving scope and breathing tissue, from poses and all frames together.
+"""Depth of every frame of a recording with a moving scope and breathing tissue, from poses and all frames together.
 
 Grid points are tracked through windows of several seconds (`grid_tracks`). Breathing and heart frequencies are
-searched (`frequencies`) and each point's distance and motion are fitted (`periodic_motion`). The depth of a frame is
-a smooth surface through its visible points. Its confidence combines three errors: the ambiguity between scope and
-tissue motion, the spread between plausible frequencies, and the distance of each point from its fitted motion. Tissue
-pulled by a tool deviates from the fitted motion and has low confidence meanwhile.
+searched and each point's distance and motion are fitted (`periodic_motion`). The depth of a frame is a smooth surface
+through its visible points. Its confidence combines three errors: the ambiguity between scope and tissue motion, the
+spread between plausible frequencies, and the distance of each point from its fitted motion.
+
+Tissue pulled by a tool deviates from the fitted motion. It moves in one direction, with an amplitude that decreases
+with the distance from the tool. The image motion of such points converges to a vanishing point, like that of static
+tissue in front of a translating scope. The vanishing point gives the share of the motion along the line of sight.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,8 +20,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import DepthMap, doubted
-from gsplat_core.depth.periodic_motion import (
+from gsplat_core.depth.maps import DepthMap, Estimator, RecordingDepth, doubted
+from gsplat_core.depth.plane_fits import surface_through
+from gsplat_core.experimental.periodic_motion import (
     Array,
     PeriodicMotion,
     fitted,
@@ -36,7 +31,6 @@ from gsplat_core.depth.periodic_motion import (
     in_cameras,
     off_px,
 )
-from gsplat_core.depth.plane_fits import surface_through
 from gsplat_core.geometry.grid_tracks import GridTracks, TexturedPicture, follow_grids, seen_by, small_camera
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import PARALLAX
@@ -305,3 +299,39 @@ def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -
     sure = length**2 / (length**2 + (MOST_OFF_PX / tracks.focal_px) ** 2)
     along = along * sure
     return along, OWN_MOTION * unexplained + PULL_ERROR * np.abs(along)
+
+
+MOST_PIXELS = 64_000_000
+"""Largest total number of pixels of frames with depth. Each takes 12 bytes here and again in the
+observations.
+"""
+NEEDS_ALL_FRAMES = "depth of breathing tissue is estimated from a complete recording, by `intrasplat reconstruct`"
+
+
+class BreathingDepth(Estimator):
+    """Depth estimator for breathing tissue before a moving scope with known poses."""
+
+    origin = PARALLAX
+    needs = "pose"
+    evidence = "the given poses"
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap:
+        """See `Estimator`. Rejects every frame, since one frame shows no breathing."""
+        return doubted(frame.image.shape[:2], PARALLAX, NEEDS_ALL_FRAMES)
+
+    def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
+        """See `OfRecording`."""
+        if cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
+            return RecordingDepth(list(frames), {})
+        tissue = MovingTissue(frames, cameras)
+        count = min(len(frames), max(1, MOST_PIXELS // frames[0].image[..., 0].size))
+        given, doubts = list(frames), Counter[str]()
+        for number in np.linspace(0, len(frames) - 1, count).round().astype(int).tolist():
+            found = tissue.depth_of(number)
+            if found.doubt is not None:
+                doubts[found.doubt] += 1
+            else:
+                given[number] = frames[number].with_fields(
+                    depth=found.depth, depth_confidence=found.confidence, depth_origin=found.origin
+                )
+        return RecordingDepth(given, doubts)
