@@ -125,8 +125,8 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
             cells.append(f'<img src="{uri}" alt="frame {seq}, {name}" loading="lazy">')
     return (
         "<section><h2>Frames</h2>"
-        '<p class="lead">Where the reconstruction is grey and dark with a light outline, it shows tissue that the frame does not, behind a tool or outside '
-        "of the field of view: remembered as it was seen last, not as it is now. "
+        '<p class="lead">Dark grey areas with a light outline are remembered tissue, shown as last seen: behind a tool or outside '
+        "of the field of view. "
         'Error <span class="scale inferno"></span> from 0 to 32 grey levels or more; '
         'depth <span class="scale viridis"></span> from near to far; grey marks tools, which are not scored, and unknown depth.</p>'
         f'<div class="frames">{"".join(cells)}</div></section>'
@@ -377,7 +377,7 @@ def _row(pictures: HiddenPictures) -> str:
     )
     return (
         f'<p class="lead">Frame {pictures.seq} at {pictures.time_s:.2f} s. Tissue behind tools and outside of the view is shown as it was seen last;'
-        " where the model has nothing it is grey. From the side: the same moment, 16 degrees aside.</p>"
+        " where the model has nothing it is grey. From the side: the same time, from 16 degrees to the side.</p>"
         f'<div class="frames">{heads}{images}</div>'
     )
 
@@ -394,7 +394,7 @@ def _figures(truth: TruthFacts) -> str:
     for name, errors in (("Depth that is seen", truth.depth), ("Depth behind tools", truth.depth_behind_tools)):
         tables += "" if errors is None else _depth(name, errors)
     return (
-        '<p class="lead">Against the truth of a synthetic recording, which training never sees. The planes know the truth.</p>'
+        '<p class="lead">Compared with the ground truth of a synthetic recording, which training does not use. Both planes are fitted to it.</p>'
         f'<div class="three">{tables}</div>'
     )
 
