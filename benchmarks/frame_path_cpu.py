@@ -23,13 +23,13 @@ import numpy as np
 import torch
 
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.applications.live import analysis_operator
 from operators.display import DisplayOp
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.graph import Application
 from operators.messages import PictureState, RenderedFrame, ShownPicture
-from operators.metrics import OnScreenMetricsOp
-from operators.side_by_side import SideBySideOp, through, with_findings
+from operators.metrics import MetricsOp
+from operators.pipeline import analysis_operator
+from operators.side_by_side import through, with_findings
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
 
@@ -42,12 +42,10 @@ class FramePath:
 
     def __init__(self) -> None:
         graph = Application(name="frame path")
-        made = analysis_operator(graph, "builtin", "withhold")
-        assert isinstance(made, SideBySideOp)
-        self._analysis = made
+        self._analysis = analysis_operator(graph, "builtin", "withhold")
         clock = FrameClock(ClockSettings(), 30.0)
         self._display = DisplayOp(graph, name="display", clock=clock, source_state=lambda: SourceState.LIVE)
-        self._score = OnScreenMetricsOp(graph, name="on_screen")
+        self._score = MetricsOp(graph, name="metrics", on_screen=True)
         for operator in (self._analysis, self._display, self._score):
             operator.initialize()
             operator.start()

@@ -32,11 +32,11 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
-from operators.applications.live import analysis_operator
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
 from operators.graph import Application
 from operators.ingest import SourceOp
+from operators.pipeline import analysis_operator
 from operators.sinks.callback import CallbackSinkOp
 from operators.sources.registry import SourceOptions, open_source
 
@@ -101,7 +101,7 @@ class Analysis(Application):
 
     def compose(self) -> None:
         source = SourceOp(self, name="source", source=self._source)
-        analysis = analysis_operator(self, "builtin", "withhold", ())
+        analysis = analysis_operator(self, "builtin", "withhold")
         sink = CallbackSinkOp(self, name="frames", callback=self.frames.append)
         self.add_flow(source, analysis, {("frame", "frame")})
         self.add_flow(analysis, sink, {("frame", "message")})

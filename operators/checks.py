@@ -258,7 +258,7 @@ def _settled(frame: Frame, came: Frame) -> bool:
     scene.
     """
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
-    return unchanged and frame.withheld is None and frame.new_scene is None and frame.status is not FrameStatus.DAMAGED
+    return unchanged and frame.new_scene is None and frame.unusable is None
 
 
 class TissueStagesOp(StageOp):
@@ -406,7 +406,7 @@ class FieldOfViewStage(Stage):
         self._view = FieldOfView()
 
     def annotate(self, frame: Frame) -> Frame:
-        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+        if frame.unusable is None:
             self._view.observe(frame.image)
         masked = self.carried(frame)
         self.found["limited"] += masked is not frame
@@ -433,7 +433,7 @@ class StripStage(Stage):
         self._detector = StripDetector()
 
     def annotate(self, frame: Frame) -> Frame:
-        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+        if frame.unusable is None:
             self._detector.observe(frame.image)
         masked = self.carried(frame)
         self.found["strip or text"] += masked is not frame
@@ -489,7 +489,7 @@ class ExposureStage(Stage):
     def annotate(self, frame: Frame) -> Frame:
         if frame.new_scene is not None:
             self._estimator.start_scene()
-        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+        if frame.unusable is None:
             self._estimator.observe(frame.image, tissue_of(frame), frame.pts_ns)
             self.found["changing"] += self._estimator.following
         self.found["other than the scene's"] += self._estimator.gains != UNCHANGED
@@ -517,7 +517,7 @@ class SharpnessStage(Stage):
         self._gate = SharpnessGate()
 
     def annotate(self, frame: Frame) -> Frame:
-        if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
+        if frame.unusable is not None:
             return frame
         if frame.new_scene is not None:
             self._gate.start_scene()
@@ -572,7 +572,7 @@ class CutStage(Stage):
         self._detector = CutDetector()
 
     def annotate(self, frame: Frame) -> Frame:
-        if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
+        if frame.unusable is not None:
             self._detector.skip()
             return frame
         verdict = self._detector.observe(frame.image, frame.seq, frame.pts_ns)

@@ -1,7 +1,7 @@
 """Depth maps of frames: recorded with the stream, estimated from the frames, or absent.
 
-During a live stream, `BackgroundDepthOp` estimates depth in a background thread, and the stream never waits for it. Late estimates are passed to the model after
-training on their frames.
+During a live stream, depth is estimated in a background thread, and the stream never waits for it. Late estimates are passed to the model after training on
+their frames.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 
@@ -22,9 +22,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import use_one_thread
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.placement import LateDepth
-from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
-from operators.graph.tracking import Histogram
 from operators.outcome import OutcomeBuilder
 from operators.side_thread import step_back, usable_cores
 
@@ -106,56 +104,6 @@ class DepthCounts:
             outcome.note(f"{frames} frames were given no depth: {doubt}")
         if self._dropped:
             outcome.note(f"the depth that {self._dropped} frames came with was not used (depth is {choice!r})")
-
-
-class DepthOp(Operator):
-    """Attaches to each frame the depth that `choice` selects. Frames without a result pass without
-    depth.
-
-    Inputs:
-        frame: `Frame`.
-
-    Outputs:
-        frame: `Frame` with `depth`, `depth_confidence` and `depth_origin` set, or all three None.
-
-    Params:
-        choice: `auto` or another value accepted by `check_depth`. Raises InvalidSetting otherwise.
-        camera: camera of the frames.
-        has_time: allow `auto` to use estimators slower than the camera's frame rate.
-        device: device of estimators that are not limited to the CPU.
-        held_out: returns True for evaluation frames, which keep their recorded depth but are never
-            passed to an estimator.
-    """
-
-    def __init__(
-        self, fragment: Any, *args: Any, choice: str, camera: Camera, has_time: bool = False, device: str = "cpu",
-        held_out: Callable[[Frame], bool] = lambda frame: False, **kwargs: Any,
-    ) -> None:  # fmt: skip
-        check_depth(choice)
-        self.choice, self.camera, self.held_out = choice, camera, held_out
-        self.has_time, self.device = has_time, device
-        self._finder: DepthFinder | None = None
-        self._counts = DepthCounts()
-        super().__init__(fragment, *args, **kwargs)
-
-    def setup(self, spec: OperatorSpec) -> None:
-        spec.input("frame", type=Frame)
-        spec.output("frame", type=Frame)
-
-    def start(self) -> None:
-        self._counts = DepthCounts()
-        self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time, device=self.device)
-
-    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        assert self._finder is not None
-        frame = op_input.receive("frame")
-        given = self._finder.with_depth(frame, shown_only=self.held_out(frame))
-        self._counts.take(frame, given)
-        op_output.emit(given, "frame")
-
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
-        self._counts.contribute(outcome, self.choice, self._finder)
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
@@ -319,25 +267,48 @@ def share_of(cores: int) -> float:
     return SHARE_OF_FEW if cores <= FEW_CORES else 1.0
 
 
-class BackgroundDepthOp(Operator):
-    """Passes frames on with or without their recorded depth, and owns the depth estimation thread.
+class DepthOp(Operator):
+    """Attaches to each frame the depth that `choice` selects. Frames without a result pass without
+    depth.
 
-    Frames are passed on immediately. `LiveReconstructOp` offers the frames that it trains on to the
-    thread and takes the results.
+    With `in_background`, frames are passed on immediately, with their recorded depth or without
+    depth. `UntilDisplay` offers the frames that it trains on to `background` and takes the results.
 
     Inputs:
         frame: `Frame`.
 
     Outputs:
-        frame: `Frame`; its depth is removed if `beside.choice` leaves recorded depth out.
+        frame: `Frame` with `depth`, `depth_confidence` and `depth_origin` set, or all three None.
 
     Params:
-        beside: the background depth estimator; started and stopped with this operator.
+        choice: `auto` or another value accepted by `check_depth`. Raises InvalidSetting otherwise.
+        camera: camera of the frames.
+        in_background: estimate depth in a background thread.
+        has_time: allow `auto` to use estimators slower than the camera's frame rate.
+        device: device of estimators that are not limited to the CPU.
+        held_out: returns True for evaluation frames, which keep their recorded depth but are never
+            passed to an estimator.
     """
 
-    def __init__(self, fragment: Any, *args: Any, beside: BackgroundDepth, **kwargs: Any) -> None:
-        self.beside = beside
-        self._given = DepthCounts()
+    def __init__(
+        self,
+        fragment: Any,
+        *args: Any,
+        choice: str,
+        camera: Camera,
+        in_background: bool = False,
+        has_time: bool = False,
+        device: str = "cpu",
+        held_out: Callable[[Frame], bool] = lambda frame: False,
+        **kwargs: Any,
+    ) -> None:
+        check_depth(choice)
+        self.choice, self.camera, self.held_out = choice, camera, held_out
+        self.has_time, self.device = has_time, device
+        self.background = BackgroundDepth(choice, camera, device=device) if in_background else None
+        """Estimator whose thread this operator starts and stops; None without `in_background`."""
+        self._finder: DepthFinder | None = None
+        self._counts = DepthCounts()
         super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
@@ -345,23 +316,33 @@ class BackgroundDepthOp(Operator):
         spec.output("frame", type=Frame)
 
     def start(self) -> None:
-        self._given = DepthCounts()
-        self.beside.start()
+        self._counts = DepthCounts()
+        if self.background is not None:
+            self.background.start()
+        else:
+            self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time, device=self.device)
 
     def stop(self) -> None:
-        self.beside.stop()
+        if self.background is not None:
+            self.background.stop()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame = given = op_input.receive("frame")
-        if frame.depth is not None and not keeps_recorded(self.beside.choice):
+        if self._finder is not None:
+            given = self._finder.with_depth(frame, shown_only=self.held_out(frame))
+        elif frame.depth is not None and not keeps_recorded(self.choice):
             given = frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
-        self._given.take(frame, given)
-        self.beside.raise_failure()
+        self._counts.take(frame, given)
+        if self.background is not None:
+            self.background.raise_failure()
         op_output.emit(given, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        (self._given + self.beside.counts).contribute(outcome, self.beside.choice, self.beside.finder)
+        counts, finder = self._counts, self._finder
+        if self.background is not None:
+            counts, finder = counts + self.background.counts, self.background.finder
+        counts.contribute(outcome, self.choice, finder)
 
 
 @dataclass(frozen=True)
@@ -374,65 +355,3 @@ class TakenDepth:
     """Median delay from the frame's arrival to the use of its depth, in milliseconds."""
     dropped: int
     """Rejected estimates, for example of an earlier scene or of a frame too old."""
-
-
-class DepthFound(Protocol):
-    """Asynchronous depth estimator for frames that are being trained on."""
-
-    def offer(self, frame: Frame) -> None:
-        """Submit a frame for estimation; the estimator may drop it."""
-
-    def take(self) -> tuple[Frame, LateDepth] | None:
-        """Return a finished frame with its depth and the training data made from it, once each.
-        None if there is no new result.
-        """
-
-
-class LateDepths:
-    """Passes late depth estimates to a model and records their delay."""
-
-    def __init__(self, found: DepthFound | None) -> None:
-        """found: the asynchronous estimator; None disables late depth."""
-        self._found = found
-        self.begin()
-
-    def begin(self) -> None:
-        """Reset the statistics for a new stream."""
-        self._ages = Histogram()
-        self._taken = self._dropped = 0
-
-    def offer(self, frame: Frame) -> None:
-        """Submit a frame that is being trained on to the estimator."""
-        if self._found is not None:
-            self._found.offer(frame)
-
-    def give(self, reconstructor: Reconstructor, now_ns: Callable[[], int]) -> Frame | None:
-        """Pass a new estimate, if any, to the model.
-
-        Args:
-            reconstructor: the live model.
-            now_ns: monotonic clock in nanoseconds, the clock of `Frame.arrived_ns`.
-
-        Returns:
-            The frame with the depth that the model accepted; None if there was none.
-        """
-        found = None if self._found is None else self._found.take()
-        if found is None:
-            return None
-        frame, late = found
-        if not reconstructor.take_depth(frame, late):
-            self._dropped += 1
-            return None
-        self._taken += 1
-        if frame.arrived_ns is not None:
-            self._ages.record(now_ns() - frame.arrived_ns)
-        return frame
-
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
-        age_ms = self._ages.summary().p50_ms
-        outcome.add(TakenDepth(self._taken, age_ms, self._dropped))
-        if self._taken:
-            outcome.note(
-                f"the depth of {self._taken} frames was learned after they were shown, {age_ms:.0f} ms after they had come (median)"
-            )

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.scene.frames import FrameStatus
 from operators.frame_clock import FrameClock
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
 from operators.graph.tracking import DurationSummary, Histogram
@@ -205,7 +204,7 @@ def _is_outdated(rendered: RenderedFrame, state: PictureState) -> bool:
     This holds for frozen pictures and a lost source. It also holds for a stale picture whose frame
     was withheld or damaged. A picture that is only late shows tissue seen a moment ago.
     """
-    unused = rendered.frame.withheld is not None or rendered.frame.status is FrameStatus.DAMAGED
+    unused = rendered.frame.unusable is not None
     return state in (PictureState.FROZEN, PictureState.SOURCE_LOST) or (state is PictureState.STALE and unused)
 
 

@@ -161,7 +161,7 @@ def is_live_log(path: Path) -> bool:
 def read_live_log(path: Path, record: Record | None = None) -> Live:
     """Compute the scores of the live protocol from a run's log.
 
-    The run scored the pictures when they were displayed (`OnScreenMetricsOp`). The last frame is
+    The run scored the pictures when they were displayed (`MetricsOp`). The last frame is
     excluded, because its display duration is unknown.
 
     Args:

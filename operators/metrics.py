@@ -1,6 +1,6 @@
 """Quality scores with trivial baselines, and a digest of the displayed pictures.
 
-A replay scores each displayed frame. A live stream scores each frame against the picture on display when the next frame arrives.
+A run without a clock scores each frame against its own picture. A live stream scores each frame against the picture on display when the next frame arrives.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ import hashlib
 import math
 import time
 from collections import OrderedDict, deque
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gsplat_core.memory import return_freed_memory
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
 from operators.frame_log import FrameLog, LogLine, Value
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
@@ -121,95 +121,6 @@ class QualityResult:
     """Number of displayed frames, including damaged ones, which are not scored."""
 
 
-class MetricsOp(Operator):
-    """Scores each displayed frame against its raw frame on tissue, and hashes the displayed bytes.
-
-    The digest is SHA-256 over the line `seq width height\\n` and the RGB bytes of each
-    reconstruction, in order. Only running means are kept in memory; the log holds the scores of
-    each frame. A damaged frame enters digest and log without scores, because its pixels are the
-    decoder's concealment.
-
-    Inputs:
-        rendered: `RenderedFrame`.
-        predicted: `Prediction` of the same frame; optional.
-
-    Outputs:
-        scored: `ScoredFrame`.
-
-    Params:
-        log: per-frame log; without it the result has no series.
-    """
-
-    def __init__(self, fragment: Any, *args: Any, log: FrameLog | None = None, **kwargs: Any) -> None:
-        self.log = log
-        self.live = QualityTracker()
-        """Frames trained on before display."""
-        self.held_out = QualityTracker()
-        """Frames displayed and never trained on."""
-        self.frames = 0
-        """Number of frames so far."""
-        self.next_frame = NextFrameScores()
-        self._digest = hashlib.sha256()
-        self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
-        self._previous: Frame | None = None
-        super().__init__(fragment, *args, **kwargs)
-
-    def setup(self, spec: OperatorSpec) -> None:
-        spec.input("rendered", type=RenderedFrame)
-        spec.input("predicted", type=Prediction, optional=True)
-        spec.output("scored", type=ScoredFrame)
-
-    def start(self) -> None:
-        self.live, self.held_out, self.frames = QualityTracker(), QualityTracker(), 0
-        self.next_frame = NextFrameScores()
-        self._digest = hashlib.sha256()
-        self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
-        self._previous = None
-        if self.log is not None:
-            self.log.open()
-
-    def stop(self) -> None:
-        self._hashing.shutdown()
-        self._previous = None
-        if self.log is not None:
-            self.log.close()
-
-    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        rendered: RenderedFrame = op_input.receive("rendered")
-        frame, previous = rendered.frame, self._previous
-        self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
-        # Hashing runs in parallel to scoring; neither holds the GIL for long.
-        hashed = self._hashing.submit(self._digest.update, np.ascontiguousarray(rendered.image).data)
-        self.frames += 1
-        quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
-        if frame.status is not FrameStatus.DAMAGED:
-            tracker = self.live if rendered.trained else self.held_out
-            quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
-            if previous is not None and previous.image.shape == frame.image.shape:
-                before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
-        next_db = prediction_db(op_input.receive("predicted"))
-        self.next_frame.add(next_db, before_db)
-        hashed.result()
-        scored = ScoredFrame(rendered, quality, before_db, next_db)
-        if self.log is not None:
-            self.log.write(scored.as_json())
-        self._previous = frame
-        op_output.emit(scored, "scored")
-
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
-        entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
-        if self.log is not None and self.frames:
-            outcome.output("frames", self.log.path)
-        outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256, self.frames))
-        outcome.add(self.next_frame.result)
-
-    @property
-    def frames_sha256(self) -> str:
-        """SHA-256 of the frames so far, in hex."""
-        return self._digest.hexdigest()
-
-
 LOOK_NS = 500_000_000
 WAITING = 8
 """Capacity of each input queue, in messages. A full queue drops its oldest message; dropped frames
@@ -255,35 +166,146 @@ class OnScreenResult:
     """Frames that arrived too fast to be scored."""
 
 
-class OnScreenMetricsOp(Operator):
-    """Scores each frame against the picture on display when the next frame arrived.
+class PictureDigest:
+    """SHA-256 over the line `seq width height\\n` and the RGB bytes of each reconstruction, in order.
 
-    This is the frame's own picture or, if that was late, an older one. Overlays are not scored.
-    Most frames were trained on before display, so the scores are training errors. Predictions are
-    scored separately after the first second (`NextFrameResult`).
+    Hashing runs in a thread, in parallel to scoring; neither holds the GIL for long.
+    """
+
+    def __init__(self) -> None:
+        self._digest = hashlib.sha256()
+        self._thread: ThreadPoolExecutor | None = None
+        self._newest: Future[None] | None = None
+
+    def add(self, rendered: RenderedFrame) -> None:
+        """Hash the picture of a frame. Waits for the previous one."""
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
+        self._wait()
+        frame = rendered.frame
+        self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
+        self._newest = self._thread.submit(self._digest.update, np.ascontiguousarray(rendered.image).data)
+
+    def hexdigest(self) -> str:
+        """Return the digest of the pictures so far, in hex."""
+        self._wait()
+        return self._digest.hexdigest()
+
+    def close(self) -> None:
+        """End the thread. The digest stays readable."""
+        if self._thread is not None:
+            self._thread.shutdown()
+
+    def _wait(self) -> None:
+        if self._newest is not None:
+            self._newest.result()
+
+
+class OnScreen:
+    """Assignment of frames to the pictures on display when their next frames arrived.
+
+    This is a frame's own picture or, if that was late, an older one.
+    """
+
+    def __init__(self, show: Callable[[ShownPicture], None]) -> None:
+        """show: called with each picture in the order of display."""
+        self._show = show
+        self._frames: deque[Frame | None] = deque()
+        self._shown: deque[ShownPicture] = deque()
+        self._current: ShownPicture | None = None
+        self._last_seq: int | None = None
+        self.unscored = 0
+        """Frames that arrived too fast to be scored."""
+
+    def add_picture(self, shown: ShownPicture) -> None:
+        """Add a picture in the order of display. Repetitions are ignored."""
+        if shown.new:
+            self._shown.append(shown)
+
+    def add_frame(self, frame: Frame) -> None:
+        """Add the next frame."""
+        self._frames.append(frame)
+
+    def end(self) -> None:
+        """End the stream. The last frame has no successor and gets the final picture."""
+        if self._frames:
+            self._frames.append(None)
+
+    def pairs(self, waiting: int) -> Iterator[tuple[Frame, ShownPicture | None, float]]:
+        """Yield the oldest frames until `waiting` remain, each with its picture and the arrival of
+        the next frame in nanoseconds. The picture is None if there is none of the frame's size.
+        """
+        while len(self._frames) > max(1, waiting):
+            frame, following = self._frames.popleft(), self._frames[0]
+            assert frame is not None
+            until_ns = math.inf if following is None or following.arrived_ns is None else following.arrived_ns
+            while self._shown and self._shown[0].shown_ns <= until_ns:
+                self._display(self._shown.popleft())
+            if self._last_seq is not None:
+                self.unscored += max(0, frame.seq - self._last_seq - 1)
+            self._last_seq = frame.seq
+            current = self._current
+            fits = current is not None and current.rendered.image.shape == frame.image.shape
+            yield frame, current if fits else None, until_ns
+        while len(self._shown) > 4 * WAITING:
+            self._display(self._shown.popleft())
+
+    def _display(self, shown: ShownPicture) -> None:
+        self._current = shown
+        self._show(shown)
+
+
+class MetricsOp(Operator):
+    """Scores frames against displayed pictures on tissue, and hashes the displayed bytes.
+
+    Without a clock each frame is scored against its own picture. With `on_screen` it is scored
+    against the picture on display when the next frame arrived; overlays are not scored. Frames that
+    were trained on before display have training errors. Predictions are scored separately
+    (`NextFrameResult`), in a live stream after the first second.
+
+    Only running means are kept in memory; the log holds the scores of each frame. A damaged or
+    withheld frame enters digest and log without scores.
 
     Inputs:
-        frame: `Frame`, as it enters reconstruction.
-        shown: `ShownPicture`.
+        rendered: `RenderedFrame`; without `on_screen`.
+        frame: `Frame`, as it enters reconstruction; with `on_screen`.
+        shown: `ShownPicture`; with `on_screen`.
         predicted: `Prediction` of some of the frames; optional.
 
     Outputs:
         scored: `ScoredFrame`.
 
     Params:
+        on_screen: score the pictures of a live display.
         log: per-frame log; without it the result has no series.
-        report: also compute SSIM and the digest, and contribute `QualityResult`; needed for reports
+        report: compute SSIM and the digest, and contribute `QualityResult`; needed for reports
             only.
     """
 
+    _previous: Frame | None
+    """Newest frame, the trivial baseline of the next one."""
+
     def __init__(
-        self, fragment: Any, *args: Any, log: FrameLog | None = None, report: bool = True, **kwargs: Any
+        self,
+        fragment: Any,
+        *args: Any,
+        on_screen: bool = False,
+        log: FrameLog | None = None,
+        report: bool = True,
+        **kwargs: Any,
     ) -> None:
-        self.log, self.report = log, report
+        self.on_screen, self.log, self.report = on_screen, log, report
+        self._digest = PictureDigest()
         self._reset()
-        super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
+        conditions = (MessageOrTimeoutCondition(fragment, LOOK_NS),) if on_screen else ()
+        super().__init__(fragment, *conditions, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
+        if not self.on_screen:
+            spec.input("rendered", type=RenderedFrame)
+            spec.input("predicted", type=Prediction, optional=True)
+            spec.output("scored", type=ScoredFrame)
+            return
         for name, kind in (("frame", Frame), ("shown", ShownPicture), ("predicted", Prediction)):
             optional = name == "predicted"
             port = spec.input(name, policy="drop_oldest", type=kind, optional=optional).condition(ConditionType.NONE)
@@ -296,140 +318,134 @@ class OnScreenMetricsOp(Operator):
             self.log.open()
 
     def stop(self) -> None:
-        if self._frames:
-            # The last frame has no successor and is scored against the final picture.
-            self._frames.append(None)
-            self._score_waiting(waiting=0)
-        self._frames.clear()
-        self._shown.clear()
-        self._predicted.clear()
+        self._screen.end()
+        for frame, shown, until_ns in self._screen.pairs(waiting=0):
+            self._score_shown(frame, shown, until_ns)
+        self._digest.close()
+        self._previous = None
         if self.log is not None:
             self.log.close()
 
     def _reset(self) -> None:
-        self.quality = QualityTracker()
-        """Scores of all frames."""
+        self.trained, self.held_out = QualityTracker(), QualityTracker()
+        """Scores of frames trained on before display, and of frames never trained on."""
+        self.frames = 0
+        """Number of frames so far."""
+        self.next_frame = NextFrameScores()
         self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
         self.worst: tuple[float, int] | None = None
-        self.next_frame = NextFrameScores()
-        self.frames = self.not_on_screen = self.unscored = 0
-        self._digest = hashlib.sha256()
-        self._frames: deque[Frame | None] = deque()
-        self._shown: deque[ShownPicture] = deque()
+        self.not_on_screen = 0
+        self._digest.close()
+        self._digest = PictureDigest()
+        self._screen = OnScreen(self._hash)
         self._predicted: OrderedDict[int, float] = OrderedDict()
         """Tissue PSNR in dB of predictions whose frame is not scored yet, by sequence number."""
         self._waiting_db: OrderedDict[int, float] = OrderedDict()
         """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not
         arrived.
         """
-        self._on_screen: ShownPicture | None = None
-        self._previous: Frame | None = None
+        self._previous = None
         self._first_s: float | None = None
-        self._last_seq: int | None = None
         self._trimmed_s = time.monotonic()
         self._log_works = True
 
+    @property
+    def frames_sha256(self) -> str:
+        """SHA-256 of the pictures so far, in hex."""
+        return self._digest.hexdigest()
+
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        if not self.on_screen:
+            rendered: RenderedFrame = op_input.receive("rendered")
+            self._digest.add(rendered)
+            self._take(op_input.receive("predicted"))
+            op_output.emit(self._score_own(rendered), "scored")
+            return
         shown: ShownPicture | None
         while (shown := op_input.receive("shown")) is not None:
-            if shown.new:
-                self._shown.append(shown)
+            self._screen.add_picture(shown)
         frame: Frame | None
         while (frame := op_input.receive("frame")) is not None:
-            self._frames.append(frame)
+            self._screen.add_frame(frame)
         prediction: Prediction | None
         while (prediction := op_input.receive("predicted")) is not None:
             self._take(prediction)
         # Pictures lag behind frames, so a frame is scored once the two following frames have
         # arrived.
-        for scored in self._score_waiting(waiting=2):
-            op_output.emit(scored, "scored")
-        while len(self._shown) > 4 * WAITING:
-            self._show(self._shown.popleft())
+        for frame, shown, until_ns in self._screen.pairs(waiting=2):
+            if (scored := self._score_shown(frame, shown, until_ns)) is not None:
+                op_output.emit(scored, "scored")
         now_s = time.monotonic()
         if now_s - self._trimmed_s > TRIM_EVERY_S:
             # Freed pictures fragment the heap; without trimming, resident memory grows for hours.
             self._trimmed_s = now_s
             return_freed_memory()
 
-    def _score_waiting(self, waiting: int) -> list[ScoredFrame]:
-        """Score the oldest frames until `waiting` frames remain in the queue, and return the
-        scores.
-        """
-        scores = []
-        while len(self._frames) > max(1, waiting):
-            frame, following = self._frames[0], self._frames[1]
-            self._frames.popleft()
-            if frame is not None and (scored := self._score(frame, following)) is not None:
-                scores.append(scored)
-        return scores
+    def _hash(self, shown: ShownPicture) -> None:
+        if self.report:
+            self._digest.add(shown.rendered)
 
-    def _take(self, prediction: Prediction) -> None:
+    def _take(self, prediction: Prediction | None) -> None:
         """Score a prediction. On a slow machine it arrives after its frame was scored."""
-        value, seq = prediction_db(prediction), prediction.frame.seq
-        if not math.isfinite(value):
+        value = prediction_db(prediction)
+        if prediction is None or not math.isfinite(value):
             return
-        before_db = self._waiting_db.pop(seq, None)
+        before_db = self._waiting_db.pop(prediction.frame.seq, None)
         if before_db is not None:
             self.next_frame.add(value, before_db)
         else:
-            _keep(self._predicted, seq, value)
+            _keep(self._predicted, prediction.frame.seq, value)
 
-    def _show(self, picture: ShownPicture) -> None:
-        self._on_screen = picture
-        if not self.report:
-            return
-        frame = picture.rendered.frame
-        self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
-        self._digest.update(np.ascontiguousarray(picture.rendered.image).data)
+    def _score_own(self, rendered: RenderedFrame) -> ScoredFrame:
+        """Score a frame against its own picture."""
+        tracker = self.trained if rendered.trained else self.held_out
+        scored = self._score(rendered.frame, rendered, tracker, similarity=True)
+        self._log(scored.as_json())
+        return scored
 
-    def _score(self, frame: Frame, following: Frame | None) -> ScoredFrame | None:
-        until_ns = math.inf if following is None or following.arrived_ns is None else following.arrived_ns
-        while self._shown and self._shown[0].shown_ns <= until_ns:
-            self._show(self._shown.popleft())
-        if self._last_seq is not None:
-            self.unscored += max(0, frame.seq - self._last_seq - 1)
-        self._last_seq = frame.seq
-        previous, self._previous = self._previous, frame
-        on_screen = self._on_screen
-        if on_screen is None or on_screen.rendered.image.shape != frame.image.shape:
+    def _score_shown(self, frame: Frame, shown: ShownPicture | None, until_ns: float) -> ScoredFrame | None:
+        """Score a frame against the picture on display until `until_ns`; None without a picture."""
+        if shown is None:
+            self._previous = frame
             return None
+        if self._first_s is None:
+            self._first_s = frame.time_s
+        similarity = self.report and self.frames % SIMILARITY_EVERY == 0
+        scored = self._score(frame, shown.rendered, self.trained, similarity=similarity)
+        self.not_on_screen += shown.rendered.frame.seq != frame.seq
+        self.before_throughout.add(scored.previous_frame_db)
+        value = scored.quality.psnr_tissue_db
+        if self._is_settled(frame):
+            self.settled.add(value)
+            self.before.add(scored.previous_frame_db)
+            if math.isfinite(value) and (self.worst is None or value < self.worst[0]):
+                self.worst = value, frame.seq
+        self._log(_entry(scored, frame, shown, until_ns))
+        return scored
+
+    def _score(
+        self, frame: Frame, rendered: RenderedFrame, tracker: QualityTracker, *, similarity: bool
+    ) -> ScoredFrame:
+        """Score a frame against a picture; `similarity` also computes SSIM."""
+        previous, self._previous = self._previous, frame
         self.frames += 1
-        before_db = math.nan
-        scorable = frame.status is not FrameStatus.DAMAGED and frame.withheld is None
-        if scorable:
-            quality = self.quality.observe(
-                frame.seq, on_screen.rendered.image, frame.image, frame.mask,
-                similarity=self.report and self.frames % SIMILARITY_EVERY == 1,
-            )  # fmt: skip
+        quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
+        if frame.unusable is None:
+            quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask, similarity=similarity)
             if previous is not None and previous.image.shape == frame.image.shape:
                 before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
-        else:
-            quality = FrameQuality(frame.seq, math.nan, math.nan, math.nan)
-        self._count(frame, on_screen, quality, before_db)
-        scored = ScoredFrame(on_screen.rendered, quality, before_db, self._next_frame_db(frame, before_db))
+        return ScoredFrame(rendered, quality, before_db, self._next_frame_db(frame, before_db))
+
+    def _log(self, entry: Mapping[str, Value]) -> None:
         if self.log is not None and self._log_works:
             # Do not write again in `stop` after a failed write, so that the error is reported once.
             self._log_works = False
-            self.log.write(_entry(scored, frame, on_screen, until_ns))
+            self.log.write(entry)
             self._log_works = True
-        return scored
-
-    def _count(self, frame: Frame, on_screen: ShownPicture, quality: FrameQuality, before_db: float) -> None:
-        if on_screen.rendered.frame.seq != frame.seq:
-            self.not_on_screen += 1
-        if self._first_s is None:
-            self._first_s = frame.time_s
-        self.before_throughout.add(before_db)
-        if not self._is_settled(frame):
-            return
-        value = quality.psnr_tissue_db
-        self.settled.add(value)
-        self.before.add(before_db)
-        if math.isfinite(value) and (self.worst is None or value < self.worst[0]):
-            self.worst = value, frame.seq
 
     def _is_settled(self, frame: Frame) -> bool:
+        if not self.on_screen:
+            return True
         return self._first_s is not None and frame.time_s - self._first_s >= SETTLING_S
 
     def _next_frame_db(self, frame: Frame, before_db: float) -> float:
@@ -452,16 +468,22 @@ class OnScreenMetricsOp(Operator):
             entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
             if self.log is not None and self.frames:
                 outcome.output("frames", self.log.path)
-            sha256 = self._digest.hexdigest()
-            outcome.add(QualityResult(self.quality, QualityTracker(), entries, per_entry, sha256, self.frames))
+            outcome.add(QualityResult(self.trained, self.held_out, entries, per_entry, self.frames_sha256, self.frames))
         outcome.add(self.next_frame.result)
-        worst_db, worst_seq = self.worst or (None, None)
-        outcome.add(
-            OnScreenResult(
-                self.settled.mean, worst_db, worst_seq, self.before.mean, self.before_throughout.mean, self.frames,
-                self.not_on_screen, self.unscored,
+        if self.on_screen:
+            worst_db, worst_seq = self.worst or (None, None)
+            outcome.add(
+                OnScreenResult(
+                    settled_db=self.settled.mean,
+                    worst_db=worst_db,
+                    worst_seq=worst_seq,
+                    previous_frame_db=self.before.mean,
+                    previous_frame_throughout_db=self.before_throughout.mean,
+                    frames=self.frames,
+                    not_on_screen=self.not_on_screen,
+                    unscored=self._screen.unscored,
+                )
             )
-        )  # fmt: skip
 
 
 def _keep(values: OrderedDict[int, float], seq: int, value: float) -> None:

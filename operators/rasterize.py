@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer
-from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
@@ -195,6 +194,5 @@ class RasterizeOp(Operator):
 def _is_predictable(before: DeformedScene, scene: DeformedScene) -> bool:
     """Return True if `scene` continues `before` and its frame can be scored."""
     frame, earlier = scene.frame, before.frame
-    usable = frame.status is not FrameStatus.DAMAGED and frame.withheld is None
     continues = frame.new_scene is None and frame.scene == earlier.scene and frame.image.shape == earlier.image.shape
-    return usable and continues
+    return frame.unusable is None and continues

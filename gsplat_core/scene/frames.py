@@ -79,6 +79,15 @@ class Frame:
     scene: int = 0
     """Scene id; lets a consumer that missed the first frame of a scene detect the change."""
 
+    @property
+    def unusable(self) -> str | None:
+        """Reason for neither training on the frame nor scoring it: the one in `withheld`, or
+        "damaged". None for a usable frame.
+        """
+        if self.withheld is not None:
+            return self.withheld
+        return "damaged" if self.status is FrameStatus.DAMAGED else None
+
     def __post_init__(self) -> None:
         if self.depth is not None and self.depth_origin is None:
             object.__setattr__(self, "depth_origin", MEASURED)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.continuation import NewestState
 from gsplat_core.deformation.registry import FIELDS, NewField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
@@ -352,7 +353,9 @@ class Reconstructor:
 
     def whole_model(self, shown: Model | Snapshot) -> Model:
         """Return the model with its past in its own memory. `shown` is the last published model."""
-        return shown.as_model() if isinstance(shown, Snapshot) else self.snapshot()
+        if isinstance(shown, Snapshot):
+            return shown.as_model()
+        return self.snapshot() if isinstance(shown.field, NewestState) else shown
 
     def _facts(self) -> dict[str, Any]:
         """Return the metadata of a model or snapshot."""

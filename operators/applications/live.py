@@ -1,22 +1,13 @@
 """Live reconstruction and display of an endless stream.
 
-Analysis of a frame runs before training. Before the first frame, models and operators are warmed up and the interpreter is set for low latency.
-
-                      depth (background thread)
-                   ┌┈┈┈┈┈┘     └┈┈┈┐
-source → analysis ─┴┬─► reconstruct ◄┘ → deform → rasterize → display ─┬─► sinks
-                    └──────────────────────────► on_screen ◄───────────┘
-
-Each operator has its own thread. Depth estimation runs in a background thread on the newest frame and reaches
-training late. The queues into `reconstruct`, `rasterize` and `display` drop the oldest frame and count dropped
-frames. Displayed pictures carry their age.
+Before the first frame, models and operators are warmed up and the interpreter is set for low latency. `operators.pipeline` has the graph.
 """
 
 from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,8 +22,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture
 from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
-from operators.applications.recording import RunRecording
-from operators.applications.replay import REPORT_RESERVE_BYTES
+from operators.applications.recording import new_recorder, reconstructor_line
 from operators.applications.session import Report, RunOutcome, Session, delivered, saves_model
 from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.applications.working_size import (
@@ -43,94 +33,17 @@ from operators.applications.working_size import (
     measured_frame_s,
     trial_run,
 )
-from operators.checks import (
-    PICTURE_STAGES,
-    TISSUE_STAGES,
-    OrdinaryStream,
-    PictureStagesOp,
-    SceneNumberStage,
-    StageOp,
-    TissueStagesOp,
-    new_stages,
-)
-from operators.choices import Policy
-from operators.depth import BackgroundDepth, BackgroundDepthOp
-from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
-from operators.frame_log import FRAMES_FILE, FrameLog
-from operators.graph import Application, MultiThreadScheduler, Operator
-from operators.ingest import SourceOp
-from operators.messages import DeformedScene
-from operators.metrics import OnScreenMetricsOp, ScoredFrame
-from operators.out_of_body import OutOfBodyGateOp
-from operators.pose import check_poses, pose_operators
-from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
-from operators.reconstruct import LiveReconstructOp
-from operators.side_by_side import SideBySideOp
-from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.keyframes import KeyframesOp
+from operators.messages import DeformedScene, ShownPicture
+from operators.metrics import ScoredFrame
+from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
+from operators.pose import check_poses
+from operators.rasterize import Rasterizer
 from operators.sources.address import SourceOptions
 from operators.sources.derived import ScaledSource, scaled_description
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
-from operators.tool_mask import new_tool_mask
-
-BESIDE = "highlights"
-"""A stage with no dependencies; runs concurrently with the other picture stages."""
-
-
-def analysis_operator(
-    fragment: Any,
-    tool_mask: str,
-    out_of_body: Policy,
-    depth: Sequence[Operator],
-    behind_gate: Sequence[Operator] = (),
-    behind: Sequence[Operator] = (),
-) -> Operator:
-    """Return the operator between source and reconstruction, with the input and output `frame`.
-
-    Tools and highlights are detected in parallel to the other checks of the picture.
-
-    Args:
-        fragment: the graph.
-        tool_mask: tool detector, a name in `TOOL_MASKS`.
-        out_of_body: policy for pictures from outside of the body.
-        depth: operators that set the pose of a frame and select its recorded depth.
-        behind_gate: operators inserted directly after the out-of-body gate.
-        behind: operators appended at the end.
-    """
-    others = [name for name in PICTURE_STAGES if name != BESIDE]
-    stream = OrdinaryStream()
-    return SideBySideOp(
-        fragment,
-        name="analysis",
-        gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
-        first=[
-            PictureStagesOp(
-                fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]), stream=stream
-            )
-        ],
-        beside=[
-            [
-                new_tool_mask(fragment, tool_mask),
-                StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
-            ]
-        ],
-        then=[
-            *behind_gate,
-            *depth,
-            TissueStagesOp(
-                fragment,
-                name="tissue",
-                always=[*new_stages(TISSUE_STAGES, without=["exposure"]), SceneNumberStage()],
-                stages=new_stages(TISSUE_STAGES, without=[name for name in TISSUE_STAGES if name != "exposure"]),
-                stream=stream,
-            ),
-            *behind,
-        ],
-    )
-
 
 GARBAGE_THRESHOLDS = (20_000, 20, 1000)
 """Thresholds of the garbage collector. Collections are rare and mostly of young objects: processing
@@ -207,101 +120,63 @@ def low_latency() -> Iterator[None]:
         sys.setswitchinterval(interval_s)
 
 
-class LiveApplication(Application):
-    """Graph of a live run."""
+def live_graph(
+    source: FrameSource,
+    settings: LiveSettings,
+    parts: LiveParts,
+    *,
+    stop_requested: Callable[[], bool] = lambda: False,
+    on_scored: Callable[[Pipeline, ScoredFrame], None] | None = None,
+    on_shown: Callable[[ShownPicture], None] | None = None,
+) -> Pipeline:
+    """Return the graph of a live run.
 
-    def __init__(
-        self,
-        source: FrameSource,
-        settings: LiveSettings,
-        parts: LiveParts,
-        *,
-        stop_requested: Callable[[], bool] = lambda: False,
-        on_scored: Callable[[LiveApplication, ScoredFrame], None] | None = None,
-        on_shown: Callable[[Any], None] | None = None,
-    ) -> None:
-        super().__init__(name="live", track=True)
-        self.scheduler(MultiThreadScheduler(self))
-        self.frame_source, self.settings, self._parts = source, settings, parts
-        self.clock = FrameClock(settings.chosen_clock, source.description.fps)
-        self._stop_requested = stop_requested
-        self._on_scored, self._on_shown = on_scored, on_shown
+    Args:
+        source: source of the frames.
+        settings: settings of the run.
+        parts: components, used by one run only.
+        stop_requested: polled; True ends the run.
+        on_scored: called for each scored frame with the graph.
+        on_shown: called with each `ShownPicture`.
+    """
+    about = source.description
+    recorder = None
+    if settings.record is not None:
+        recorder = new_recorder(settings.record, about, settings, lambda: graph.room_to_finish())
 
-    def compose(self) -> None:
-        """Create and connect the operators (see the diagram of the module)."""
-        settings, out = self.settings, self.settings.out
-        reserve = StorageReserve(out, self.room_to_finish)
-        self.source_op = SourceOp(
-            self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=settings.seconds
-        )
-        recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
-        beside = BackgroundDepth(settings.depth, self.frame_source.description.camera, device=settings.device)
-        camera = self.frame_source.description.camera
-        depth = (
-            *pose_operators(self, settings.poses, camera, settings.depth),
-            BackgroundDepthOp(self, name="depth", beside=beside),
-        )
-        analysis = analysis_operator(
-            self, settings.tool_mask, settings.out_of_body, depth, recording.behind_gate(), recording.behind_analysis()
-        )
-        self.add_flow(self.source_op, analysis, {("frame", "frame")})
-        self.reconstruct = LiveReconstructOp(
-            self,
-            name="reconstruct",
-            make_reconstructor=recording.made_by(lambda: self._parts.reconstructor),
-            clock=self.clock,
-            listener=recording.listener,
-            depth=beside,
-        )
-        deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(
-            self,
-            name="rasterize",
-            renderer=settings.renderer,
-            predict_every=LIVE_PREDICT_EVERY[settings.device],
-            rasterizer=self._parts.rasterizer,
-        )
-        self.display = DisplayOp(
-            self,
-            name="display",
-            clock=self.clock,
-            source_state=lambda: self.frame_source.state,
-        )
-        log = FrameLog(out / FRAMES_FILE, reserve) if settings.report else None
-        self.metrics = OnScreenMetricsOp(self, name="on_screen", log=log, report=settings.report)
-        self.add_flow(analysis, self.reconstruct, {("frame", "frame")})
-        self.add_flow(
-            self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2
-        )
-        self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest", capacity=2)
-        self.add_flow(rasterize, self.display, {("rendered", "rendered")})
-        recording.pictures_of(self.display)
-        self.add_flow(analysis, self.metrics, {("frame", "frame")})
-        self.add_flow(self.display, self.metrics, {("shown", "shown")})
-        self.add_flow(rasterize, self.metrics, {("predicted", "predicted")})
-        if self._on_shown is not None:
-            shown = CallbackSinkOp(self, name="viewer", callback=self._on_shown)
-            self.add_flow(self.display, shown, {("shown", "message")}, policy="drop_oldest")
-        if settings.report:
-            keyframes = KeyframesOp(self, name="keyframes")
-            self.add_flow(self.metrics, keyframes, {("scored", "scored")}, policy="drop_oldest", capacity=4)
-        if self._on_scored is not None:
-            report = self._on_scored
-            progress = CallbackSinkOp(self, name="progress", callback=lambda scored: report(self, scored))
-            self.add_flow(self.metrics, progress, {("scored", "message")}, policy="drop_oldest")
+    def reconstructor() -> Reconstructor:
+        if recorder is not None:
+            recorder.line(reconstructor_line(parts.reconstructor, settings, about))
+        return parts.reconstructor
 
-    def room_to_finish(self) -> int:
-        """Return the disk space that finishing needs, in bytes: the newest model in float32 and the
-        report.
-        """
-        return REPORT_RESERVE_BYTES + 4 * self.reconstruct.parameter_count
+    graph = Pipeline(
+        source,
+        settings,
+        settings.out,
+        name="live",
+        pace=Pace(
+            clock=FrameClock(settings.chosen_clock, about.fps), predict_every=LIVE_PREDICT_EVERY[settings.device]
+        ),
+        make_reconstructor=reconstructor,
+        outputs=Outputs(
+            sinks=("keyframes",) if settings.report else (),
+            report=settings.report,
+            on_scored=None if on_scored is None else lambda scored: on_scored(graph, scored),
+            on_shown=on_shown,
+            recorder=recorder,
+        ),
+        rasterizer=parts.rasterizer,
+        seconds=settings.seconds,
+        stop_requested=stop_requested,
+    )
+    return graph
 
 
 def live(
     settings: LiveSettings,
     *,
     stop_requested: Callable[[], bool] = lambda: False,
-    on_scored: Callable[[LiveApplication, ScoredFrame], None] | None = None,
+    on_scored: Callable[[Pipeline, ScoredFrame], None] | None = None,
     on_shown: Callable[[Any], None] | None = None,
     report: Report | None = None,
 ) -> RunOutcome:
@@ -324,7 +199,7 @@ def live(
         source = prepare(inside, notes)
         with low_latency():
             inside, source = on_trial(inside, source, notes)
-            graph = LiveApplication(
+            graph = live_graph(
                 source,
                 inside,
                 warm_up(inside, source),
@@ -354,8 +229,8 @@ def measured_size(settings: LiveSettings, about: SourceDescription, share: float
         share: share of the frame interval that a frame may take.
     """
 
-    def paced(tissue: PacedTissue, tried: LiveSettings) -> LiveApplication:
-        return LiveApplication(tissue, tried, new_parts(tried, tissue), on_shown=tissue.shown)
+    def paced(tissue: PacedTissue, tried: LiveSettings) -> Pipeline:
+        return live_graph(tissue, tried, new_parts(tried, tissue), on_shown=tissue.shown)
 
     return choose_working_size(
         about,
@@ -378,7 +253,7 @@ def on_trial(settings: LiveSettings, source: FrameSource, notes: list[str]) -> t
         The settings and the source at the working size.
     """
     if settings.device != "cpu" or settings.scale is not None:
-        trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
+        trial_run(settings, source, lambda made_up, tried: live_graph(made_up, tried, new_parts(tried, source)))
         return settings, source
     chosen = measured_size(settings, source.description)
     notes.append(chosen.sentence)

@@ -16,13 +16,13 @@ from torch import Tensor
 from gsplat_core.depth.registry import DepthFinder, of_recording
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
-from gsplat_core.training.budget import ObserveReport
+from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.right_eye import BothEyes
 from operators.applications.device import seeded
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
+from operators.applications.replay import ReplaySettings, new_reconstructor, prepare, replay_graph
 from operators.applications.session import (
     FirstFrames,
     Report,
@@ -45,12 +45,21 @@ class FittedModel:
 
     def __init__(self, model: Model, eyes: BothEyes) -> None:
         self.model, self.eyes = model, eyes
+        self.camera, self.device, self.parameter_count = model.camera, model.device, model.parameter_count
 
-    def observe(self, frame: Frame, *, steps: int | None = None, train: bool = True) -> ObserveReport:
+    def begin_scene(self, frame: Frame) -> bool:
+        """Ignore the scene change; the model covers all scenes."""
+        return False
+
+    def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool = True) -> ObserveReport:
         """Return a report without training steps."""
         return ObserveReport(frame.seq, 0, None, self.model.gaussians.count)
 
     def publish(self) -> Model:
+        """Return the finished model."""
+        return self.model
+
+    def whole_model(self, shown: Model) -> Model:
         """Return the finished model."""
         return self.model
 
@@ -91,16 +100,15 @@ def reconstruct(
         model, eyes, done = _fit(source, inside, steps, progress, stop_requested, notes)
         if done < steps:
             notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
-        graph = ReplayApplication(
+        graph = replay_graph(
             source,
             inside,
-            progress=progress,
-            stop_requested=stop_requested,
             make_reconstructor=lambda: FittedModel(model, eyes),
             stage="evaluate",
-            predicts=False,
+            learns=False,
+            progress=progress,
+            stop_requested=stop_requested,
         )
-        graph.announce()
         return Session(
             graph,
             inside.stated(online=False),
@@ -116,7 +124,7 @@ def reconstruct(
 
 
 def _trains(frame: Frame) -> bool:
-    return not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED and frame.withheld is None
+    return not is_heldout(frame.seq) and frame.unusable is None
 
 
 def _fit(

@@ -1,4 +1,4 @@
-"""Recording of a live run: frames, pictures and the schedule of training."""
+"""Creation of the recorder of a live run, which keeps frames, pictures and the calls of training."""
 
 from __future__ import annotations
 
@@ -12,19 +12,10 @@ from pydantic import TypeAdapter
 
 from gsplat_core.io.frame_codec import camera_record
 from gsplat_core.io.sessions import SessionInfo
-from gsplat_core.io.sessions.records import (
-    Grown,
-    Observed,
-    ReconstructorMade,
-    Rehearsed,
-    SceneBegun,
-    ScheduleLine,
-)
+from gsplat_core.io.sessions.records import ReconstructorMade
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.graph import Application, Operator
 from operators.output_folder import RECORDINGS
-from operators.reconstruct import ScheduleEvent, ScheduleListener
-from operators.sinks.session_recorder import RecordFramesOp, RecordPicturesOp, RecordPreparationOp, SessionRecorder
+from operators.sinks.session_recorder import SessionRecorder
 from operators.sources.source import SourceDescription
 from operators.storage import StorageReserve
 
@@ -73,93 +64,19 @@ def new_recorder(
     return SessionRecorder(folder, info, settings.recording, reserve=reserve)
 
 
-class RunRecording:
-    """Inserts the recording of a live run into its graph. Without a recording folder it has no
-    effect.
-    """
-
-    def __init__(
-        self, graph: Application, settings: LiveSettings, source: SourceDescription, room: Callable[[], int]
-    ) -> None:
-        """Create the recorder if the settings ask for a recording.
-
-        Args:
-            graph: graph of the run.
-            settings: settings of the run.
-            source: description of the stream.
-            room: returns the disk space that finishing the run needs, in bytes.
-        """
-        self._graph, self._settings, self._is_stereo = graph, settings, source.is_stereo
-        self.recorder: SessionRecorder | None = None
-        if settings.record is not None:
-            self.recorder = new_recorder(settings.record, source, settings, room)
-
-    def behind_gate(self) -> list[Operator]:
-        """Return the operators that record each frame after the out-of-body gate."""
-        if self.recorder is None:
-            return []
-        return [RecordFramesOp(self._graph, name="recorded_frames", recorder=self.recorder)]
-
-    def behind_analysis(self) -> list[Operator]:
-        """Return the operators that record the analysis results of each frame before training."""
-        if self.recorder is None:
-            return []
-        return [RecordPreparationOp(self._graph, name="recorded_preparation", recorder=self.recorder)]
-
-    def pictures_of(self, display: Operator) -> None:
-        """Record the pictures that `display` emits."""
-        if self.recorder is not None:
-            pictures = RecordPicturesOp(self._graph, name="recorded_pictures", recorder=self.recorder)
-            self._graph.add_flow(display, pictures, {("shown", "shown")}, policy="drop_oldest", capacity=8)
-
-    @property
-    def listener(self) -> ScheduleListener | None:
-        """Callback that records every call that changes the model; None without a recording."""
-        if self.recorder is None:
-            return None
-        recorder = self.recorder
-
-        def record_event(event: ScheduleEvent) -> None:
-            if event.frame is not None:
-                recorder.depth(event.frame)
-            else:
-                recorder.line(_line(event))
-
-        return record_event
-
-    def made_by(self, make: Callable[[], Reconstructor]) -> Callable[[], Reconstructor]:
-        """Return a factory that calls `make` and records the settings of the new reconstructor."""
-        if self.recorder is None:
-            return make
-        recorder, settings = self.recorder, self._settings
-
-        def made() -> Reconstructor:
-            reconstructor = make()
-            recorder.line(
-                ReconstructorMade(
-                    device=settings.device,
-                    seed=settings.seed,
-                    renderer=settings.renderer,
-                    config=_json(reconstructor.config),
-                    training=_json(settings.chosen_training),
-                    camera=camera_record(reconstructor.camera),
-                    stereo=self._is_stereo,
-                )
-            )
-            return reconstructor
-
-        return made
-
-
-def _line(event: ScheduleEvent) -> ScheduleLine:
-    if event.kind == "rehearse":
-        return Rehearsed(steps=event.steps)
-    assert event.seq is not None, f"{event.kind} is of a frame"
-    if event.kind == "begin_scene":
-        return SceneBegun(seq=event.seq)
-    if event.kind == "grow":
-        return Grown(seq=event.seq)
-    return Observed(seq=event.seq, steps=event.steps, train=event.train)
+def reconstructor_line(
+    reconstructor: Reconstructor, settings: LiveSettings, source: SourceDescription
+) -> ReconstructorMade:
+    """Return the line that records the settings of a new reconstructor."""
+    return ReconstructorMade(
+        device=settings.device,
+        seed=settings.seed,
+        renderer=settings.renderer,
+        config=_json(reconstructor.config),
+        training=_json(settings.chosen_training),
+        camera=camera_record(reconstructor.camera),
+        stereo=source.is_stereo,
+    )
 
 
 def _json(settings: Any) -> dict[str, Any]:

@@ -1,26 +1,14 @@
-"""Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finished model.
+"""Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finite source.
 
-A recorded session is replayed faithfully, with its prepared frames, calls and settings.
-
-Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finite source.
-
-source → tool_mask → (pose) → depth → reconstruct → deform → rasterize → video
-                                                              → metrics → keyframes
-                                                                        → progress
-
-`ReplaySettings.sinks` selects the sinks, here `video` and `keyframes`.
-
-Each operator processes its frames in order and shares only messages. Timestamps come from the recording, the work per
-frame is a fixed number of steps, and every edge blocks. The same recording, settings and device therefore give the
-same `frames_sha256` on either engine and with any number of threads (`scheduler_for`).
+Timestamps come from the recording, the work per frame is a fixed number of steps, and no frame is dropped. The same recording, settings and device
+therefore give the same `frames_sha256`. A recorded session is replayed faithfully, with its prepared frames, calls and settings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +22,10 @@ from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.io.sessions.records import ReconstructorMade
 from gsplat_core.rendering.registry import check_renderer
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
-from operators.applications.device import check_device, scheduler_for, seeded
+from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.session import (
@@ -52,29 +38,16 @@ from operators.applications.session import (
     saves_model,
 )
 from operators.applications.warm_reconstructor import warm_reconstructor
-from operators.choices import SINKS
-from operators.compare_shown import CompareShownOp
-from operators.depth import DepthOp, without_depth
-from operators.frame_log import FRAMES_FILE, FrameLog
-from operators.graph import Application, Operator
-from operators.ingest import SourceOp
-from operators.messages import RenderedFrame
-from operators.metrics import MetricsOp, ScoredFrame
-from operators.pose import check_poses, pose_operators
-from operators.rasterize import DeformOp, RasterizeOp
-from operators.reconstruct import ReconstructOp, ScheduledReconstructOp
+from operators.depth import without_depth
+from operators.metrics import ScoredFrame
+from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
+from operators.pose import check_poses
 from operators.settings import ReplayOptions, check_option
-from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.registry import SinkOptions, input_of
 from operators.sources.recording import SessionSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
-from operators.tool_mask import RecordedToolMaskOp
-from operators.truth import TruthOp
 
-REPORT_RESERVE_BYTES = 8 * 2**20
-"""Disk space reserved for the video's index and the report, in bytes."""
 PIXELS_PER_GAUSSIAN = 4
 
 
@@ -133,138 +106,71 @@ class ReplaySettings(ReplayOptions):
         )
 
 
-class ReplayApplication(Application):
-    """Graph of a replay."""
+def replay_graph(
+    source: FrameSource,
+    settings: ReplaySettings,
+    *,
+    make_reconstructor: Callable[[], Any] | None = None,
+    followed: FollowedSession | None = None,
+    stage: str = "replay",
+    learns: bool = True,
+    progress: ProgressCallback | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Pipeline:
+    """Return the graph of a replay.
 
-    def __init__(
-        self,
-        source: FrameSource,
-        settings: ReplaySettings,
-        *,
-        reserve_bytes: int = REPORT_RESERVE_BYTES,
-        progress: ProgressCallback | None = None,
-        stop_requested: Callable[[], bool] = lambda: False,
-        make_reconstructor: Callable[[], Any] | None = None,
-        followed: FollowedSession | None = None,
-        stage: str = "replay",
-        predicts: bool = True,
-    ) -> None:
-        """Store the parameters; `compose` creates the operators.
+    Args:
+        source: source of the frames.
+        settings: settings of the replay.
+        make_reconstructor: factory of the reconstructor; None for the default of the settings.
+        followed: recorded session whose schedule is replayed; None for a plain replay.
+        stage: name of the stage in progress reports.
+        learns: False for a finished model, which has seen all frames and makes no predictions.
+        progress: called before the first frame, which takes long because it initialises the model,
+            and after each scored frame.
+        stop_requested: polled; True ends the stream.
+    """
+    about = source.description
+    recording = Path(settings.recording)
+    if followed is not None:
+        make_reconstructor = followed.new_reconstructor
+    graph = Pipeline(
+        source,
+        settings,
+        settings.out,
+        name="replay",
+        pace=Pace(
+            session=None if followed is None else followed.reader,
+            held_out=lambda frame: settings.heldout and is_heldout(frame.seq),
+            predict_every=int(learns),
+        ),
+        make_reconstructor=make_reconstructor or (lambda: new_reconstructor(settings, source)),
+        outputs=Outputs(
+            sinks=settings.sinks,
+            behind=open_behind(recording, about.frame_count) if about.frame_count and recording.is_dir() else None,
+            on_scored=None if progress is None else lambda scored: progress(progressed(graph.metrics.frames, scored)),
+        ),
+        stop_requested=stop_requested,
+    )
 
-        Args:
-            source: source of the frames.
-            settings: settings of the replay.
-            reserve_bytes: disk space to keep free, in addition to the model.
-            progress: called after each scored frame.
-            stop_requested: polled; True ends the stream.
-            make_reconstructor: factory of the reconstructor; None for the default of the settings.
-            followed: recorded session whose schedule is replayed; None for a plain replay.
-            stage: name of the stage in progress reports.
-            predicts: score predictions made before training; False for a model that has seen all
-                frames.
-        """
-        super().__init__(name="replay", track=True)
-        self.scheduler(scheduler_for(settings.device, self))
-        self.frame_source = source
-        self.settings = settings
-        self.stage, self._predicts = stage, predicts
-        self._progress = progress
-        self._stop_requested = stop_requested
-        self._make_reconstructor = make_reconstructor or (lambda: new_reconstructor(settings, source))
-        self._reserve_bytes = reserve_bytes
-        self._followed = followed
-
-    def compose(self) -> None:
-        """Create and connect the operators (see the diagram of the module)."""
-        settings, out = self.settings, self.settings.out
-        reserve = StorageReserve(out, self.room_to_finish)
-        source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
-        looks = replay_analysis(
-            self, self.frame_source.description.camera, self._held_out, follows=self._followed is not None
-        )
-        self.reconstruct = self._reconstruct_op()
-        deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, predict_every=int(self._predicts))
-        self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
-        for before, after in pairwise((source, *looks, self.reconstruct)):
-            self.add_flow(before, after, {("frame", "frame")})
-        self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")})
-        self.add_flow(deform, rasterize, {("scene", "scene")})
-        options = SinkOptions(out, self.frame_source.description, reserve)
-        sinks = [SINKS[name](self, name, options) for name in settings.sinks]
-        # A sink consumes either rendered or scored frames.
-        for sink in sinks:
-            port, kind = input_of(sink)
-            if kind is RenderedFrame:
-                self.add_flow(rasterize, sink, {("rendered", port)})
-        self.add_flow(rasterize, self.metrics, {("rendered", "rendered")})
-        if self._predicts:
-            self.add_flow(rasterize, self.metrics, {("predicted", "predicted")})
-        for sink in sinks:
-            port, kind = input_of(sink)
-            if kind is ScoredFrame:
-                self.add_flow(self.metrics, sink, {("scored", port)})
-        if self._followed is not None:
-            self.add_flow(rasterize, self._followed.compare_op(self, "compare"), {("rendered", "rendered")})
-        self._compare_with_truth(rasterize)
-        progress = CallbackSinkOp(self, name="progress", callback=self._report)
-        self.add_flow(self.metrics, progress, {("scored", "message")})
-
-    def _compare_with_truth(self, rasterize: RasterizeOp) -> None:
-        """Add scores against ground truth if the recording provides the tissue behind its tools."""
-        folder, about = Path(self.settings.recording), self.frame_source.description
-        if about.frame_count is None or not folder.is_dir():
-            return
-        behind = open_behind(folder, about.frame_count)
-        if behind is not None:
-            truth = TruthOp(self, name="truth", behind=behind, camera=about.camera, frame_count=about.frame_count)
-            self.add_flow(rasterize, truth, {("rendered", "rendered")})
-
-    def _reconstruct_op(self) -> ReconstructOp:
-        if self._followed is not None:
-            return self._followed.reconstruct_op(self, "reconstruct")
-        return ReconstructOp(
-            self, name="reconstruct", make_reconstructor=self._make_reconstructor, held_out=self._held_out
-        )
-
-    def room_to_finish(self) -> int:
-        """Return the disk space that finishing needs, in bytes: the newest model in float32 and the
-        report.
-        """
-        model = self.reconstruct.newest
-        return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
-
-    def _held_out(self, frame: Frame) -> bool:
-        return self.settings.heldout and is_heldout(frame.seq)
-
-    def announce(self) -> None:
-        """Report zero progress before the first frame, which takes long because it initialises the
-        model.
-        """
-        self._show(0, None)
-
-    def _report(self, scored: ScoredFrame) -> None:
-        self._show(self.metrics.frames, scored)
-
-    def _show(self, done: int, scored: ScoredFrame | None) -> None:
-        total = self.frame_source.description.frame_count or done
-        if self._progress is None:
-            return
+    def progressed(done: int, scored: ScoredFrame | None) -> Progress:
+        total = about.frame_count or done
         if scored is None:
-            self._progress(Progress(self.stage, done, total))
-            return
-        measured, previous_db, next_db = scored.quality.psnr_tissue_db, scored.previous_frame_db, scored.next_frame_db
-        self._progress(
-            Progress(
-                self.stage,
-                done,
-                total,
-                psnr_tissue_db=measured,
-                previous_frame_db=previous_db if math.isfinite(previous_db) else None,
-                next_frame_db=next_db if math.isfinite(next_db) else None,
-                trained=scored.rendered.trained,
-            )
+            return Progress(stage, done, total)
+        previous_db, next_db = scored.previous_frame_db, scored.next_frame_db
+        return Progress(
+            stage,
+            done,
+            total,
+            psnr_tissue_db=scored.quality.psnr_tissue_db,
+            previous_frame_db=previous_db if math.isfinite(previous_db) else None,
+            next_frame_db=next_db if math.isfinite(next_db) else None,
+            trained=scored.rendered.trained,
         )
+
+    if progress is not None:
+        progress(progressed(0, None))
+    return graph
 
 
 def replay(
@@ -293,8 +199,7 @@ def replay(
         followed = followed_session(inside, notes)
         if followed is not None:
             source, inside = followed.source, replace(inside, seed=followed.made.seed, field=followed.config.field)
-        graph = ReplayApplication(source, inside, progress=progress, stop_requested=stop_requested, followed=followed)
-        graph.announce()
+        graph = replay_graph(source, inside, progress=progress, stop_requested=stop_requested, followed=followed)
         return Session(
             graph,
             inside.stated(online=True),
@@ -356,28 +261,6 @@ def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline:
     )
 
 
-def replay_analysis(
-    graph: ReplayApplication, camera: Camera, held_out: Callable[[Frame], bool], *, follows: bool
-) -> Sequence[Operator]:
-    """Return the operators between source and reconstruction, in order.
-
-    Args:
-        graph: graph of the replay.
-        camera: camera of the frames.
-        held_out: returns True for frames excluded from training.
-        follows: a recorded session is replayed, whose frames already carry poses and depth.
-    """
-    settings = graph.settings
-    # A graph that only displays a finished model does not use depth.
-    learns = graph.stage == "replay"
-    depth = DepthOp(
-        graph, name="depth", choice="recorded" if follows else settings.depth, camera=camera, held_out=held_out,
-        has_time=learns, device=settings.device,
-    )  # fmt: skip
-    poses = "given" if follows else settings.poses
-    return RecordedToolMaskOp(graph, name="tool_mask"), *pose_operators(graph, poses, camera, settings.depth), depth
-
-
 def lacking_depth(settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig) -> str | None:
     """Return a note if the source's frames have no usable recorded depth; None otherwise."""
     poses = {"pose"} if settings.poses == "estimated" else set()
@@ -408,20 +291,6 @@ class FollowedSession:
             )
             warm_reconstructor(reconstructor, stereo=self.made.stereo)
         return reconstructor
-
-    def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:
-        """Create the training operator, which follows the schedule."""
-        return ScheduledReconstructOp(
-            graph,
-            name=name,
-            make_reconstructor=self.new_reconstructor,
-            schedule=self.reader.schedule,
-            late_depths=self.reader.late_depths,
-        )
-
-    def compare_op(self, graph: Application, name: str) -> CompareShownOp:
-        """Create the operator that compares the pictures with the recorded ones."""
-        return CompareShownOp(graph, name=name, shown=self.reader.digests)
 
 
 def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSession | None:

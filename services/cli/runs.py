@@ -17,7 +17,7 @@ import typer
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.sessions import WriterOptions
-from operators.applications.live import LiveApplication, live
+from operators.applications.live import live
 from operators.applications.live_settings import LiveSettings
 from operators.applications.progress import ProgressCallback
 from operators.applications.reconstruct import reconstruct
@@ -25,6 +25,7 @@ from operators.applications.recording import new_recording_folder
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Report, RunOutcome
 from operators.metrics import ScoredFrame
+from operators.pipeline import Pipeline
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest, printable
@@ -152,7 +153,7 @@ class LiveStatus:
         if self._terminal and self._written:
             print(file=sys.stderr)  # noqa: T201 - ends the refreshed line
 
-    def __call__(self, graph: LiveApplication, scored: ScoredFrame) -> None:
+    def __call__(self, graph: Pipeline, scored: ScoredFrame) -> None:
         """Process one scored frame."""
         now_s = time.monotonic()
         if self._quiet or now_s - self._printed_s < self._period_s:

@@ -20,10 +20,11 @@ from operators.ingest import SourceResult
 from operators.metrics import NextFrameResult, OnScreenResult, QualityResult
 from operators.out_of_body import WITHHELD as OUT_OF_BODY
 from operators.out_of_body import OutOfBodyFrames
-from operators.reconstruct import ModelResult, TrainedEyes, TrainingCounts
+from operators.reconstruct import ModelResult, TrainedEyes
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
+from operators.training import TrainingCounts
 from operators.truth import TruthResult
 from services.reports.html import write_html
 from services.reports.machine import machine_facts

@@ -26,7 +26,7 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import StagedCopies
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture
-from operators.applications.live import LiveApplication, LiveParts, low_latency, measured_size, new_parts, warm_up
+from operators.applications.live import LiveParts, live_graph, low_latency, measured_size, new_parts, warm_up
 from operators.applications.live_settings import LiveSettings
 from operators.applications.session import Session
 from operators.applications.working_size import WorkingSize, trial_run
@@ -35,7 +35,8 @@ from operators.graph.application import Application
 from operators.graph.tracking import Histogram
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
-from operators.reconstruct import LiveReconstructOp
+from operators.pipeline import Pipeline
+from operators.reconstruct import ReconstructOp
 from operators.settings import EngineOptions, check_option
 from operators.sources.source import SourceDescription
 from services.bus.messages import BOUNDS_S, text_of
@@ -129,11 +130,11 @@ class LiveSnapshots:
     """
 
     def __init__(self) -> None:
-        self._graph: LiveApplication | None = None
+        self._graph: Pipeline | None = None
         self._copies: StagedCopies | None = None
 
     @contextmanager
-    def of(self, graph: LiveApplication) -> Iterator[None]:
+    def of(self, graph: Pipeline) -> Iterator[None]:
         """Register the running reconstruction while the block runs."""
         self._graph = graph
         try:
@@ -156,7 +157,7 @@ class LiveSnapshots:
             CommandRefused: if no reconstruction runs or no frame arrives.
         """
         folder = Path(text_of(arguments, "folder"))
-        running: LiveReconstructOp | None = getattr(self._graph, "reconstruct", None)
+        running: ReconstructOp | None = getattr(self._graph, "reconstruct", None)
         if running is None:
             raise CommandRefused("no live reconstruction runs; what is shown is a finished model, or nothing yet")
         model, seq, pause_ns = self._asked(running)
@@ -171,7 +172,7 @@ class LiveSnapshots:
             "written_ms": round((time.monotonic() - began_s) * 1e3, 3),
         }
 
-    def _asked(self, running: LiveReconstructOp) -> tuple[Model, int, int]:
+    def _asked(self, running: ReconstructOp) -> tuple[Model, int, int]:
         """Request the model after the next frame.
 
         The GPU snapshot is released here, because training needs another slot while one is held.
@@ -235,7 +236,7 @@ def started(settings: LiveSettings, source: CapturedSource, again: bool) -> Live
     """
     if again:
         return new_parts(settings, source)
-    trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
+    trial_run(settings, source, lambda made_up, tried: live_graph(made_up, tried, new_parts(tried, source)))
     return warm_up(settings, source)
 
 
@@ -268,14 +269,14 @@ def reconstruct(
         worker.say("starting", "prepares the reconstruction")
         parts = started(settings, source, again)
 
-        def scored(graph: LiveApplication, score: ScoredFrame) -> None:
+        def scored(graph: Pipeline, score: ScoredFrame) -> None:
             screen.scored(score)
 
         def show(shown: ShownPicture) -> None:
             if screen.show(shown):
                 layers.offer(lambda: scene_of(shown, graph.reconstruct.newest))
 
-        graph = LiveApplication(source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=show)
+        graph = live_graph(source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=show)
         worker.tell_figures("graph", lambda: graph_figures(graph))
         worker.tell_measures("graph", lambda: graph_measures(graph))
         worker.say("running", "reconstructs")
@@ -313,7 +314,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
         layers.close()
 
 
-def graph_figures(graph: LiveApplication) -> dict[str, object]:
+def graph_figures(graph: Pipeline) -> dict[str, object]:
     """Return the counters of a graph by name; empty before the graph runs."""
     if getattr(graph, "metrics", None) is None:
         return {}

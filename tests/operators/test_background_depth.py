@@ -16,7 +16,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.training.placement import LateDepth
-from operators.depth import FEW_CORES, BackgroundDepth, BackgroundDepthOp, FoundDepth, share_of
+from operators.depth import FEW_CORES, BackgroundDepth, DepthOp, FoundDepth, share_of
 from operators.outcome import OutcomeBuilder
 
 CAMERA = Camera.from_focal(30.0, 24, 16)
@@ -149,8 +149,8 @@ def test_what_is_doubted_is_not_found(beside, estimator, frame):
 
 
 def test_a_failure_is_raised_by_the_operator_and_once(estimator, frame, compute):
-    beside = BackgroundDepth("gated", CAMERA)
-    operator = BackgroundDepthOp(None, beside=beside)
+    operator = DepthOp(None, choice="gated", camera=CAMERA, in_background=True)
+    beside = operator.background
     operator.start()
     estimator.fails = True
     estimator.gate.release()
@@ -200,7 +200,7 @@ def test_few_cores_are_left_to_training():
 
 @pytest.mark.parametrize(("choice", "kept"), [("auto", True), ("recorded", True), ("none", False), ("stereo", False)])
 def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, choice, kept):
-    operator = BackgroundDepthOp(None, beside=BackgroundDepth(choice, CAMERA))
+    operator = DepthOp(None, choice=choice, camera=CAMERA, in_background=True)
     operator.start()
     given = frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"])
     (passed,) = compute(operator, frame=given)
@@ -215,12 +215,12 @@ def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, c
 
 
 def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute):
-    operator = BackgroundDepthOp(None, beside=BackgroundDepth("gated", CAMERA))
+    operator = DepthOp(None, choice="gated", camera=CAMERA, in_background=True)
     operator.start()
     compute(operator, frame=frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"]))
     estimator.gate.release()
-    operator.beside.offer(frame(1))
-    taken(operator.beside)
+    operator.background.offer(frame(1))
+    taken(operator.background)
     operator.stop()
     outcome = OutcomeBuilder()
     operator.contribute(outcome)

@@ -11,7 +11,8 @@ from gsplat_core.scene.frames import FrameStatus
 from operators.depth import TakenDepth
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.outcome import OutcomeBuilder
-from operators.reconstruct import GROWN_AT_LATEST, LiveReconstructOp, ModelResult
+from operators.reconstruct import ModelResult, ReconstructOp
+from operators.training import GROWN_AT_LATEST, UntilDisplay
 
 
 class FakeReconstructor:
@@ -71,16 +72,19 @@ class FakeDepth:
 
 @pytest.fixture
 def live(model, camera, fake_time):
-    """Return the operator, its fake reconstructor and the events received by its listener."""
-    fake, events = FakeReconstructor(model, camera), []
+    """Return the operator, its fake reconstructor, and the calls that its recorder receives."""
+    fake, lines, depths = FakeReconstructor(model, camera), [], []
+    recorder = SimpleNamespace(line=lines.append, depth=depths.append)
     clock = FrameClock(ClockSettings(), 30.0, fake_time)
     clock.wait_until_shown = lambda: None
     depth = FakeDepth()
-    operator = LiveReconstructOp(
-        None, make_reconstructor=lambda: fake, clock=clock, listener=events.append, depth=depth
+    operator = ReconstructOp(
+        None, make_reconstructor=lambda: fake, training=UntilDisplay(clock, depth), recorder=recorder
     )
     operator.start()
-    return SimpleNamespace(operator=operator, fake=fake, events=events, time=fake_time, depth=depth)
+    return SimpleNamespace(
+        operator=operator, fake=fake, lines=lines, depths=depths, time=fake_time, depth=depth, clock=clock
+    )
 
 
 def arrived(frame, live, seq, **fields):
@@ -146,10 +150,10 @@ def test_the_scene_grows_now_and_then_though_no_time_is_ever_left(live, frame, c
 
 def test_the_listener_is_told_every_call_in_order(live, one_by_one):
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
-    kinds = [event.kind for event in live.events]
+    kinds = [line.event for line in live.lines]
     made = [call[0] for call in live.fake.calls]
     assert [kind for kind in kinds if kind != "rehearse"] == [kind for kind in made if kind != "rehearse"]
-    steps = sum(event.steps for event in live.events if event.kind == "rehearse")
+    steps = sum(line.steps for line in live.lines if line.event == "rehearse")
     assert steps == sum(live.fake.seqs("rehearse")) == live.operator.counts.rehearsed > 0
 
 
@@ -205,7 +209,7 @@ def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, 
     one_by_one((2, {}))
     kinds = [call[0] for call in live.fake.calls if call[0] != "rehearse"]
     assert kinds[-3:] == ["observe", "take_depth", "grow"] and ("take_depth", 0, "ready") in live.fake.calls
-    assert [event.frame for event in live.events if event.kind == "take_depth"] == [found]
+    assert live.depths == [found]
     outcome = OutcomeBuilder()
     live.operator.contribute(outcome)
     taken = outcome.find(TakenDepth)
@@ -218,7 +222,7 @@ def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
     live.depth.found = arrived(frame, live, 0), "ready"
     one_by_one((2, {"scene": 1}))
-    assert live.fake.seqs("take_depth") == [0] and not [event for event in live.events if event.kind == "take_depth"]
+    assert live.fake.seqs("take_depth") == [0] and not live.depths
     outcome = OutcomeBuilder()
     live.operator.contribute(outcome)
     assert outcome.find(TakenDepth) == TakenDepth(0, 0.0, 1) and outcome.notes == ()
@@ -227,8 +231,8 @@ def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by
 @pytest.fixture
 def waits(live):
     """Write the waits for a picture down among the reconstructor's calls."""
-    live.operator.clock.wait_until_shown = lambda: live.fake.calls.append(("wait",))
-    live.operator.clock.too_late = lambda frame, waiting: False
+    live.clock.wait_until_shown = lambda: live.fake.calls.append(("wait",))
+    live.clock.too_late = lambda frame, waiting: False
     return live
 
 

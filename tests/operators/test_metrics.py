@@ -31,7 +31,7 @@ def test_live_and_held_out_frames_are_scored_apart(rendered, compute, tmp_path):
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute, [rendered(0, offset=2), rendered(1, offset=20, trained=False), rendered(2, offset=2)])
     exact = 20 * math.log10(255 / 2)
-    assert operator.live.means()["psnr_tissue_db"] == pytest.approx(exact, abs=1e-3)
+    assert operator.trained.means()["psnr_tissue_db"] == pytest.approx(exact, abs=1e-3)
     assert operator.held_out.means()["psnr_tissue_db"] == pytest.approx(20 * math.log10(255 / 20), abs=1e-3)
     quality, outputs = result(operator)
     assert (quality.trained.count, quality.held_out.count, quality.frames, operator.frames) == (2, 1, 3, 3)
@@ -169,5 +169,5 @@ def test_each_run_begins_anew(rendered, compute):
     score(operator, compute, [rendered(0), rendered(1)])
     first = operator.frames_sha256
     (scored,) = score(operator, compute, [rendered(0)])
-    assert operator.frames == operator.live.count == 1 and operator.frames_sha256 != first
+    assert operator.frames == operator.trained.count == 1 and operator.frames_sha256 != first
     assert math.isnan(scored.previous_frame_db)

@@ -11,7 +11,7 @@ from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.frame_log import FrameLog, read_frames
 from operators.messages import PictureState, Prediction, ShownPicture
-from operators.metrics import PREDICTIONS_KEPT, NextFrameResult, OnScreenMetricsOp, OnScreenResult, QualityResult
+from operators.metrics import PREDICTIONS_KEPT, MetricsOp, NextFrameResult, OnScreenResult, QualityResult
 from operators.outcome import OutcomeBuilder
 
 MS = 1_000_000
@@ -44,7 +44,7 @@ def score(operator, compute_queued, frames, pictures):
 
 def test_a_picture_in_time_is_scored_against_its_own_frame(stream, compute_queued, tmp_path):
     frames, pictures = stream(5)
-    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     _, result, quality = score(
         operator, compute_queued, frames, [shown(p, k * PERIOD + 15 * MS) for k, p in enumerate(pictures)]
     )
@@ -56,7 +56,7 @@ def test_a_picture_in_time_is_scored_against_its_own_frame(stream, compute_queue
 def test_a_picture_that_comes_after_the_next_frame_does_not_count_for_its_own(stream, compute_queued, tmp_path):
     frames, pictures = stream(4)
     late = [shown(pictures[0], 10 * MS), shown(pictures[1], 2 * PERIOD + 1), shown(pictures[2], 2 * PERIOD + 10 * MS)]
-    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     _, result, _ = score(operator, compute_queued, frames, late)
     rows = list(read_frames(operator.log.path))
     assert [(row["seq"], row["shown_seq"]) for row in rows] == [(0, 0), (1, 0), (2, 2), (3, 2)]
@@ -66,16 +66,16 @@ def test_a_picture_that_comes_after_the_next_frame_does_not_count_for_its_own(st
 
 def test_frames_before_the_first_picture_are_not_scored(stream, compute_queued):
     frames, pictures = stream(4)
-    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, [shown(pictures[2], 2 * PERIOD + MS)])
+    _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, [shown(pictures[2], 2 * PERIOD + MS)])
     assert result.frames == 2
 
 
 def test_a_picture_that_is_only_sent_again_is_no_new_one(stream, compute_queued):
     frames, pictures = stream(3)
     again = [shown(pictures[0], MS), shown(pictures[0], PERIOD + MS, new=False)]
-    operator = OnScreenMetricsOp(None)
+    operator = MetricsOp(None, on_screen=True)
     _, _, quality = score(operator, compute_queued, frames, again)
-    once = OnScreenMetricsOp(None)
+    once = MetricsOp(None, on_screen=True)
     assert quality.frames_sha256 == score(once, compute_queued, frames, again[:1])[2].frames_sha256
 
 
@@ -83,7 +83,10 @@ def test_withheld_frames_are_shown_and_not_scored(stream, compute_queued):
     frames, pictures = stream(4)
     frames[1] = frames[1].with_fields(withheld="blur")
     _, result, quality = score(
-        OnScreenMetricsOp(None), compute_queued, frames, [shown(p, k * PERIOD + MS) for k, p in enumerate(pictures)]
+        MetricsOp(None, on_screen=True),
+        compute_queued,
+        frames,
+        [shown(p, k * PERIOD + MS) for k, p in enumerate(pictures)],
     )
     assert (result.frames, quality.trained.count) == (4, 3)
 
@@ -91,7 +94,7 @@ def test_withheld_frames_are_shown_and_not_scored(stream, compute_queued):
 def test_frames_that_were_passed_over_before_scoring_are_counted(stream, compute_queued):
     frames, pictures = stream(6)
     _, result, _ = score(
-        OnScreenMetricsOp(None), compute_queued, [frames[0], frames[3], frames[5]], [shown(pictures[0], MS)]
+        MetricsOp(None, on_screen=True), compute_queued, [frames[0], frames[3], frames[5]], [shown(pictures[0], MS)]
     )
     assert result.unscored == 3
 
@@ -100,7 +103,10 @@ def test_the_first_second_is_left_out_of_the_settled_figures(frame, rendered, co
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
     pictures = [rendered(k, frame=frames[k], offset=60 if k < 20 else 1) for k in range(40)]
     _, result, quality = score(
-        OnScreenMetricsOp(None), compute_queued, frames, [shown(p, k * PERIOD + MS) for k, p in enumerate(pictures)]
+        MetricsOp(None, on_screen=True),
+        compute_queued,
+        frames,
+        [shown(p, k * PERIOD + MS) for k, p in enumerate(pictures)],
     )
     assert result.settled_db == pytest.approx(-20 * np.log10(1 / 255), abs=0.1)
     assert quality.trained.means()["psnr_tissue_db"] < result.settled_db - 5
@@ -111,11 +117,11 @@ def test_the_first_second_is_left_out_of_the_settled_figures(frame, rendered, co
 
 def test_memory_does_not_grow_when_pictures_come_without_frames(stream, compute_queued):
     _, pictures = stream(1)
-    operator = OnScreenMetricsOp(None)
+    operator = MetricsOp(None, on_screen=True)
     operator.start()
     for k in range(1000):
         compute_queued(operator, shown=[shown(pictures[0], k)])
-    assert len(operator._shown) <= 64
+    assert len(operator._screen._shown) <= 64
     operator.stop()
 
 
@@ -133,7 +139,7 @@ def test_the_worst_frame_is_the_lowest_after_the_first_second(frame, rendered, c
     offsets = {k: 60 for k in range(25)} | {worst_at: 30, 27: 1}
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
     pictures = [rendered(k, frame=frames[k], offset=offsets.get(k, 5)) for k in range(40)]
-    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert result.worst_seq == worst_at
     assert result.worst_db == pytest.approx(decibels(30), abs=0.05)
 
@@ -141,13 +147,13 @@ def test_the_worst_frame_is_the_lowest_after_the_first_second(frame, rendered, c
 def test_the_first_frame_that_counts_is_that_of_a_whole_second(frame, rendered, compute_queued):
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(26)]
     pictures = [rendered(k, frame=frames[k], offset=9 if k < 25 else 3) for k in range(26)]
-    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert result.settled_db == pytest.approx(decibels(3), abs=0.05), "frame 25 was taken at 1.00 s"
 
 
 def test_a_stream_that_ends_within_the_first_second_has_no_settled_figures(stream, compute_queued):
     frames, pictures = stream(6)
-    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert (result.settled_db, result.worst_db, result.worst_seq, result.previous_frame_db) == (None,) * 4
 
 
@@ -158,7 +164,7 @@ def test_frames_without_figures_are_neither_the_worst_nor_in_the_means(frame, re
     frames[32] = frames[32].with_fields(mask=np.zeros((16, 24), np.uint8))
     bad = {30: 90, 31: 80, 32: 70, 35: 20}
     pictures = [rendered(k, frame=frames[k], offset=bad.get(k, 2)) for k in range(40)]
-    _, result, quality = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    _, result, quality = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert (result.worst_seq, result.frames) == (35, 40)
     assert quality.trained.count == 38, "the frame without tissue was observed and has no figure"
     assert result.not_on_screen == 0
@@ -167,21 +173,21 @@ def test_frames_without_figures_are_neither_the_worst_nor_in_the_means(frame, re
 def test_what_is_on_the_screen_when_the_next_frame_arrives_counts_and_what_comes_after_does_not(stream, compute_queued):
     frames, pictures = stream(3)
     exactly = [shown(pictures[0], MS), shown(pictures[1], 2 * PERIOD), shown(pictures[2], 3 * PERIOD)]
-    assert score(OnScreenMetricsOp(None), compute_queued, frames, exactly)[1].not_on_screen == 0
+    assert score(MetricsOp(None, on_screen=True), compute_queued, frames, exactly)[1].not_on_screen == 0
     later = [exactly[0], shown(pictures[1], 2 * PERIOD + 1), exactly[2]]
-    assert score(OnScreenMetricsOp(None), compute_queued, frames, later)[1].not_on_screen == 1
+    assert score(MetricsOp(None, on_screen=True), compute_queued, frames, later)[1].not_on_screen == 1
 
 
 def test_a_picture_of_another_size_scores_nothing(stream, frame, rendered, compute_queued):
     frames, pictures = stream(2)
     small = frame(2, image=np.zeros((8, 12, 3), np.uint8), arrived_ns=2 * PERIOD)
-    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, [*frames, small], in_time(pictures))
+    _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, [*frames, small], in_time(pictures))
     assert result.frames == 2
 
 
 def test_similarity_is_measured_on_every_eighth_frame_from_the_first(stream, compute_queued, tmp_path):
     frames, pictures = stream(20)
-    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute_queued, frames, in_time(pictures))
     assert [row["seq"] for row in read_frames(operator.log.path) if row["ssim"] is not None] == [0, 8, 16]
 
@@ -191,7 +197,7 @@ def test_the_log_says_what_was_on_the_screen_and_when(stream, rendered, compute_
     picture = rendered(
         0, frame=frames[0], content=frames[0], steps=7, taken_ns=3 * MS, published_ns=9 * MS, model_version=5
     )
-    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     score(
         operator,
         compute_queued,
@@ -226,7 +232,7 @@ def test_predictions_are_scored_whenever_they_come_and_compared_over_the_same_fr
         frame(k, image=np.full((16, 24, 3), level, np.uint8), arrived_ns=k * PERIOD) for k, level in enumerate(levels)
     ]
     pictures = [rendered(k, frame=frames[k]) for k in range(40)]
-    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     predictions = [*predicted(frames, {10: 90, 26: 3, 33: 5}), Prediction(frames[35], None)]
     operator.start()
     compute_queued(operator, frame=frames, shown=in_time(pictures), predicted=[] if late else predictions)
@@ -245,7 +251,7 @@ def test_predictions_are_scored_whenever_they_come_and_compared_over_the_same_fr
 
 def test_predictions_of_frames_that_never_come_take_no_memory(stream, compute_queued):
     frames, _ = stream(1)
-    operator = OnScreenMetricsOp(None)
+    operator = MetricsOp(None, on_screen=True)
     operator.start()
     for k in range(10 * PREDICTIONS_KEPT):
         compute_queued(operator, predicted=[Prediction(frames[0].with_fields(seq=k), frames[0].image)])
@@ -256,23 +262,25 @@ def test_predictions_of_frames_that_never_come_take_no_memory(stream, compute_qu
 def test_frames_that_are_never_predicted_take_no_memory(frame, rendered, compute_queued):
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(30 + 2 * PREDICTIONS_KEPT)]
     pictures = [rendered(k, frame=frames[k]) for k in range(len(frames))]
-    operator = OnScreenMetricsOp(None)
+    operator = MetricsOp(None, on_screen=True)
     score(operator, compute_queued, frames, in_time(pictures))
     assert 0 < len(operator._waiting_db) <= PREDICTIONS_KEPT
 
 
 def test_a_run_without_a_report_measures_nothing_that_only_a_report_shows(stream, compute_queued, monkeypatch):
     frames, pictures = stream(10)
-    operator = OnScreenMetricsOp(None, report=False)
+    operator = MetricsOp(None, on_screen=True, report=False)
     scored, result, quality = score(operator, compute_queued, frames, in_time(pictures))
     assert quality is None and result.frames == 10
     assert all(np.isnan(each.quality.ssim) and each.quality.psnr_tissue_db > 40 for each in scored)
-    assert operator._digest.hexdigest() == OnScreenMetricsOp(None)._digest.hexdigest(), "no picture was hashed"
+    assert operator._digest.hexdigest() == MetricsOp(None, on_screen=True)._digest.hexdigest(), "no picture was hashed"
 
 
 def test_the_digest_is_over_every_new_picture_and_all_of_its_bytes(stream, rendered, compute_queued):
     frames, pictures = stream(3)
-    digest = lambda shown_ones: score(OnScreenMetricsOp(None), compute_queued, frames, shown_ones)[2].frames_sha256
+    digest = lambda shown_ones: (
+        score(MetricsOp(None, on_screen=True), compute_queued, frames, shown_ones)[2].frames_sha256
+    )
     changed = rendered(1, frame=frames[1], image=pictures[1].image.copy())
     changed.image[-1, -1, -1] ^= 1
     all_of_them = in_time(pictures)
@@ -285,5 +293,5 @@ def test_the_first_second_begins_with_the_stream_and_not_at_zero(frame, rendered
     start_ns = 3_600_000_000_000
     frames = [frame(k, pts_ns=start_ns + k * PERIOD, arrived_ns=k * PERIOD) for k in range(30)]
     pictures = [rendered(k, frame=frames[k], offset=9 if k < 25 else 3) for k in range(30)]
-    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert result.settled_db == pytest.approx(decibels(3), abs=0.05)

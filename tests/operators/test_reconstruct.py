@@ -10,19 +10,22 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.transfers import HostCopy
 from operators.reconstruct import ReconstructOp
+from operators.training import EveryFrame
+from tests.operators.conftest import HEIGHT, WIDTH
 
 
 class FakeReconstructor:
     """Writes down what it is asked to do."""
 
     eyes = SimpleNamespace(trained="both")
+    camera = SimpleNamespace(width_px=WIDTH, height_px=HEIGHT)
 
     def __init__(self, make_model):
         self.calls = []
         self.version = 0
         self.make_model = make_model
 
-    def observe(self, frame, *, steps=None, train=True):
+    def observe(self, frame, *, budget=None, train=True):
         self.calls.append(("observe", frame.seq, train))
         return SimpleNamespace(
             seq=frame.seq,
@@ -36,10 +39,13 @@ class FakeReconstructor:
         self.calls.append(("publish", self.version))
         return self.make_model(self.version)
 
+    def whole_model(self, shown):
+        return shown.as_model()
+
 
 def test_each_frame_is_trained_on_before_its_snapshot(frame, model, compute):
     fake = FakeReconstructor(model)
-    operator = ReconstructOp(None, make_reconstructor=lambda: fake)
+    operator = ReconstructOp(None, make_reconstructor=lambda: fake, training=EveryFrame())
     operator.start()
     messages = [compute(operator, frame=frame(k))[0] for k in range(2)]
     assert fake.calls == [("observe", 0, True), ("publish", 1), ("observe", 1, True), ("publish", 2)]
@@ -47,12 +53,12 @@ def test_each_frame_is_trained_on_before_its_snapshot(frame, model, compute):
         (0, 1, 7, 0.5, True),
         (1, 2, 7, 0.5, True),
     ]
-    assert operator.model is messages[-1].model
+    assert operator.newest is messages[-1].model
 
 
 def test_held_out_frames_are_passed_on_and_never_trained_on(frame, model, compute):
     fake = FakeReconstructor(model)
-    operator = ReconstructOp(None, make_reconstructor=lambda: fake, held_out=lambda f: f.seq == 1)
+    operator = ReconstructOp(None, make_reconstructor=lambda: fake, training=EveryFrame(lambda f: f.seq == 1))
     operator.start()
     messages = [compute(operator, frame=frame(k))[0] for k in range(3)]
     assert [m.trained for m in messages] == [True, False, True]
@@ -65,7 +71,9 @@ def test_held_out_frames_are_passed_on_and_never_trained_on(frame, model, comput
 
 
 def test_the_first_frame_is_trained_on_even_when_it_is_held_out(frame, model, compute):
-    operator = ReconstructOp(None, make_reconstructor=lambda: FakeReconstructor(model), held_out=lambda f: True)
+    operator = ReconstructOp(
+        None, make_reconstructor=lambda: FakeReconstructor(model), training=EveryFrame(lambda f: True)
+    )
     operator.start()
     assert [compute(operator, frame=frame(k))[0].trained for k in range(2)] == [True, False]
 
@@ -77,7 +85,7 @@ def test_the_heavy_work_begins_at_start_and_the_last_model_survives_stop(frame, 
         made.append(FakeReconstructor(model))
         return made[-1]
 
-    operator = ReconstructOp(None, make_reconstructor=make)
+    operator = ReconstructOp(None, make_reconstructor=make, training=EveryFrame())
     assert made == []
     operator.start()
     compute(operator, frame=frame())
@@ -92,7 +100,7 @@ def test_a_snapshot_becomes_a_model_when_it_is_asked_for(frame, model, camera, c
         gaussians = model(version, index=version).gaussians
         return slots.publish(gaussians, None, version=version, camera=camera, time_window_s=(0.0, 1.0))
 
-    operator = ReconstructOp(None, make_reconstructor=lambda: FakeReconstructor(publish))
+    operator = ReconstructOp(None, make_reconstructor=lambda: FakeReconstructor(publish), training=EveryFrame())
     operator.start()
     messages = [compute(operator, frame=frame(k))[0] for k in range(2)]
     assert [type(message.model) for message in messages] == [Snapshot, Snapshot]

@@ -28,7 +28,7 @@ from pathlib import Path
 sys.meta_path.sort(key=lambda finder: finder is not PathFinder)
 
 import services.cli.runs
-from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
+from operators.applications.replay import ReplaySettings, prepare, replay_graph
 from services.cli.app import run
 from services.bus.runtime import StreamFolder
 from services.settings import StreamSettings
@@ -45,10 +45,10 @@ values = {}
 def at_the_operator(settings):
     '''The configuration that the operator of a replay reconstructs with.'''
     settings.out.mkdir(exist_ok=True)
-    graph = ReplayApplication(prepare(settings, []), settings)
+    graph = replay_graph(prepare(settings, []), settings)
     graph.compose()
     graph.reconstruct.start()
-    return graph.reconstruct._reconstructor.config.example
+    return graph.reconstruct._learner.reconstructor.config.example
 
 
 def live_at_the_operator(settings):

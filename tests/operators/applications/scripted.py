@@ -15,9 +15,9 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.applications.session import RunOutcome
 from operators.applications.working_size import made_up_tissue
 from operators.messages import PictureState, ShownPicture
-from operators.reconstruct import ScheduleEvent, TrainingCounts
 from operators.sources.live import LiveSource
 from operators.sources.source import SourceDescription
+from operators.training import TrainingCounts
 
 WIDTH, HEIGHT, FPS = 64, 48, 25.0
 INTERVAL_NS = round(1e9 / FPS)
@@ -119,7 +119,8 @@ class Watched:
     script: Script
     outcome: RunOutcome | None = None
     shown: list[ShownPicture] = field(default_factory=list)
-    events: list[ScheduleEvent] = field(default_factory=list)
+    learned: set[int] = field(default_factory=set)
+    """Numbers of the frames that were trained on."""
 
     def part(self, kind: type) -> Any:
         """Return an operator's part of the run's outcome."""
@@ -127,11 +128,6 @@ class Watched:
         found = self.outcome.find(kind)
         assert found is not None, kind
         return found
-
-    @property
-    def learned(self) -> set[int]:
-        """Numbers of the frames that were trained on."""
-        return {event.seq for event in self.events if event.kind == "observe" and event.train and event.seq is not None}
 
     def recovers_in(self, frames: range) -> None:
         """Among these frames some were learned from, and a live picture showed one of them."""

@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
-from operators.applications.live import LiveApplication, warm_up
+from operators.applications.live import live_graph, warm_up
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Session
@@ -74,9 +74,7 @@ def test_a_session_with_estimated_poses_comes_out_again(tmp_path):
     )
     settings.out.mkdir()
     source = _Scope(recording)
-    live = Session(
-        LiveApplication(source, settings, warm_up(settings, source)), settings.stated(), command="live"
-    ).execute()
+    live = Session(live_graph(source, settings, warm_up(settings, source)), settings.stated(), command="live").execute()
     assert live.find(EstimatedPoses).frames == FRAMES and live.find(RecordingResult).recorded.lost == {}
     prepared = [line for _, line in SessionReader(tmp_path / "session").lines() if line.event == "prepared"]
     assert len(prepared) == FRAMES and not np.array_equal(prepared[0].pose, prepared[-1].pose)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.io.bundle import load_bundle
-from gsplat_core.scene.frames import FrameStatus
+from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.training.budget import Budget
 from operators import display
 from operators.applications import live as live_module
 from operators.applications.live import live
@@ -18,11 +19,11 @@ from operators.checks import CutCounts, MaskAndDepthCounts, SequenceCounts
 from operators.display import COLOURS, LiveDisplayResult
 from operators.frame_clock import ClockSettings
 from operators.ingest import SourceResult
-from operators.messages import PictureState
+from operators.messages import PictureState, Reconstruction
 from operators.metrics import OnScreenResult
 from operators.out_of_body import OutOfBodyFrames
-from operators.reconstruct import TrainingCounts
 from operators.sources.live import FrameOrder
+from operators.training import Learner, TrainingCounts
 from tests.operators.applications.scripted import (
     BLACK,
     HEIGHT,
@@ -44,15 +45,23 @@ FEW_STEPS = ClockSettings(at_most_steps=4, rehearse_at_most=4)
 def watched(tmp_path, monkeypatch) -> Callable[..., Watched]:
     """Run a script live to its end."""
 
+    observe = Learner.observe
+
     def run(script: Script, *, source: dict[str, Any] | None = None, **settings: Any) -> Watched:
         watch = Watched(script)
-        # The graph's trial run before the stream tells the same listener.
-        played = ScriptedSource(script, watch.events.clear, **(source or {}))
+
+        def observing(self: Learner, frame: Frame, *, budget: Budget | None = None, train: bool) -> Reconstruction:
+            if train:
+                watch.learned.add(frame.seq)
+            return observe(self, frame, budget=budget, train=train)
+
+        # The trial run before the stream trains, too.
+        played = ScriptedSource(script, watch.learned.clear, **(source or {}))
+        monkeypatch.setattr(live_module, "open_source", lambda address, options: played)
+        monkeypatch.setattr(Learner, "observe", observing)
         # A busy machine displays pictures late, which is not tested here.
         monkeypatch.setattr(display, "STALE_AFTER_NS", 700e6)
         monkeypatch.setattr(display, "FROZEN_AFTER_NS", 1400e6)
-        monkeypatch.setattr(live_module, "open_source", lambda address, options: played)
-        monkeypatch.setattr(live_module.RunRecording, "listener", property(lambda self: watch.events.append))
         wanted = LiveSettings("scripted", tmp_path / "out", **{"out_of_body": "off", "clock": FEW_STEPS, **settings})
         watch.outcome = live(wanted, on_shown=watch.shown.append)
         assert watch.outcome.stop_reason == "end of stream"

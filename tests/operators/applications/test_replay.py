@@ -11,6 +11,7 @@ from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.training.config import ReconstructorConfig
+from operators import pipeline as pipeline_module
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import RunOutcome
@@ -87,7 +88,7 @@ def test_a_failure_carries_what_was_reached(settings):
 
 def test_threads_give_the_same_bytes_as_one(settings, monkeypatch):
     expected = replay(settings)
-    monkeypatch.setattr(replay_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
+    monkeypatch.setattr(pipeline_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
     events = []
     outcome = replay(settings, events.append)
     assert [e.done for e in events] == [0, 1, 2, 3, 4]
@@ -101,7 +102,7 @@ def test_threads_give_the_same_bytes_as_one(settings, monkeypatch):
 
 
 def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeypatch):
-    monkeypatch.setattr(replay_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
+    monkeypatch.setattr(pipeline_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
 
     def fail_on_the_second(progress):
         if progress.done == 2:

@@ -16,7 +16,7 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.sessions import SessionReader, WriterOptions
 from gsplat_core.io.sessions.records import DepthTaken, Observed, Rehearsed, SceneBegun
 from gsplat_core.scene.frames import Frame
-from operators.applications.live import LiveApplication, warm_up
+from operators.applications.live import live_graph, warm_up
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import RunOutcome, Session
@@ -87,7 +87,7 @@ def record(folder: Path, change, options: WriterOptions | None = None) -> RunOut
         eyes="both",
     )
     source = _Scope(recording, change)
-    graph = LiveApplication(source, settings, warm_up(settings, source))
+    graph = live_graph(source, settings, warm_up(settings, source))
     return Session(graph, settings.stated(), command="live").execute()
 
 

@@ -244,9 +244,9 @@ def test_the_live_graph_itself_is_measured(tmp_path):
 
     def new_graph(tissue, settings):
         assert settings.clock.at_most_steps == 1 and settings.record is None
-        from operators.applications.live import LiveApplication, new_parts
+        from operators.applications.live import live_graph, new_parts
 
-        graphs.append(LiveApplication(tissue, settings, new_parts(settings, tissue), on_shown=tissue.shown))
+        graphs.append(live_graph(tissue, settings, new_parts(settings, tissue), on_shown=tissue.shown))
         return graphs[0]
 
     took_s = measured_frame_s(replace(LiveSettings("a", tmp_path), scale=0.125), about, new_graph)

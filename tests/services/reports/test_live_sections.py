@@ -53,8 +53,8 @@ def test_few_frames_and_missing_figures_are_drawn_as_far_as_they_go(live):
 def test_each_place_where_frames_end_is_named_once_and_the_age_stands_for_the_latency(live):
     ways = {
         "source,analysis,display,recorded": 239.0,
-        "source,on_screen,progress": 41.0,
-        "source,display,on_screen,progress": 318.0,
+        "source,metrics,progress": 41.0,
+        "source,display,metrics,progress": 318.0,
         "display,recorded": 0.7,
     }
     paths = {path: Latency(p50=p50, p95=p50, p99=p50, max=p50) for path, p50 in ways.items()}

@@ -14,9 +14,9 @@ from operators.errors import NothingShown
 from operators.ingest import SourceResult
 from operators.metrics import QualityResult
 from operators.out_of_body import OutOfBodyFrames
-from operators.reconstruct import TrainingCounts
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
+from operators.training import TrainingCounts
 from services.cli.exit_codes import BAD_INPUT, NOTHING_SHOWN, exit_code_of
 from services.reports.build import REMEDIES, require_shown
 

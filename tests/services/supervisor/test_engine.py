@@ -30,7 +30,7 @@ def test_only_the_first_start_tries_everything_out(monkeypatch, again):
     calls = []
     monkeypatch.setattr(engines, "new_parts", lambda settings, source: calls.append(("new", settings)) or "parts")
     monkeypatch.setattr(engines, "warm_up", lambda settings, source: calls.append(("warm", settings)) or "warm parts")
-    monkeypatch.setattr(engines, "LiveApplication", lambda source, settings, parts: (source, settings, parts))
+    monkeypatch.setattr(engines, "live_graph", lambda source, settings, parts: (source, settings, parts))
     monkeypatch.setattr(
         engines, "trial_run", lambda settings, source, new: calls.append(("trial", new("made up", "tried")))
     )
@@ -146,7 +146,7 @@ def reconstructing(monkeypatch):
         return 0.25
 
     for name, value in {
-        "CapturedSource": Source, "LiveApplication": Graph, "Session": FakeSession, "low_latency": nullcontext,
+        "CapturedSource": Source, "live_graph": Graph, "Session": FakeSession, "low_latency": nullcontext,
         "started": lambda settings, source, again: ("parts", again), "engine_scale": scale,
         "check_picture": lambda camera, scale: world.__setattr__("checked", (camera, scale)),
         "measured_size": lambda settings, about, share: (settings.source, share),

@@ -1,0 +1,332 @@
+"""Graph of a run, from the source to the sinks.
+
+source ─► analysis ─► reconstruct ─► deform ─► rasterize ─┬─► display ─► viewer, session recorder
+             │             ▲                              │      │
+             └─► depth ┈┈┈┈┘                              └──────┴─► metrics ─► sinks, progress
+
+`analysis` checks the picture, finds tools and highlights, and sets pose and depth. All runs use this graph. They differ in the source, the `Pace` and the
+sinks:
+
+- A replay, also of a finished model, has no clock. Every edge blocks and holds one message, and the work per frame is a number of steps. The same source,
+  settings and device therefore give the same pictures on either engine and with any number of threads. Its pictures have no age, so there is no display.
+- The replay of a recorded session repeats the recorded calls of training. Its frames were analysed when they were recorded.
+- A live stream has a clock. Each operator has its own thread, and the queues between them drop the oldest frame. Depth is estimated in a background thread
+  on the newest frame and reaches training late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsplat_core.io.recordings.truth import TissueBehindTools
+from gsplat_core.io.sessions import SessionReader
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.reconstructor import Reconstructor
+from operators.applications.device import scheduler_for
+from operators.checks import (
+    PICTURE_STAGES,
+    TISSUE_STAGES,
+    OrdinaryStream,
+    PictureStagesOp,
+    SceneNumberStage,
+    StageOp,
+    TissueStagesOp,
+    new_stages,
+)
+from operators.choices import SINKS, Policy
+from operators.compare_shown import CompareShownOp
+from operators.depth import DepthOp
+from operators.display import DisplayOp
+from operators.frame_clock import FrameClock
+from operators.frame_log import FRAMES_FILE, FrameLog
+from operators.graph import Application, GreedyScheduler, MultiThreadScheduler, Operator
+from operators.ingest import SourceOp
+from operators.messages import RenderedFrame, ShownPicture
+from operators.metrics import MetricsOp, ScoredFrame
+from operators.out_of_body import OutOfBodyGateOp
+from operators.pose import pose_operators
+from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
+from operators.reconstruct import ReconstructOp
+from operators.settings import EngineOptions, JobOptions
+from operators.side_by_side import SideBySideOp
+from operators.sinks.callback import CallbackSinkOp
+from operators.sinks.registry import SinkOptions, input_of
+from operators.sinks.session_recorder import (
+    RecordFramesOp,
+    RecordPicturesOp,
+    RecordPreparationOp,
+    SessionRecorder,
+)
+from operators.sources.source import FrameSource
+from operators.storage import StorageReserve
+from operators.tool_mask import RecordedToolMaskOp, new_tool_mask
+from operators.training import EveryFrame, RecordedCalls, Training, UntilDisplay
+from operators.truth import TruthOp
+
+REPORT_RESERVE_BYTES = 8 * 2**20
+"""Disk space reserved for the video's index and the report, in bytes."""
+SIDE_STAGE = "highlights"
+"""A stage with no dependencies; runs concurrently with the other picture stages."""
+
+
+def analysis_operator(
+    fragment: Any,
+    tool_mask: str,
+    out_of_body: Policy,
+    positions: Sequence[Operator] = (),
+    *,
+    behind_gate: Sequence[Operator] = (),
+    behind: Sequence[Operator] = (),
+) -> SideBySideOp:
+    """Return the operator between source and reconstruction, with the input and output `frame`.
+
+    Tools and highlights are detected in parallel to the other checks of the picture.
+
+    Args:
+        fragment: the graph.
+        tool_mask: tool detector, a name in `TOOL_MASKS`.
+        out_of_body: policy for pictures from outside of the body.
+        positions: operators that set pose and depth of a frame.
+        behind_gate: operators inserted directly after the out-of-body gate.
+        behind: operators appended at the end.
+    """
+    others = [name for name in PICTURE_STAGES if name != SIDE_STAGE]
+    stream = OrdinaryStream()
+    picture_stages = new_stages(PICTURE_STAGES, without=[SIDE_STAGE])
+    return SideBySideOp(
+        fragment,
+        name="analysis",
+        gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
+        first=[PictureStagesOp(fragment, name="picture", stages=picture_stages, stream=stream)],
+        beside=[
+            [
+                new_tool_mask(fragment, tool_mask),
+                StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others)),
+            ]
+        ],
+        then=[
+            *behind_gate,
+            *positions,
+            TissueStagesOp(
+                fragment,
+                name="tissue",
+                always=[*new_stages(TISSUE_STAGES, without=["exposure"]), SceneNumberStage()],
+                stages=new_stages(TISSUE_STAGES, without=[name for name in TISSUE_STAGES if name != "exposure"]),
+                stream=stream,
+            ),
+            *behind,
+        ],
+    )
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Timing of a run: scheduler, queues, and training per frame."""
+
+    clock: FrameClock | None = None
+    """Display deadlines of a live stream. None to process every frame, whatever time it takes."""
+    session: SessionReader | None = None
+    """Recorded session whose calls of training are repeated."""
+    held_out: Callable[[Frame], bool] = lambda frame: False
+    """Returns True for frames that are displayed and scored but not trained on."""
+    predict_every: int = 1
+    """Predict one in this many frames before training on it; 0 for a finished model."""
+
+    def scheduler(self, device: str, graph: Application) -> GreedyScheduler | MultiThreadScheduler:
+        """Return the scheduler of the graph."""
+        return scheduler_for(device, graph) if self.clock is None else MultiThreadScheduler(graph)
+
+    def queue(self, capacity: int) -> dict[str, Any]:
+        """Return the arguments of `add_flow` for an edge. With a clock it holds up to `capacity`
+        messages and drops the oldest one.
+        """
+        return {} if self.clock is None else {"policy": "drop_oldest", "capacity": capacity}
+
+    def training(self, depth: DepthOp) -> Training:
+        """Return the training of each frame; `depth` is the depth operator of the graph."""
+        if self.clock is not None:
+            return UntilDisplay(self.clock, depth.background)
+        if self.session is not None:
+            return RecordedCalls(self.session.schedule, self.session.late_depths)
+        return EveryFrame(self.held_out)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Consumers of a run's pictures and scores."""
+
+    sinks: Sequence[str] = ()
+    """Names in `SINKS`."""
+    report: bool = True
+    """Collect data for a report: per-frame log, SSIM and a digest of the pictures."""
+    on_scored: Callable[[ScoredFrame], None] | None = None
+    """Called with each score."""
+    behind: TissueBehindTools | None = None
+    """Ground truth of the tissue behind the tools; replays only."""
+    on_shown: Callable[[ShownPicture], None] | None = None
+    """Called with each picture of the display; live streams only."""
+    recorder: SessionRecorder | None = None
+    """Recorder of frames, pictures and calls of training; live streams only."""
+
+
+class Pipeline(Application):
+    """Graph of a run."""
+
+    def __init__(
+        self,
+        source: FrameSource,
+        settings: JobOptions | EngineOptions,
+        out: Path,
+        *,
+        name: str,
+        pace: Pace,
+        make_reconstructor: Callable[[], Reconstructor],
+        outputs: Outputs | None = None,
+        rasterizer: Rasterizer | None = None,
+        seconds: float | None = None,
+        stop_requested: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Store the parameters; `compose` creates the operators.
+
+        Args:
+            source: source of the frames.
+            settings: options of the engine.
+            out: output folder.
+            name: name of the application.
+            pace: timing of the run.
+            make_reconstructor: factory of the reconstructor, called at the start of the run.
+            outputs: consumers of pictures and scores; None for scores alone.
+            rasterizer: warm rasterizer; None to create one.
+            seconds: maximum duration of the run; None for no limit.
+            stop_requested: polled; True ends the stream.
+        """
+        super().__init__(name=name, track=True)
+        self.frame_source, self.settings, self.out, self.pace = source, settings, out, pace
+        self.outputs = outputs or Outputs()
+        self._make_reconstructor, self._rasterizer = make_reconstructor, rasterizer
+        self._seconds, self._stop_requested = seconds, stop_requested
+        self.scheduler(pace.scheduler(settings.device, self))
+
+    def compose(self) -> None:
+        """Create and connect the operators (see the diagram of the module)."""
+        settings, pace, outputs, about = self.settings, self.pace, self.outputs, self.frame_source.description
+        self.source_op = SourceOp(
+            self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=self._seconds
+        )
+        is_analysed, learns = pace.session is not None, pace.predict_every > 0
+        depth = DepthOp(
+            self,
+            name="depth",
+            choice="recorded" if is_analysed else settings.depth,
+            camera=about.camera,
+            in_background=pace.clock is not None,
+            # A graph that only displays a finished model does not use depth.
+            has_time=learns and pace.clock is None,
+            device=settings.device,
+            held_out=pace.held_out,
+        )
+        analysis = self._analysis(depth, is_analysed)
+        self.reconstruct = ReconstructOp(
+            self,
+            name="reconstruct",
+            make_reconstructor=self._make_reconstructor,
+            training=pace.training(depth),
+            recorder=outputs.recorder,
+        )
+        deform = DeformOp(self, name="deform")
+        rasterize = RasterizeOp(
+            self,
+            name="rasterize",
+            renderer=settings.renderer,
+            predict_every=pace.predict_every,
+            rasterizer=self._rasterizer,
+        )
+        before: Operator = self.source_op
+        for operator in analysis:
+            self.add_flow(before, operator, {("frame", "frame")})
+            before = operator
+        self.add_flow(before, self.reconstruct, {("frame", "frame")}, **pace.queue(5))
+        self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")}, **pace.queue(2))
+        self.add_flow(deform, rasterize, {("scene", "scene")}, **pace.queue(2))
+        reserve = StorageReserve(self.out, self.room_to_finish)
+        log = FrameLog(self.out / FRAMES_FILE, reserve) if outputs.report else None
+        self.metrics = MetricsOp(self, name="metrics", on_screen=pace.clock is not None, log=log, report=outputs.report)
+        if pace.clock is None:
+            self.add_flow(rasterize, self.metrics, {("rendered", "rendered")})
+        else:
+            self.add_flow(before, self.metrics, {("frame", "frame")})
+            self._show(rasterize, pace.clock)
+        if learns:
+            self.add_flow(rasterize, self.metrics, {("predicted", "predicted")})
+        self._connect_sinks(rasterize, reserve)
+
+    def _analysis(self, depth: DepthOp, is_analysed: bool) -> Sequence[Operator]:
+        """Return the operators between source and reconstruction, in order."""
+        settings, recorder = self.settings, self.outputs.recorder
+        poses = pose_operators(
+            self, "given" if is_analysed else settings.poses, self.frame_source.description.camera, settings.depth
+        )
+        if not isinstance(settings, EngineOptions):
+            return RecordedToolMaskOp(self, name="tool_mask"), *poses, depth
+        return (
+            analysis_operator(
+                self,
+                settings.tool_mask,
+                settings.out_of_body,
+                (*poses, depth),
+                behind_gate=[RecordFramesOp(self, name="recorded_frames", recorder=recorder)] if recorder else [],
+                behind=[RecordPreparationOp(self, name="recorded_preparation", recorder=recorder)] if recorder else [],
+            ),
+        )
+
+    def _show(self, rasterize: RasterizeOp, clock: FrameClock) -> None:
+        """Connect the live display and the consumers of its pictures."""
+        outputs = self.outputs
+        self.display = DisplayOp(
+            self,
+            name="display",
+            clock=clock,
+            source_state=lambda: self.frame_source.state,
+        )
+        self.add_flow(rasterize, self.display, {("rendered", "rendered")})
+        if outputs.recorder is not None:
+            pictures = RecordPicturesOp(self, name="recorded_pictures", recorder=outputs.recorder)
+            self.add_flow(self.display, pictures, {("shown", "shown")}, **self.pace.queue(8))
+        self.add_flow(self.display, self.metrics, {("shown", "shown")})
+        if outputs.on_shown is not None:
+            viewer = CallbackSinkOp(self, name="viewer", callback=outputs.on_shown)
+            self.add_flow(self.display, viewer, {("shown", "message")}, **self.pace.queue(1))
+
+    def _connect_sinks(self, rasterize: RasterizeOp, reserve: StorageReserve) -> None:
+        """Connect the sinks. Each consumes either rendered or scored frames."""
+        about, outputs = self.frame_source.description, self.outputs
+        options = SinkOptions(self.out, about, reserve)
+        sinks = [SINKS[name](self, name, options) for name in outputs.sinks]
+        producers: dict[type, tuple[Operator, str]] = {
+            RenderedFrame: (rasterize, "rendered"),
+            ScoredFrame: (self.metrics, "scored"),
+        }
+        for sink in sinks:
+            port, kind = input_of(sink)
+            producer, output = producers[kind]
+            self.add_flow(producer, sink, {(output, port)}, **self.pace.queue(4))
+        if self.pace.session is not None:
+            compare = CompareShownOp(self, name="compare", shown=self.pace.session.digests)
+            self.add_flow(rasterize, compare, {("rendered", "rendered")})
+        if outputs.behind is not None and about.frame_count is not None:
+            truth = TruthOp(
+                self, name="truth", behind=outputs.behind, camera=about.camera, frame_count=about.frame_count
+            )
+            self.add_flow(rasterize, truth, {("rendered", "rendered")})
+        if outputs.on_scored is not None:
+            progress = CallbackSinkOp(self, name="progress", callback=outputs.on_scored)
+            self.add_flow(self.metrics, progress, {("scored", "message")}, **self.pace.queue(1))
+
+    def room_to_finish(self) -> int:
+        """Return the disk space that finishing needs, in bytes: the newest model in float32 and the
+        report.
+        """
+        return REPORT_RESERVE_BYTES + 4 * self.reconstruct.parameter_count

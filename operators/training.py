@@ -1,0 +1,432 @@
+"""Training of the model by a stream's frames: how much each frame is trained on, and what happens between frames.
+
+`ReconstructOp` owns a `Learner` and delegates these decisions to a `Training`. `EveryFrame` trains a number of steps on each frame. `UntilDisplay` trains
+until the display deadline, and on earlier frames until the next frame arrives. `RecordedCalls` repeats the calls of a recorded session.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from gsplat_core.io.sessions.records import (
+    DepthTaken,
+    Grown,
+    LostLine,
+    Observed,
+    ReconstructorMade,
+    Rehearsed,
+    SceneBegun,
+    ScheduleLine,
+)
+from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.placement import MOST_LATE, LateDepth
+from gsplat_core.training.reconstructor import Reconstructor
+from operators.depth import BackgroundDepth, TakenDepth
+from operators.frame_clock import FrameClock
+from operators.graph.tracking import Histogram
+from operators.messages import Reconstruction
+from operators.outcome import OutcomeBuilder
+from operators.sinks.session_recorder import SessionRecorder
+
+REHEARSED_AT_ONCE = 3
+"""Rehearsal steps on a GPU between two checks for a new frame. On the slower CPU it is one step."""
+GROWN_AT_LATEST = 10
+"""Maximum number of trained frames between two growth steps; beyond it growth runs even without
+spare time.
+"""
+
+
+@dataclass
+class TrainingCounts:
+    """Statistics of the training of a run."""
+
+    frames: int = 0
+    """Number of frames that were trained on."""
+    steps: int = 0
+    """Optimiser steps on the newest frame before its display."""
+    passed_over: int = 0
+    """Frames dropped for newer ones."""
+    rehearsed: int = 0
+    """Rehearsal steps, on frames of the training window."""
+    withheld: dict[str, int] = field(default_factory=dict)
+    """Frames excluded from training (withheld or damaged), by reason."""
+    scenes: dict[str, int] = field(default_factory=dict)
+    """Number of scene restarts, by reason."""
+    places_found: int = 0
+    """New scenes recognised as a place that the stream had shown before."""
+
+
+class Learner:
+    """Reconstructor of a run with its last published model.
+
+    Counts the calls that change the model and passes each to the recorder of the session, so that
+    the run can be replayed.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Reconstructor],
+        recorder: SessionRecorder | None = None,
+        counts: TrainingCounts | None = None,
+    ) -> None:
+        self._make, self._recorder = make, recorder
+        self.counts = counts or TrainingCounts()
+        self.newest: Model | Snapshot | None = None
+        """Last published model of the current scene; None before its first frame."""
+        self.learned: Frame | None = None
+        """Newest frame that the model was trained on."""
+        self._scene = 0
+        """Number of the scene that the model represents."""
+        self.reconstructor = make()
+
+    def renew(self) -> None:
+        """Replace the reconstructor by a new one."""
+        self.reconstructor, self.newest = self._make(), None
+
+    def accepts(self, frame: Frame) -> bool:
+        """Return True if a frame can be trained on. Counts the reason if not."""
+        reason = frame.unusable
+        if reason is not None:
+            self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
+        return reason is None
+
+    def enter(self, frame: Frame, *, usable: bool) -> bool:
+        """Begin another scene if the frame does not belong to the current one.
+
+        The scene number changes even if the first frame of a scene was dropped or withheld.
+
+        Returns:
+            False if the frame cannot be shown: it is unusable, and no model of its scene exists.
+        """
+        camera = self.reconstructor.camera
+        resized = (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px)
+        other_scene = frame.new_scene is not None or frame.scene != self._scene
+        if self.newest is None or resized or other_scene:
+            if not usable:
+                return False
+            if self.newest is not None:
+                reason = "resized" if resized else frame.new_scene or "begun by a frame that was not used"
+                self.counts.scenes[reason] = self.counts.scenes.get(reason, 0) + 1
+                self.begin_scene(frame)
+            self._scene = frame.scene
+        return True
+
+    def begin_scene(self, frame: Frame) -> None:
+        """Leave the scene; `frame` starts another one."""
+        self.counts.places_found += self.reconstructor.begin_scene(frame)
+        self._record(lambda: SceneBegun(seq=frame.seq))
+        self.newest = None
+
+    def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool) -> Reconstruction:
+        """Process the next frame, train on it if `train` is True, and publish the model."""
+        report = self.reconstructor.observe(frame, budget=budget, train=train)
+        if train:
+            self.learned = frame
+            self.counts.frames += 1
+            self.counts.steps += report.steps
+        self._record(lambda: Observed(seq=frame.seq, steps=report.steps, train=train))
+        self.newest = self.reconstructor.publish()
+        return Reconstruction(
+            frame,
+            self.newest,
+            trained=train,
+            steps=report.steps,
+            arriving_loss=report.arriving_loss,
+            content=self.learned if frame.unusable else frame,
+        )
+
+    def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
+        """Use the depth of a frame that was trained on without it. Return False if it came too late."""
+        taken = self.reconstructor.take_depth(frame, late)
+        if taken and self._recorder is not None:
+            self._recorder.depth(frame)
+        return taken
+
+    def grow(self, frame: Frame) -> None:
+        """Grow the scene after the display of `frame`, the newest trained one."""
+        self.reconstructor.grow(frame)
+        self._record(lambda: Grown(seq=frame.seq))
+
+    def record_rehearsal(self, steps: int) -> None:
+        """Count and record rehearsal steps since the last frame."""
+        self.counts.rehearsed += steps
+        if steps:
+            self._record(lambda: Rehearsed(steps=steps))
+
+    def whole_model(self) -> Model | None:
+        """Return the model with its past in its own memory; None before there is one."""
+        return None if self.newest is None else self.reconstructor.whole_model(self.newest)
+
+    def _record(self, line: Callable[[], ScheduleLine]) -> None:
+        if self._recorder is not None:
+            self._recorder.line(line())
+
+
+class Training(ABC):
+    """Decides how much the model is trained on a frame, and when."""
+
+    def begin(self) -> None:  # noqa: B027 - not every training has a state
+        """Reset the state for a new stream."""
+
+    def end(self) -> None:  # noqa: B027
+        """Release the state after a stream."""
+
+    def take(self, op_input: Any, learner: Learner) -> Frame:
+        """Return the next frame of the queue at the input `frame`."""
+        frame: Frame = op_input.receive("frame")
+        return frame
+
+    @abstractmethod
+    def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
+        """Train on a frame.
+
+        Args:
+            frame: next frame in order.
+            learner: owner of the model.
+            frame_waits: returns True if a further frame is queued.
+
+        Returns:
+            The frame with the published model; None if the frame is not displayed.
+        """
+
+    def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:  # noqa: B027
+        """Use the time after the frame's model was published. Arguments as for `learn`."""
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:  # noqa: B027
+        """See `Contributor`."""
+
+
+class EveryFrame(Training):
+    """Trains the configured number of steps on each frame.
+
+    Damaged, withheld and held-out frames are displayed with the newest model. The first frame is
+    trained on even if it is held out, because the following ones need a model.
+    """
+
+    def __init__(self, held_out: Callable[[Frame], bool] = lambda frame: False) -> None:
+        """held_out: returns True for frames to exclude from training."""
+        self._held_out = held_out
+
+    def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
+        """See `Training.learn`."""
+        usable = learner.accepts(frame)
+        if not learner.enter(frame, usable=usable):
+            return None
+        train = learner.newest is None or (usable and not self._held_out(frame))
+        return learner.observe(frame, train=train)
+
+
+class UntilDisplay(Training):
+    """Trains on each frame until its display deadline, and rehearses until the next frame.
+
+    Frames that are too late are dropped. Withheld and damaged frames are displayed with the current
+    model and not trained on.
+    """
+
+    def __init__(self, clock: FrameClock, depth: BackgroundDepth | None = None) -> None:
+        """Set the collaborators.
+
+        Args:
+            clock: display deadlines and training budgets.
+            depth: depth estimator for trained frames; None disables late depth.
+        """
+        self._clock, self._depth = clock, depth
+        self.begin()
+
+    def begin(self) -> None:
+        """See `Training.begin`."""
+        self._since_grown = 0
+        """Frames trained on since the last growth step."""
+        self._depth_ages = Histogram()
+        self._depths_taken = self._depths_dropped = 0
+
+    def take(self, op_input: Any, learner: Learner) -> Frame:
+        """Return the oldest queued frame that is not too late."""
+        frame: Frame = op_input.receive("frame")
+        while (waiting := op_input.queued("frame")) and self._clock.too_late(frame, waiting):
+            learner.counts.passed_over += 1
+            frame = op_input.receive("frame")
+        return frame
+
+    def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
+        """See `Training.learn`."""
+        behind, taken_ns = frame_waits(), self._clock.now_ns()
+        usable = learner.accepts(frame)
+        if not learner.enter(frame, usable=usable):
+            return None
+        first = learner.newest is None
+        if usable and self._depth is not None:
+            self._depth.offer(frame)
+        budget = self._clock.budget(frame, first=first, behind=behind)
+        shown = learner.observe(frame, budget=budget, train=usable)
+        if usable:
+            # The initialisation of a scene already covers its first frame.
+            self._since_grown = 0 if first else self._since_grown + 1
+        published_ns = self._clock.now_ns()
+        if not first:
+            self._clock.published(taken_ns, published_ns, shown.steps, learner.reconstructor.step_ns)
+        return replace(shown, taken_ns=taken_ns, published_ns=published_ns)
+
+    def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:
+        """Take late depth, grow the scene if due, then train on the window until the next frame
+        waits or is expected.
+        """
+        if not frame_waits():
+            self._clock.wait_until_shown()
+        self._take_depth(learner)
+        reconstructor = learner.reconstructor
+        at_once = REHEARSED_AT_ONCE if reconstructor.device.type == "cuda" else 1
+        made = 0
+
+        def has_time() -> bool:
+            return not frame_waits() and self._clock.may_rehearse(made, reconstructor.rehearsal_ns(at_once))
+
+        if frame is learner.learned and self._since_grown and (self._since_grown >= GROWN_AT_LATEST or has_time()):
+            learner.grow(frame)
+            self._since_grown = 0
+        while has_time():
+            reconstructor.rehearse(at_once)
+            made += at_once
+        learner.record_rehearsal(made)
+
+    def _take_depth(self, learner: Learner) -> None:
+        """Pass depth maps that the background thread has finished to the model. They belong to
+        frames that were trained on without depth.
+        """
+        found = None if self._depth is None else self._depth.take()
+        if found is None:
+            return
+        frame, late = found
+        if not learner.take_depth(frame, late):
+            self._depths_dropped += 1
+            return
+        self._depths_taken += 1
+        if frame.arrived_ns is not None:
+            self._depth_ages.record(self._clock.now_ns() - frame.arrived_ns)
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        age_ms = self._depth_ages.summary().p50_ms
+        outcome.add(TakenDepth(self._depths_taken, age_ms, self._depths_dropped))
+        if self._depths_taken:
+            outcome.note(
+                f"the depth of {self._depths_taken} frames was learned after they were shown, {age_ms:.0f} ms after they had come (median)"
+            )
+
+
+class RecordedCalls(Training):
+    """Repeats the recorded calls of a live session. Frames that the session dropped are not
+    displayed.
+    """
+
+    def __init__(
+        self,
+        schedule: Callable[[], Iterator[ScheduleLine | LostLine]],
+        late_depths: Callable[[], Iterator[dict[str, Any] | None]],
+    ) -> None:
+        """Set the recording.
+
+        Args:
+            schedule: called in `begin`; yields the lines of the schedule from the beginning.
+            late_depths: called in `begin`; yields the frame fields for each `take_depth` line, in
+                order.
+        """
+        self._schedule, self._late_depths = schedule, late_depths
+        self.missing: int | None = None
+        """Sequence number of the first recorded frame, or late depth, that is missing; later
+        pictures may differ. None if complete.
+        """
+        self._lines: Iterator[ScheduleLine | LostLine] = iter(())
+        self._depths: Iterator[dict[str, Any] | None] = iter(())
+        self._due: ScheduleLine | LostLine | None = None
+        self._has_reconstructor = False
+        self._observed: OrderedDict[int, Frame] = OrderedDict()
+        """The most recently observed frames, by sequence number."""
+
+    def begin(self) -> None:
+        """See `Training.begin`."""
+        self.missing, self._has_reconstructor = None, False
+        self._observed.clear()
+        self._lines, self._depths = self._schedule(), self._late_depths()
+        self._due = next(self._lines, None)
+
+    def end(self) -> None:
+        """See `Training.end`."""
+        self._observed.clear()
+        self._lines, self._depths = iter(()), iter(())
+
+    def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
+        """See `Training.learn`."""
+        observed = self._follow_to(frame, learner)
+        if observed is None or not self._has_reconstructor:
+            return None
+        train = observed.train and frame.status is not FrameStatus.DAMAGED
+        if not train:
+            learner.accepts(frame)
+        if learner.newest is None and not train:
+            return None
+        self._observed[frame.seq] = frame
+        while len(self._observed) > MOST_LATE:
+            self._observed.popitem(last=False)
+        return learner.observe(frame, budget=Budget.of_steps(observed.steps), train=train)
+
+    def _follow_to(self, frame: Frame, learner: Learner) -> Observed | None:
+        """Replay the calls that precede this frame's observation. Return its line; None if it was
+        never observed.
+        """
+        while self._due is not None:
+            line = self._due
+            if isinstance(line, Observed | SceneBegun) and line.seq > frame.seq:
+                return None
+            self._due = next(self._lines, None)
+            if isinstance(line, Observed):
+                if line.seq == frame.seq:
+                    return line
+                self._miss(line.seq)
+            elif isinstance(line, ReconstructorMade):
+                # The learner starts with the first reconstructor.
+                if self._has_reconstructor:
+                    learner.renew()
+                self._has_reconstructor = True
+            elif isinstance(line, DepthTaken | LostLine):
+                self._take_depth(line, learner)
+            elif self._has_reconstructor:
+                self._call(learner, line, frame)
+        return None
+
+    def _call(self, learner: Learner, line: SceneBegun | Grown | Rehearsed, frame: Frame) -> None:
+        """Replay one call that precedes the observation of `frame`."""
+        if isinstance(line, Rehearsed):
+            if learner.reconstructor.gaussians:
+                learner.reconstructor.rehearse(line.steps)
+        elif isinstance(line, Grown):
+            if self._observed and line.seq == next(reversed(self._observed)):
+                learner.grow(self._observed[line.seq])
+        elif line.seq == frame.seq:
+            learner.begin_scene(frame)
+
+    def _take_depth(self, line: DepthTaken | LostLine, learner: Learner) -> None:
+        """Replay a late depth estimate, or note that the frame or depth is missing."""
+        fields = next(self._depths, None) if isinstance(line, DepthTaken) else None
+        frame = self._observed.get(line.seq)
+        if fields is None or frame is None or not self._has_reconstructor:
+            self._miss(line.seq)
+        else:
+            learner.take_depth(frame.with_fields(**fields))
+
+    def _miss(self, seq: int) -> None:
+        self.missing = seq if self.missing is None else self.missing
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        if self.missing is not None:
+            outcome.note(
+                f"frame {self.missing} was trained on in the session and is not in its recording, or its depth is not: later pictures may differ"
+            )
