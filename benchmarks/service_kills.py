@@ -168,7 +168,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--options", type=json.loads, default={}, help="stream options as JSON")
     options = parser.parse_args()
-    with Server(options.source, device=options.device, options=options.options) as server:
+    sections = {"server": {"port": 0, "takeover_s": 60}}
+    with Server(options.source, device=options.device, options=options.options, sections=sections) as server:
         live_s = server.until_live()
         changes = Changes(server)
         if options.what == "control":

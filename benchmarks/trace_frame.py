@@ -2,8 +2,9 @@
 
     python benchmarks/trace_frame.py [--seconds 5] [--source synthetic:]
 
-Runs a server with one stream and one viewer. Each of its Python processes records the code objects that are called: first during some seconds of live frames, then while
-another stream is created. Modules called for other reasons at that time, such as heartbeats, are included. A module counts with all of its lines.
+A server runs with one stream and one viewer. Every Python process of it records the code objects that are called: first for some seconds of
+live frames, where heartbeats and other periodic work are counted, too. Then the stream is stopped, and the control process is recorded while
+another stream is created. A module counts with all of its lines.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def main() -> int:
         frame: dict[int, set[str]] = {}
         creation: dict[int, set[str]] = {}
         with Server(options.source) as server:
-            server.until_live()
+            server.until(lambda stream: (stream["processes"]["engine"]["figures"] or {}).get("pictures"), 300.0)
             pids = server.pids()
             stop = threading.Event()
             viewer = threading.Thread(target=watch_pictures, args=(server, stop), daemon=True)
@@ -106,9 +107,11 @@ def main() -> int:
             time.sleep(3.0)
             with recorded(folder, "frame", list(pids.values()), frame):
                 time.sleep(options.seconds)
+            stop.set()
+            viewer.join(30)
+            server.ask(f"/v1/streams/{STREAM}/stop", "POST")
             with recorded(folder, "creation", [pids["control"]], creation):
                 server.ask("/v1/streams", "POST", {"name": "second", "source": options.source, "start": False})
-            stop.set()
         roles = {role: frame.get(pid, set()) for role, pid in pids.items()}
         missing = [role for role, modules in roles.items() if not modules]
         if missing:

@@ -169,7 +169,10 @@ def assembled(settings: ServiceSettings) -> Parts:
     measures = StreamMeasures()
     events = SystemEvents()
     streams = SupervisedStreams(
-        RuntimeFolder(settings.runtime_dir), event_receiver(measures, events), settings.limits.streams
+        RuntimeFolder(settings.runtime_dir),
+        event_receiver(measures, events),
+        settings.limits.streams,
+        settings.server.takeover_s,
     )
     measures.streams = streams
     models = registry_of(settings)

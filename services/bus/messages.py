@@ -129,8 +129,6 @@ class CommandServer:
 
     def __init__(self, endpoint: str, handlers: Mapping[str, Handler]) -> None:
         self._handlers = handlers
-        self.heard_s = time.monotonic()
-        """Time of the last command."""
         self._stop = threading.Event()
         self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 200)  # lets the answer to the stop command leave before the process ends
@@ -149,9 +147,7 @@ class CommandServer:
             if not self._socket.poll(LOOK_MS):
                 continue
             parts = self._socket.recv_multipart()
-            self.heard_s = time.monotonic()
             answer = self._answer(b"".join(parts))
-            self.heard_s = time.monotonic()
             self._socket.send(answer)
         self._socket.close()
 

@@ -10,7 +10,7 @@ import fcntl
 import os
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from signal import pidfd_send_signal
@@ -42,6 +42,13 @@ class ProcessIdentity:
         if fields[_STATE] in "ZX":
             return None
         return ProcessIdentity(pid, f"{_boot()} {fields[_STARTED]}")
+
+    @staticmethod
+    def own() -> ProcessIdentity:
+        """Return the identity of this process."""
+        identity = ProcessIdentity.of(os.getpid())
+        assert identity is not None
+        return identity
 
     @property
     def is_alive(self) -> bool:
@@ -205,12 +212,7 @@ class StreamFolder:
 
     def write_record(self, role: Role, spec_digest: str) -> None:
         """Record this process as the one that serves a role."""
-        identity = ProcessIdentity.of(os.getpid())
-        assert identity is not None
-        write_json(
-            self.path / f"{role}.json",
-            {"pid": identity.pid, "started": identity.started, "spec_digest": spec_digest},
-        )
+        write_json(self.path / f"{role}.json", {**asdict(ProcessIdentity.own()), "spec_digest": spec_digest})
 
     def lock(self, role: Role) -> int:
         """Lock a role for this process until it ends.

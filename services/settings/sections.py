@@ -180,6 +180,13 @@ class ServerSettings(Section):
     drain_s: float = Field(
         default=10.0, ge=0, le=600, description="Longest time for running requests to finish after SIGTERM, in seconds."
     )
+    takeover_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=3600,
+        description="Time in seconds for which streams continue after the server was killed, so that the next server takes them"
+        " over. With 0 they end within 2 s. For servers that are restarted automatically.",
+    )
 
     @model_validator(mode="after")
     def _whole_pair(self) -> ServerSettings:

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import gc
 import importlib
+import json
 import logging
 import os
 import re
@@ -21,6 +22,7 @@ import sys
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
@@ -30,6 +32,7 @@ from services.bus.runtime import ProcessIdentity, RuntimeFolder, check_path, rea
 from services.errors import AlreadyRunning, BadMessage, NoAnswer
 from services.private_files import keep_files_private
 from services.settings.sections import masked_address
+from services.supervisor.worker import ORPHAN_DRAIN_S, Parent, identity_of
 
 FINISHED = 0
 FAILED = 1
@@ -175,8 +178,9 @@ class ByLauncher:
     directly. Streams of a runtime folder share one instance.
     """
 
-    def __init__(self, folder: RuntimeFolder, orphan_after_s: float = 600.0) -> None:
+    def __init__(self, folder: RuntimeFolder, orphan_after_s: float = 0.0) -> None:
         self._folder, self._orphan_after_s = folder, orphan_after_s
+        self._own = asdict(ProcessIdentity.own())
         self._direct = Direct()
         self._own_pid: int | None = None
         self._keeping: asyncio.Task[None] | None = None
@@ -263,14 +267,21 @@ class ByLauncher:
                     self._clean()
                     self._own_pid = await self._direct.start(
                         "services.supervisor.launcher",
-                        ["--folder", os.fspath(self._folder.path), "--orphan-after-s", str(self._orphan_after_s)],
+                        [
+                            "--folder",
+                            os.fspath(self._folder.path),
+                            "--orphan-after-s",
+                            str(self._orphan_after_s),
+                            "--supervisor",
+                            json.dumps(self._own),
+                        ],
                         self._folder.path / "launcher.log",
                         {},
                     )
                 await asyncio.sleep(LOOK_S)
                 continue
             try:
-                await self._ask("ping")
+                await self._ask("ping", supervisor=self._own)
                 self.ready.set()
             except (NoAnswer, BadMessage, OSError) as error:
                 self.ready.clear()
@@ -327,18 +338,18 @@ MOST_REMEMBERED = 256
 
 
 class Launcher:
-    """Server on the launcher's socket. Ends on `stop`, after `orphan_after_s` without requests, or
-    when the socket file is removed."""
+    """Server on the launcher's socket. Ends on `stop`, when its supervisor has died, or when the
+    socket file is removed. An orphan ends its children, too."""
 
-    def __init__(self, path: Path, orphan_after_s: float) -> None:
-        self._path, self._orphan_after_s = path, orphan_after_s
+    def __init__(self, path: Path, parent: Parent) -> None:
+        self._path, self._parent = path, parent
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         path.unlink(missing_ok=True)
         self._listener.bind(os.fspath(path))
         self._listener.listen(16)
         self._stopped = False
         self._ends: dict[int, str] = {}
-        self._heard_s = time.monotonic()
+        self._children: set[int] = set()
 
     def stop(self, *_: Any) -> None:
         """Request the end of `serve`. Also used as signal handler."""
@@ -346,8 +357,11 @@ class Launcher:
 
     def serve(self) -> None:
         """Answer requests until the end."""
-        while not self._stopped and time.monotonic() - self._heard_s < self._orphan_after_s:
+        while not self._stopped:
             self._reap()
+            if self._parent.lost(time.monotonic()):
+                self._end_children()
+                break
             if not self._path.exists():
                 break
             if not select.select([self._listener], [], [], LAUNCHER_LOOK_S)[0]:
@@ -363,8 +377,9 @@ class Launcher:
     def _answer(self, connection: socket.socket) -> dict[str, Any]:
         try:
             request = parsed_json(connection.recv(MOST_BYTES))
-            self._heard_s = time.monotonic()
             command = request.get("command")
+            if command == "ping" and "supervisor" in request:
+                self._parent.identity = identity_of(request["supervisor"])
             if command == "start":
                 return {"ok": True, "pid": self._start(request, connection)}
             if command == "status":
@@ -389,9 +404,19 @@ class Launcher:
                 self._listener.close()
                 connection.close()
                 _become(module, arguments, environment, output)
+            self._children.add(pid)
             return pid
         finally:
             os.close(output)
+
+    def _end_children(self) -> None:
+        """Wait for the children, which end themselves as orphans, and kill those that hang."""
+        until_s = time.monotonic() + ORPHAN_DRAIN_S + LAUNCHER_LOOK_S
+        while self._children and time.monotonic() < until_s:
+            time.sleep(LOOK_S)
+            self._reap()
+        for pid in self._children:
+            os.kill(pid, signal.SIGKILL)  # not reaped yet, so the process id is still that of the child
 
     def _reap(self) -> None:
         """Collect the exit statuses of ended processes."""
@@ -402,6 +427,7 @@ class Launcher:
                 return
             if pid == 0:
                 return
+            self._children.discard(pid)
             self._ends[pid] = ended_how(status)
             while len(self._ends) > MOST_REMEMBERED:
                 del self._ends[next(iter(self._ends))]
@@ -435,7 +461,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keep_files_private()
     parser = argparse.ArgumentParser(description="Forks the processes of streams.")
     parser.add_argument("--folder", required=True, help="runtime folder")
-    parser.add_argument("--orphan-after-s", type=float, default=600.0)
+    parser.add_argument("--orphan-after-s", type=float, default=0.0, help="time to continue without a supervisor")
+    parser.add_argument("--supervisor", type=json.loads, help="process id and start time of the supervisor, as JSON")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # The NVML check detects GPUs without initialising CUDA; after initialisation no forked engine
@@ -454,12 +481,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     gc.collect()
     gc.freeze()  # excludes the imported objects from garbage collection, so their pages stay shared
 
-    identity = ProcessIdentity.of(os.getpid())
-    assert identity is not None
-    launcher = Launcher(folder.path / SOCKET, given.orphan_after_s)
+    supervisor = None if given.supervisor is None else identity_of(given.supervisor)
+    launcher = Launcher(folder.path / SOCKET, Parent(supervisor, given.orphan_after_s))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, launcher.stop)
-    write_json(folder.path / RECORD, {"pid": identity.pid, "started": identity.started})
+    write_json(folder.path / RECORD, asdict(ProcessIdentity.own()))
     try:
         launcher.serve()
     finally:

@@ -8,7 +8,7 @@ import signal
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import zmq
@@ -405,12 +405,14 @@ class ManagedProcess:
                 self._say("lost", reason, self._identity)
 
     async def _ping(self) -> None:
-        """Ping the process periodically, so that it does not end itself as an orphan."""
+        """Tell the process periodically that this process is its supervisor, so that an adopted process does not end
+        itself as an orphan."""
+        own = asdict(ProcessIdentity.own())
         while True:
             await asyncio.sleep(PING_S)
             if self._identity is not None and self._heartbeat is not None:
                 try:
-                    await ask_async(self._folder.commands(self._role), "ping")
+                    await ask_async(self._folder.commands(self._role), "ping", supervisor=own)
                 except BusError as error:
                     # hang detection relies on the heartbeats, not on this ping
                     log.info("%s %s: %s", self._spec.stream, self._role, error)

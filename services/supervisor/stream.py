@@ -23,7 +23,7 @@ from services.schemas.streams import StreamView
 from services.settings import StreamSettings
 from services.supervisor.launcher import ByLauncher, Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent
-from services.supervisor.worker import ProcessSpec, assigned, gpus, remove_dead, specs_of
+from services.supervisor.worker import ProcessLimits, ProcessSpec, assigned, gpus, remove_dead, specs_of
 
 log = logging.getLogger(__name__)
 
@@ -169,16 +169,25 @@ def _withheld(engine: ProcessState) -> str | None:
 class SupervisedStreams:
     """Streams of a server by name. `running` is entered with the server."""
 
-    def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None], most: int = 16) -> None:
+    def __init__(
+        self,
+        runtime: RuntimeFolder,
+        on_event: Callable[[StreamEvent], None],
+        most: int = 16,
+        takeover_s: float = 0.0,
+    ) -> None:
         """Create the manager without streams.
 
         Args:
             runtime: runtime folder of the service.
             on_event: receives process events.
             most: limit on the number of streams, including stopped ones (`limits.streams`).
+            takeover_s: time for which processes continue after this process has died
+                (`server.takeover_s`).
         """
         self._runtime, self._on_event, self._most = runtime, on_event, most
-        self._launcher = ByLauncher(runtime)
+        self._limits = ProcessLimits(orphan_after_s=takeover_s)
+        self._launcher = ByLauncher(runtime, takeover_s)
         self._streams: dict[str, Stream] = {}
 
     @asynccontextmanager
@@ -337,7 +346,7 @@ class SupervisedStreams:
 
     def _specs(self, name: str, settings: StreamSettings) -> dict[Role, ProcessSpec]:
         try:
-            specs = specs_of(name, settings)
+            specs = specs_of(name, settings, self._limits)
         except InvalidSetting as error:
             raise Rejected(str(error)) from error
         others = [each.specs["engine"].engine for other, each in self._streams.items() if other != name]

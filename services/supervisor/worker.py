@@ -26,7 +26,7 @@ from operators.options import Option, Section, options_for
 from operators.settings import CallerCaptureOptions, CallerEngineOptions, check_stream_options
 from operators.sources.registry import check_address
 from services.bus.messages import CommandServer, Handler, Heartbeats
-from services.bus.runtime import Role, StreamFolder, read_json, write_json
+from services.bus.runtime import ProcessIdentity, Role, StreamFolder, read_json, write_json
 from services.errors import BadMessage
 from services.settings import StreamSettings
 
@@ -61,8 +61,8 @@ class _Strict(BaseModel):
 class ProcessLimits(_Strict):
     """Time limits of stream processes, in seconds."""
 
-    orphan_after_s: float = Field(default=600.0, gt=0)
-    """Time without supervisor requests after which a process ends itself."""
+    orphan_after_s: float = Field(default=0.0, ge=0)
+    """Time for which a process continues after its supervisor has died, so that the next one adopts it."""
     drain_s: float = Field(default=10.0, gt=0)
     """Time from a stop request to the kill."""
     start_s: float = Field(default=120.0, gt=0)
@@ -84,6 +84,8 @@ class ProcessSpec(_Strict):
     capture: SourceSpec | None = None
     engine: EngineSpec | None = None
     limits: ProcessLimits = ProcessLimits()
+    supervisor: dict[str, int | str] | None = None
+    """Identity of the process that wrote the file; set by `write`."""
 
     @model_validator(mode="after")
     def _for_one_role(self) -> ProcessSpec:
@@ -109,7 +111,7 @@ class ProcessSpec(_Strict):
     def write(self, folder: StreamFolder) -> Path:
         """Write the file, readable by its owner only because the address may contain a password."""
         path = folder.spec(self.role)
-        write_json(path, self._content())
+        write_json(path, {**self._content(), "supervisor": asdict(ProcessIdentity.own())})
         return path
 
     @staticmethod
@@ -253,14 +255,56 @@ log = logging.getLogger(__name__)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.25
 MEASURED_EVERY_S = 1.0
+ORPHAN_DRAIN_S = 1.25
+"""Seconds from the death of the supervisor to the end of a process that does not finish by itself."""
+
+
+class Parent:
+    """Supervising process of this process, which may be replaced by the next one.
+
+    The supervisor need not be the parent of the process, because the launcher forks it. Its identity is therefore checked
+    in place of a signal at the parent's death.
+    """
+
+    def __init__(self, identity: ProcessIdentity | None, patience_s: float) -> None:
+        """Watch a process.
+
+        Args:
+            identity: the supervisor; None for a process that is run by hand.
+            patience_s: time after the supervisor's death in which another one may take its place.
+        """
+        self.identity = identity
+        self._patience_s = patience_s
+        self._dead_since_s: float | None = None
+
+    def lost(self, now_s: float) -> bool:
+        """Return True if the supervisor has been dead for `patience_s`."""
+        if self.identity is None or self.identity.is_alive:
+            self._dead_since_s = None
+            return False
+        if self._dead_since_s is None:
+            self._dead_since_s = now_s
+        return now_s - self._dead_since_s >= self._patience_s
+
+
+def identity_of(content: Any) -> ProcessIdentity:
+    """Return the process identity in a message.
+
+    Raises:
+        BadMessage: if the content is malformed.
+    """
+    try:
+        return ProcessIdentity(int(content["pid"]), str(content["started"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadMessage(f"{content!r:.80} is no identity of a process") from error
 
 
 class Worker:
     """Context manager that runs this process in its role.
 
     `say` sets the state in the heartbeats. `stop_requested` returns True after a stop command, a
-    signal, or `orphan_after_s` without supervisor requests. A process that does not finish within
-    `drain_s` is terminated.
+    signal, or the death of the supervisor. A process that does not finish within `drain_s` is
+    terminated, and an orphan within `ORPHAN_DRAIN_S`.
 
     Raises:
         AlreadyRunning: if another process serves this role.
@@ -275,7 +319,9 @@ class Worker:
             handlers: commands in addition to `ping` and `stop`.
         """
         self.folder, self.spec, self.role = folder, spec, spec.role
-        own: dict[str, Handler] = {"ping": lambda _: {"pid": os.getpid()}, "stop": self._told_to_stop}
+        supervisor = None if spec.supervisor is None else identity_of(spec.supervisor)
+        self._parent = Parent(supervisor, spec.limits.orphan_after_s)
+        own: dict[str, Handler] = {"ping": self._pinged, "stop": self._told_to_stop}
         self._handlers = {**own, **(handlers or {})}
         self._stop = threading.Event()
         self._over = threading.Event()
@@ -353,6 +399,12 @@ class Worker:
     def _signalled(self, number: int, frame: FrameType | None) -> None:
         self.request_stop(f"it got {signal.Signals(number).name}")
 
+    def _pinged(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer with the process id. The caller is the supervisor from now on."""
+        if "supervisor" in arguments:
+            self._parent.identity = identity_of(arguments["supervisor"])
+        return {"pid": os.getpid()}
+
     def _told_to_stop(self, arguments: Mapping[str, Any]) -> None:
         self.request_stop(str(arguments.get("reason", "a stop was requested"))[:200])
 
@@ -370,15 +422,16 @@ class Worker:
         return self._measured
 
     def _look_after(self) -> None:
-        limits = self.spec.limits
+        drain_s = self.spec.limits.drain_s
         asked_s: float | None = None
         while not self._over.wait(LOOK_S):
             now_s = time.monotonic()
-            if now_s - self._commands.heard_s > limits.orphan_after_s:
-                self.request_stop(f"no supervisor has asked for anything in {limits.orphan_after_s:g} s")
+            if self._parent.lost(now_s):
+                self.request_stop("its supervisor has died")
+                drain_s = min(drain_s, ORPHAN_DRAIN_S)
             if self._stop.is_set():
                 asked_s = asked_s or now_s
-                if now_s - asked_s > limits.drain_s:
-                    log.error("not finished within %g s; ended", limits.drain_s)
+                if now_s - asked_s > drain_s:
+                    log.error("not finished within %g s; ended", drain_s)
                     self.folder.clean(self.role)
                     os._exit(1)

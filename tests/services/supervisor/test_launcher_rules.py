@@ -5,18 +5,23 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from services.bus.messages import packed_json
+from services.bus.runtime import ProcessIdentity
 from services.supervisor import launcher as launchers
 from services.supervisor.launcher import MOST_REMEMBERED, Launcher
+from services.supervisor.worker import Parent
+
+DEAD = ProcessIdentity(os.getpid(), "another boot 1")
 
 
 @pytest.fixture
 def launcher(tmp_path: Path) -> Iterator[Launcher]:
-    launcher = Launcher(tmp_path / "socket", orphan_after_s=600.0)
+    launcher = Launcher(tmp_path / "socket", Parent(None, 0.0))
     yield launcher
     launcher._listener.close()
 
@@ -59,18 +64,18 @@ def test_a_wrong_request_is_refused_and_the_launcher_goes_on(launcher: Launcher,
     assert not launcher._stopped
 
 
-def test_a_request_keeps_it_from_being_an_orphan(launcher: Launcher) -> None:
-    launcher._heard_s -= 1000.0
-    before_s = launcher._heard_s
-    asked(launcher, packed_json({"command": "ping"}))
-    assert launcher._heard_s > before_s + 999
+def test_a_ping_names_the_next_supervisor(launcher: Launcher) -> None:
+    launcher._parent.identity = DEAD
+    assert launcher._parent.lost(0.0)
+    asked(launcher, packed_json({"command": "ping", "supervisor": asdict(ProcessIdentity.own())}))
+    assert not launcher._parent.lost(1.0)
 
 
 def test_it_ends_when_it_is_told_to_is_an_orphan_or_its_socket_is_gone(tmp_path: Path) -> None:
-    stopped = Launcher(tmp_path / "stopped", 600.0)
+    stopped = Launcher(tmp_path / "stopped", Parent(None, 0.0))
     assert asked(stopped, packed_json({"command": "stop"})) == {"ok": True}
-    orphan = Launcher(tmp_path / "orphan", 0.0)
-    gone = Launcher(tmp_path / "gone", 600.0)
+    orphan = Launcher(tmp_path / "orphan", Parent(DEAD, 0.0))
+    gone = Launcher(tmp_path / "gone", Parent(None, 0.0))
     (tmp_path / "gone").unlink()
     for each in (stopped, orphan, gone):
         each.serve()  # returns
@@ -96,7 +101,7 @@ def test_the_newest_ends_are_remembered(launcher: Launcher, monkeypatch: pytest.
 
 def test_an_old_socket_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "socket").write_text("left by another")
-    launcher = Launcher(tmp_path / "socket", 600.0)
+    launcher = Launcher(tmp_path / "socket", Parent(None, 0.0))
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.connect(str(tmp_path / "socket"))
         launcher.stop()

@@ -18,11 +18,12 @@ from services.supervisor.launcher import (
     last_words,
     recorded_launcher,
 )
+from services.supervisor.worker import Parent
 
 
 @pytest.fixture
 def launcher(runtime):
-    launcher = Launcher(runtime.path / SOCKET, orphan_after_s=600.0)
+    launcher = Launcher(runtime.path / SOCKET, Parent(None, 0.0))
     serving = threading.Thread(target=launcher.serve)
     serving.start()
     yield runtime.path / SOCKET
@@ -62,13 +63,8 @@ def test_the_launcher_refuses_and_goes_on(launcher, data):
     assert asked(launcher, b'{"command": "ping"}') == {"ok": True}
 
 
-def test_a_launcher_that_nobody_asks_ends(runtime):
-    Launcher(runtime.path / SOCKET, orphan_after_s=0.1).serve()
-    assert not (runtime.path / SOCKET).exists()
-
-
 def test_a_launcher_whose_socket_was_removed_ends(runtime):
-    launcher = Launcher(runtime.path / SOCKET, orphan_after_s=600.0)
+    launcher = Launcher(runtime.path / SOCKET, Parent(None, 0.0))
     (runtime.path / SOCKET).unlink()
     launcher.serve()
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import stat
+from dataclasses import asdict
 
 import pytest
 from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.runtime import write_json
+from services.bus.runtime import ProcessIdentity, write_json
 from services.supervisor.worker import EngineSpec, ProcessLimits, ProcessSpec, SourceSpec, assigned
 
 
@@ -21,7 +22,8 @@ def test_a_process_reads_its_specification(runtime):
     path = wanted.write(runtime.stream("a"))
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     read = ProcessSpec.read(path, "engine")
-    assert (read, read.digest, read.role) == (wanted, wanted.digest, "engine")
+    assert (read.engine, read.digest, read.role) == (wanted.engine, wanted.digest, "engine")
+    assert read.supervisor == asdict(ProcessIdentity.own())
 
 
 def test_the_digest_changes_with_the_settings():

@@ -128,14 +128,32 @@ def test_an_address_that_cannot_work_is_said_and_tried_seldom(runtime):
     asyncio.run(scenario())
 
 
-def test_a_process_that_nobody_looks_after_ends(runtime):
-    folder = runtime.stream("a")
-    path = spec(orphan_after_s=1.0).write(folder)
-    command = [sys.executable, "-m", "services.supervisor.capture", "--spec", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=SOON_S)
-    assert done.returncode == 0, done.stderr
-    assert "no supervisor" in done.stderr
-    assert sorted(file.name for file in folder.path.iterdir()) == ["capture.lock", "capture.spec"]
+DYING = """
+import os, subprocess, sys, time
+from pathlib import Path
+from services.bus.runtime import ProcessIdentity, RuntimeFolder
+from services.supervisor.worker import ProcessSpec, SourceSpec
+
+folder = RuntimeFolder(Path(sys.argv[1])).stream("a")
+path = ProcessSpec(stream="a", capture=SourceSpec(address=sys.argv[2])).write(folder)
+subprocess.Popen([sys.executable, "-m", "services.supervisor.capture", "--spec", path])
+while (record := folder.record("capture")) is None:
+    time.sleep(0.02)
+print(record.identity.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_process_ends_when_its_supervisor_is_killed(runtime):
+    command = [sys.executable, "-c", DYING, str(runtime.path), SMALL]
+    supervisor = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert supervisor.stdout is not None
+    capture = ProcessIdentity.of(int(supervisor.stdout.readline()))
+    supervisor.kill()
+    supervisor.wait()
+    supervisor.stdout.close()
+    assert capture is not None and asyncio.run(capture.ended(SOON_S))
+    assert sorted(file.name for file in (runtime.path / "a").iterdir()) == ["capture.lock", "capture.spec"]
 
 
 def test_capture_loads_no_torch(runtime):
@@ -163,15 +181,16 @@ from services.bus.runtime import RuntimeFolder
 from services.supervisor.launcher import ByLauncher
 from services.settings import StreamSettings
 from services.supervisor.stream import Stream
-from services.supervisor.worker import specs_of
+from services.supervisor.worker import ProcessLimits, specs_of
 
 async def run():
     runtime = RuntimeFolder(Path(sys.argv[1]))
-    launcher = ByLauncher(runtime)
+    launcher = ByLauncher(runtime, orphan_after_s=600.0)
     launcher.open()
     await launcher.ready.wait()
     settings = StreamSettings(source=sys.argv[2], device="cpu")
-    await Stream(settings, specs_of("a", settings), runtime, start=launcher).start()
+    specs = specs_of("a", settings, ProcessLimits(orphan_after_s=600.0))
+    await Stream(settings, specs, runtime, start=launcher).start()
     await asyncio.sleep(600)
 
 assert "torch" not in sys.modules and "cv2" not in sys.modules
@@ -188,9 +207,10 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
         folder = runtime.stream("a")
         raw, shown = Headers(folder.pictures("capture")), Headers(folder.pictures("engine"))
         events: list[StreamEvent] = []
-        launcher = ByLauncher(runtime)
+        launcher = ByLauncher(runtime, orphan_after_s=600.0)
         settings = StreamSettings(source=SMALL, device="cpu")
-        stream = Stream(settings, specs_of("a", settings), runtime, start=launcher, on_event=events.append)
+        specs = specs_of("a", settings, ProcessLimits(orphan_after_s=600.0))
+        stream = Stream(settings, specs, runtime, start=launcher, on_event=events.append)
         try:
             await until(lambda: len(shown.seen) > 3)
 

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import os
 import signal
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import pytest
 
 from services.bus.messages import ask
-from services.errors import AlreadyRunning
+from services.bus.runtime import ProcessIdentity
+from services.errors import AlreadyRunning, BadMessage
 from services.supervisor import worker as workers
-from services.supervisor.worker import MEASURED_EVERY_S, SIGNALS, ProcessLimits, ProcessSpec, SourceSpec, Worker
+from services.supervisor.worker import (
+    MEASURED_EVERY_S,
+    ORPHAN_DRAIN_S,
+    SIGNALS,
+    ProcessLimits,
+    ProcessSpec,
+    SourceSpec,
+    Worker,
+)
 
 
 @pytest.fixture
@@ -113,7 +123,7 @@ class Exited(Exception):
 
 @pytest.fixture
 def watch(monkeypatch):
-    """Run the watch thread's loop in this thread at given times; the supervisor last asked at 0 s."""
+    """Run the watch thread's loop in this thread at given times."""
 
     def run(worker: Worker, *times: float, then=lambda now_s: None) -> float | None:
         """Return the time at which the process ended itself, or None."""
@@ -130,7 +140,6 @@ def watch(monkeypatch):
             raise Exited
 
         worker._over = SimpleNamespace(wait=wait)
-        worker._commands = SimpleNamespace(heard_s=0.0)
         monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: now.s))
         monkeypatch.setattr(workers.os, "_exit", leave)
         try:
@@ -142,11 +151,33 @@ def watch(monkeypatch):
     return run
 
 
-def test_a_process_without_a_supervisor_stops(new_worker, watch):
+DEAD = ProcessIdentity(os.getpid(), "another boot 1")
+
+
+def test_an_orphan_stops_after_its_time_and_ends_itself_soon_after(new_worker, watch):
+    worker = new_worker(orphan_after_s=30.0, drain_s=10.0)
+    worker._parent.identity = DEAD
+    object.__setattr__(worker, "folder", SimpleNamespace(clean=lambda role: None))
+    assert watch(worker, 10.0, 39.0) is None and not worker.stop_requested()
+    assert watch(worker, 40.0, 40.0 + ORPHAN_DRAIN_S, 41.5) == 41.5
+    assert worker.stop_reason == "its supervisor has died"
+
+
+def test_a_process_stays_with_its_supervisor_and_with_the_next_one(new_worker, watch):
     worker = new_worker(orphan_after_s=30.0)
-    assert watch(worker, 10.0, 30.0) is None and not worker.stop_requested()
-    watch(worker, 30.5)
-    assert worker.stop_reason == "no supervisor has asked for anything in 30 s"
+    assert watch(worker, 1.0, 1e6) is None and not worker.stop_requested(), "run by hand"
+    worker._parent.identity = ProcessIdentity.own()
+    assert watch(worker, 2e6) is None and not worker.stop_requested()
+    worker._parent.identity = DEAD
+    next_one = asdict(ProcessIdentity.own())
+
+    def adopt(now_s):
+        if now_s > 3e6:
+            worker._handlers["ping"]({"supervisor": next_one})
+
+    assert watch(worker, 3e6, 3e6 + 20, 3e6 + 40, then=adopt) is None and not worker.stop_requested()
+    with pytest.raises(BadMessage, match="no identity"):
+        worker._handlers["ping"]({"supervisor": {"pid": "x"}})
 
 
 def test_a_process_that_does_not_finish_in_time_ends_itself(new_worker, watch):
