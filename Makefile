@@ -1,28 +1,28 @@
-# Each target does its own set-up and is quick when nothing changed.
+# Each target does its own set-up and takes little time if nothing changed.
 PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
 EXAMPLES ?= 200
 MUTANTS ?= 60
-# Waiting threads sleep: tests and benchmarks share the machine.
+# Idle threads sleep instead of spinning, because tests and benchmarks share the machine.
 export OMP_WAIT_POLICY ?= PASSIVE
 MODULES := $(wildcard $(sort $(shell git ls-files --cached --others --exclude-standard 'gsplat_core/*.py' 'operators/*.py' 'services/*.py')))
 CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*.cu' 'gsplat_core/*.cuh')
-# For which GPUs `make cuda` builds: `native`, the one in this machine; `portable`, all from compute capability 8.0 on; or as CMake
-# names them, 80-real;90-real.
+# Target GPUs of `make cuda`: `native` (this machine), `portable` (compute capability 8.0 and later), or a list in CMake's notation
+# (80-real;90-real).
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
 .PHONY: demo results mutants test test-all test-isa test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
 
-# On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
+# Runs on the NVIDIA GPU if torch can use one. The CUDA kernels are built first; a failed build ends the target.
 demo: native
 	$(BIN)/intrasplat synthesize --out out/recording --frames 90 --behind
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
-# The fast tests (`test`), or all of them (`test-all`: also those that are marked as slow), in two groups beside each other that take about equally
-# long. What a group says is printed when it is over.
+# Run the fast tests (`test`), or also those marked as slow (`test-all`), in two parallel groups of about equal duration. The output of a group is
+# printed when it has ended.
 PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry tests/operators tests/recipes tests/deploy
 BESIDE := --no-print-directory --jobs=2 --output-sync=target --keep-going
 test: native .venv/.development
@@ -35,8 +35,7 @@ test-all: native .venv/.development
 test-isa: native .venv/.development
 	tests/instruction_sets.sh
 
-# One thread for each of their processes: most arrays in tests are so small that more of them would mostly wait for one another. Tests of what
-# threads do ask for them.
+# One thread per process, because most arrays in tests are too small for several threads. Tests of threading set the number themselves.
 test-of-programs test-of-parts: export OMP_NUM_THREADS ?= 1
 test-of-programs test-of-parts: export OPENBLAS_NUM_THREADS ?= 1
 test-of-programs test-of-parts: export OPENCV_FOR_THREADS_NUM ?= 1
@@ -58,11 +57,11 @@ format: .venv/.development
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(CPP)
 
-# The API of a real server, called in ways that its document allows and forbids (EXAMPLES of each), by schemathesis.
+# Fuzz the API of a real server with schemathesis: EXAMPLES valid and invalid calls of each operation.
 fuzz: native .venv/.development
 	$(BIN)/python -m tests.system.api_fuzzing --examples $(EXAMPLES)
 
-# Measures this machine into benchmarks/logs/cpu; `make results` makes RESULTS.md and the figures of the README out of the logs.
+# Measure this machine into benchmarks/logs/cpu. `make results` generates RESULTS.md and the README's table from the logs.
 bench: native .venv/.development
 	$(BIN)/python benchmarks/suite.py --device cpu
 	$(BIN)/python benchmarks/publish.py
@@ -74,11 +73,11 @@ results: .venv/.development
 mutants: native .venv/.development
 	$(BIN)/python -m tests.mutants --count $(MUTANTS)
 
-# Rebuilds the C++ core where its sources changed; a no-op otherwise.
+# Rebuild the C++ core if its sources changed.
 native: .venv/.runtime
 	@$(BIN)/cmake --build build/editable -- --quiet
 
-# The CUDA kernels. The compiler is NVIDIA's from pip, in a folder of its own beside no torch, or the nvcc that CUDACXX names.
+# Build the CUDA kernels with NVIDIA's compiler from pip, in a separate folder without torch, or with the nvcc in CUDACXX.
 cuda: .venv/.runtime $(if $(strip $(CUDACXX)),,$(CUDA_TOOLKIT)/.installed)
 	@$(BIN)/cmake -S . -B build/cuda -G Ninja -DINTRASPLAT_CUDA=ON -DINTRASPLAT_INPLACE=ON \
 	  -DINTRASPLAT_CUDA_ARCHITECTURES="$(CUDA_ARCHITECTURES)" -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
@@ -90,7 +89,7 @@ $(CUDA_TOOLKIT)/.installed: requirements-cuda.lock | .venv/.runtime
 	$(BIN)/pip install --quiet --require-hashes --no-deps --target $(CUDA_TOOLKIT) -r requirements-cuda.lock
 	touch $@
 
-# The host code of both libraries with every C++ compiler of this machine; warnings are errors.
+# Compile the host code of both libraries with every C++ compiler of this machine; warnings are errors.
 compilers: .venv/.runtime
 	@.ci/compilers
 
@@ -99,12 +98,12 @@ compilers: .venv/.runtime
 	$(BIN)/pip install --quiet --require-hashes -r requirements.lock
 	touch $@
 
-# The installed package holds a list of our modules. This file has it too, and changes where one was added, moved or removed.
+# The installed package contains a list of modules. This file has the same list and changes when a module is added, moved or removed.
 build/modules.txt: always
 	@mkdir -p build
 	@printf '%s\n' $(MODULES) | cmp --quiet - $@ || printf '%s\n' $(MODULES) > $@
 
-# The build tools come first, so that the install builds against the torch that it will run with.
+# Build tools are installed first, so that the core is built against the torch that it runs with.
 .venv/.runtime: .venv/.dependencies pyproject.toml build/modules.txt
 	$(BIN)/pip install --quiet --no-build-isolation --no-deps --editable .
 	touch $@
@@ -121,7 +120,7 @@ lock: .venv/.development
 	  | $(BIN)/uv pip compile - --no-deps --universal --generate-hashes --quiet --no-emit-index-url --no-annotate \
 	    --custom-compile-command "make lock (the compiler of make cuda, installed without dependencies)" -o requirements-cuda.lock
 
-# What the images hold, as CycloneDX: name, version, digests and address of each package that the service's lock pins.
+# Write the packages of the images as CycloneDX: name, version, digests and address of each package in the service's lock.
 sbom: .venv/.development
 	@mkdir -p out
 	$(BIN)/cyclonedx-py requirements requirements-service.lock --pyproject pyproject.toml --output-reproducible --of JSON -o out/sbom.json
