@@ -90,14 +90,14 @@ class Uses:
                         self.attributes[name].append((file, node.lineno))
 
 
-def used_in_documents(root: Path) -> set[str]:
-    """Return the names in the examples and in the Python blocks of the documents."""
+def documented(root: Path) -> str:
+    """Return the text of the examples and of the Python blocks of the documents."""
     texts = [path.read_text(encoding="utf-8") for path in (root / "examples").rglob("*.py")]
     for path in [root / "README.md", *(root / "docs").rglob("*.md")]:
         texts += (
             re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL) if path.exists() else []
         )
-    return {name for text in texts for name in IDENTIFIER.findall(text)}
+    return "\n".join(texts)
 
 
 def definitions(tree: ast.Module, classes: set[str]) -> Iterator[tuple[str, Definition]]:
@@ -147,8 +147,10 @@ def unreached(product: dict[str, ast.Module], others: Uses, documents: set[str])
 
 
 def settings_fields(product: dict[str, ast.Module]) -> Iterator[tuple[str, str, str]]:
-    """Yield (place, class, field) of settings dataclasses. Options with a declaration are set by users and left out."""
+    """Yield (place, class, field) of settings dataclasses, without those of the command line."""
     for file, tree in product.items():
+        if file.startswith("services/cli"):
+            continue
         for node in nodes(tree):
             if not isinstance(node, ast.ClassDef) or not SETTINGS.search(node.name):
                 continue
@@ -179,18 +181,20 @@ def assigned(trees: dict[str, ast.Module], fields: dict[str, list[str]]) -> set[
     return found
 
 
-def unset_settings(product: dict[str, ast.Module], others: dict[str, ast.Module]) -> tuple[list[str], list[str]]:
-    """Return settings fields that nothing sets, and those that only tests and benchmarks set."""
+def unset_settings(
+    product: dict[str, ast.Module], others: dict[str, ast.Module], documents: str
+) -> tuple[list[str], list[str]]:
+    """Return settings fields that nothing sets, and those that only tests and benchmarks set. Options and documents count as setters."""
     places = list(settings_fields(product))
     fields: dict[str, list[str]] = defaultdict(list)
     for _place, kind, name in places:
         fields[kind].append(name)
     text = "\n".join(ast.unparse(tree) for file, tree in product.items() if file.endswith("operators/settings.py"))
-    options = {name for name in re.findall(r"^ +(\w+): ", text, re.MULTILINE)}
+    users = {*re.findall(r"^ +(\w+): ", text, re.MULTILINE), *re.findall(r"\b(\w+)=", documents)}
     by_product, by_others = assigned(product, fields), assigned(others, fields)
     nothing, only_tests = [], []
     for place, kind, name in places:
-        if (kind, name) not in by_product and name not in options:
+        if (kind, name) not in by_product and name not in users:
             (only_tests if (kind, name) in by_others else nothing).append(f"{place} {kind}.{name}")
     return nothing, only_tests
 
@@ -303,6 +307,7 @@ def numeric_constants(product: dict[str, ast.Module]) -> list[str]:
 def measure(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
     """Return the figures of a tree, and for those that count places the places."""
     product, others = parsed(root, PACKAGES), parsed(root, ("tests", "benchmarks"))
+    documents = documented(root)
     figures: dict[str, int] = {}
     lines = {file: (root / file).read_text(encoding="utf-8").splitlines() for file in product}
     for package in PACKAGES:
@@ -319,10 +324,10 @@ def measure(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
         "import circles with imports in functions and for types": circles(imports(product, everything=True)),
     }
     places["settings fields that nothing sets"], places["settings fields that only tests set"] = unset_settings(
-        product, others
+        product, others, documents
     )
     places["definitions that only tests use"], places["definitions that nothing uses"] = unreached(
-        product, Uses(others), used_in_documents(root)
+        product, Uses(others), set(IDENTIFIER.findall(documents))
     )
     places["protocols with fewer than two implementers"] = protocols(product)
     places["numeric module constants"] = numeric_constants(product)

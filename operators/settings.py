@@ -93,11 +93,6 @@ class ReconstructSection(Section):
     ] = 0
     eyes: Annotated[Eyes | None, Option("Pictures of a stereo scope that are trained on", null="left")] = None
 
-    @property
-    def trained_eyes(self) -> Eyes:
-        """Eyes that are trained on. The display shows the left one, and stereo depth uses both in any case."""
-        return self.eyes or "left"
-
 
 @dataclass(frozen=True, kw_only=True)
 class DepthSection(Section):

@@ -84,11 +84,6 @@ class Span:
         lowest = int(np.floor(low))
         return cls(lowest, COUNT_STEP * max(1, int(np.ceil((high - lowest + 1) / COUNT_STEP))))
 
-    @property
-    def highest(self) -> int:
-        """Largest disparity of the range, in pixels."""
-        return self.lowest + self.count - 1
-
 
 def find_disparity(left: Tensor, right: Tensor, span: Span) -> Disparity:
     """Match two rectified grey pictures.

@@ -9,18 +9,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import BaselineScore
-from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, measures, why_left_out
-from gsplat_core.scene.frames import Frame
-from gsplat_core.training.metrics import FrameQuality, ScoredMean, frame_quality, psnrs_db
+from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, measures
+from gsplat_core.training.metrics import FrameQuality, ScoredMean
 
 _FINEST_MS = 1e-3
 _RATIO = 1.01
@@ -77,25 +71,8 @@ MOST_BEHIND = 8
 """Largest lateness in frames with its own counter; later pictures are counted here too."""
 SETTLING_S = 1.0
 """Start-up time in seconds, excluded from `settled` but included in `score`."""
-NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"
+NOTHING_SHOWN = "nothing shown yet"
 _MAX_STATES = 16
-_NS_PER_MS = 1e6
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Picture that was put on the screen."""
-
-    seq: int
-    """Sequence number of the frame whose content is shown."""
-    arrived_ns: int
-    """Arrival time of that frame, in nanoseconds."""
-    shown_ns: int
-    """Display time of the picture, in nanoseconds on the clock of `arrived_ns`."""
-    image: NDArray[np.uint8] | None = None
-    """RGB [H, W, 3]; None if the picture was not kept."""
-    state: str = "live"
-    """Status label drawn on the picture: `live`, `stale`, `frozen` or `source lost`."""
 
 
 @dataclass(frozen=True)
@@ -203,92 +180,5 @@ class LiveSums:
         )
 
 
-def evaluate_live(frames: Iterable[Frame], shown: Iterable[Shown], *, record: Record | None = None) -> Live:
-    """Score the pictures on the screen against the frames that had arrived; single pass.
-
-    Args:
-        frames: every frame that arrived, in order, with `arrived_ns`, including dropped frames that
-            were never displayed. The last frame is not scored, because no next arrival is known.
-        shown: displayed pictures in display order.
-        record: callback that receives the figures of each scored frame.
-
-    Returns:
-        Quality, latency and baselines.
-
-    Raises:
-        InvalidInput: if a frame has no arrival time, or timestamps decrease.
-    """
-    sums = LiveSums(record)
-    screen = _Screen(shown, sums)
-    before: Frame | None = None
-    for frame, following in pairwise(_in_order(frames)):
-        assert following.arrived_ns is not None
-        picture = screen.at(following.arrived_ns)
-        reason = why_left_out(frame)
-        if reason is not None:
-            sums.leave_out(reason)
-        elif picture is None:
-            sums.leave_out(NOTHING_SHOWN)
-        elif picture.image is None:
-            sums.leave_out(NOT_KEPT)
-        elif picture.image.shape != frame.image.shape:
-            sums.leave_out(OTHER_SIZE)
-        else:
-            quality = frame_quality(frame.seq, picture.image, frame.image, frame.mask)
-            age_ms = (following.arrived_ns - picture.arrived_ns) / _NS_PER_MS
-            sums.frame(quality, frame.time_s, frame.seq - picture.seq, age_ms, _copy_db(before, frame))
-        before = frame
-    screen.rest()
-    return sums.live
-
-
-def _copy_db(before: Frame | None, frame: Frame) -> tuple[float, float]:
-    if before is None or before.image.shape != frame.image.shape:
-        return math.nan, math.nan
-    return psnrs_db(before.image, frame.image, frame.mask)
-
-
 def _baseline(means: tuple[ScoredMean, ScoredMean]) -> BaselineScore:
     return BaselineScore(means[0].mean, means[1].mean, means[0].count)
-
-
-class _Screen:
-    """Cursor over the displayed pictures that returns the visible one at increasing times."""
-
-    def __init__(self, shown: Iterable[Shown], sums: LiveSums) -> None:
-        self._coming = iter(shown)
-        self._next: Shown | None = next(self._coming, None)
-        self._now: Shown | None = None
-        self._sums = sums
-
-    def at(self, moment_ns: int) -> Shown | None:
-        """Return the last picture displayed before a time in nanoseconds."""
-        while self._next is not None and self._next.shown_ns < moment_ns:
-            self._take()
-        return self._now
-
-    def rest(self) -> None:
-        """Count the pictures displayed after the last frame arrived."""
-        while self._next is not None:
-            self._take()
-
-    def _take(self) -> None:
-        picture, before = self._next, self._now
-        assert picture is not None
-        if before is not None and picture.shown_ns < before.shown_ns:
-            raise InvalidInput(
-                f"the picture of frame {picture.seq} was shown before that of frame {before.seq}, which came first; give them in order"
-            )
-        self._sums.picture((picture.shown_ns - picture.arrived_ns) / _NS_PER_MS, picture.state)
-        self._now, self._next = picture, next(self._coming, None)
-
-
-def _in_order(frames: Iterable[Frame]) -> Iterator[Frame]:
-    before: Frame | None = None
-    for frame in frames:
-        if frame.arrived_ns is None:
-            raise InvalidInput(f"frame {frame.seq} has no time of arrival; the live protocol needs one for every frame")
-        if before is not None and before.arrived_ns is not None and frame.arrived_ns < before.arrived_ns:
-            raise InvalidInput(f"frame {frame.seq} arrived before frame {before.seq}; give the frames in order")
-        yield frame
-        before = frame

@@ -131,11 +131,6 @@ class SmallPicture:
         return np.asarray(total / (least if values.ndim == 2 else least[..., None])), share
 
 
-def shading_of(frame: Frame) -> Shading:
-    """Compute the shading of a frame's tissue."""
-    return shading_in(SmallPicture.of(frame))
-
-
 def shading_in(picture: SmallPicture) -> Shading:
     """Compute the shading of a reduced picture."""
     cells, share = picture.averaged(_LOG_LIGHT[picture.levels], picture.usable)

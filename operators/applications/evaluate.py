@@ -74,8 +74,6 @@ class EvaluationSettings:
     """Optimiser steps per frame in the causal protocol; None for the run's."""
     motion_prior: str | None = None
     """Motion prior of the causal protocol, a name in `MOTION_PRIORS`; None for the default."""
-    last_s: float = LAST_S
-    """Duration at the end of the stream that the retention protocol renders, in seconds."""
     places: tuple[Visits, ...] | None = None
     """Visits to places for the retention protocol; None detects them from the poses."""
     poses: Path | None = None
@@ -94,8 +92,6 @@ class EvaluationSettings:
         if self.steps_per_frame is not None:
             check_option("steps_per_frame", self.steps_per_frame)
         check_option("max_frames", self.max_frames)
-        if not 0 < self.last_s < 1e6:
-            raise InvalidSetting(f"last_s is {self.last_s:g}; it must be positive")
 
 
 @dataclass(frozen=True)
@@ -311,13 +307,12 @@ class _Work:
         end_s = self.model.time_window_s[1]
         if math.isinf(self.playback.round_s):
             end_s = min(end_s, self.playback.last_s)
-        from_s = min([end_s - self.settings.last_s, *(place.first[0] for place in places)])
+        from_s = min([end_s - LAST_S, *(place.first[0] for place in places)])
         with self._log("retention") as record:
             return evaluate_retention(
                 self._frames("retention", from_s),
                 self._of_final_model(),
                 window_s=(self.model.time_window_s[0], end_s),
-                last_s=self.settings.last_s,
                 places=places,
                 record=record,
             )

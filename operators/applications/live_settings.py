@@ -86,8 +86,6 @@ class LiveSettings(LiveOptions):
     """
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     """Display deadlines and step limits; `budget_ms` has precedence over its own."""
-    training: LiveTraining | None = None
-    """Training parameters; None: device default."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,8 +112,8 @@ class LiveSettings(LiveOptions):
 
     @property
     def chosen_training(self) -> LiveTraining:
-        """Training parameters, by default those of the device."""
-        return self.training or LIVE_TRAINING[self.device]
+        """Training parameters of the device."""
+        return LIVE_TRAINING[self.device]
 
     @property
     def inputs(self) -> tuple[Path, ...]:

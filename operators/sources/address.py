@@ -201,7 +201,6 @@ FORMATS = (
 `PROTOCOLS`.
 """
 _LABEL = re.compile(r"(?![-])[\w-]{1,63}(?<!-)")
-_SECRET = re.compile(r"(?<=://)[^/@\s'\"]*@")
 
 
 @dataclass(frozen=True)
@@ -283,11 +282,6 @@ def _is_host(host: str) -> bool:
     labels = host.removesuffix(".").split(".")
     # A host that ends in a number must be an IPv4 address, which was rejected above.
     return len(host) <= 253 and not labels[-1].isdigit() and all(_LABEL.fullmatch(label) for label in labels)
-
-
-def without_secrets(text: str) -> str:
-    """Return the text with user and password removed from all addresses."""
-    return _SECRET.sub("", text)
 
 
 LEAST_FPS = 0.01

@@ -126,12 +126,6 @@ class ProcessRecord:
     """Digest of the specification in use."""
 
 
-def default_runtime_folder() -> Path:
-    """Return the system's default runtime folder for this user."""
-    own = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(own) / "intrasplat" if own else Path(f"/tmp/intrasplat-{os.geteuid()}")
-
-
 class RuntimeFolder:
     """Runtime folder of one service.
 

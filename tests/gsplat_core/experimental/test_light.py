@@ -12,7 +12,7 @@ from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.experimental import light
 from gsplat_core.experimental.light import FLAT, UNSEEN, LightDepth
 from gsplat_core.experimental.relief import Grid, Places
-from gsplat_core.experimental.shading import shading_of
+from gsplat_core.experimental.shading import SmallPicture, shading_in
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
@@ -82,8 +82,8 @@ def test_vessels_and_pale_tissue_do_not_hide_a_relief():
 
 def test_the_mixture_of_channels_leaves_the_light_and_not_the_pigment():
     pigment = np.exp(-np.maximum(noise(3, 4), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
-    mixed = shading_of(Frame(0, 0, picture(plane(), PINK * pigment)))
-    red = shading_of(Frame(0, 0, np.repeat(picture(plane(), PINK * pigment)[..., :1], 3, axis=2)))
+    mixed = shading_in(SmallPicture.of(Frame(0, 0, picture(plane(), PINK * pigment))))
+    red = shading_in(SmallPicture.of(Frame(0, 0, np.repeat(picture(plane(), PINK * pigment)[..., :1], 3, axis=2))))
     assert mixed.detail < 0.5 * red.detail
 
 

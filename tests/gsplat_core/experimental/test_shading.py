@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsplat_core.experimental.shading import shading_of
+from gsplat_core.experimental.shading import SmallPicture, shading_in
 from gsplat_core.scene.frames import Frame
 
 
@@ -17,7 +17,7 @@ def test_glints_are_counted_where_they_are_and_nowhere_else() -> None:
         for y in range(20, 240, 16):
             cv2.circle(dots, (x, y), 2, 1, -1)
     image[dots > 0] = 255
-    found = shading_of(Frame(0, 0, image))
+    found = shading_in(SmallPicture.of(Frame(0, 0, image)))
     left, right = found.glints[:, :19], found.glints[:, 21:]
     assert right.max() == 0
     assert 0.7 < left.sum() * 64 / np.count_nonzero(dots) < 1.3, "cells are 8 pixels wide"

@@ -16,7 +16,6 @@ from operators.applications.evaluate import EvaluationSettings
         ("scale", [None, 64.0], [0.0, 64.1]),
         ("steps_per_frame", [None, 1], [0]),
         ("max_frames", [None, 1], [0]),
-        ("last_s", [1e-9, 999_999.0], [0.0, -1.0, 1e6]),
     ],
 )
 def test_settings_of_an_evaluation_have_ranges(name, possible, impossible):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from services.bus.runtime import ProcessIdentity, RuntimeFolder, default_runtime_folder, write_json
+from services.bus.runtime import ProcessIdentity, RuntimeFolder, write_json
 from services.errors import AlreadyRunning, RuntimeFolderUnusable
 
 
@@ -57,13 +57,6 @@ def test_somebody_elses_folder_is_refused(runtime):
 def test_a_path_too_long_for_a_socket_is_refused(runtime):
     with pytest.raises(RuntimeFolderUnusable, match="bytes"):
         runtime.stream("x" * 80)
-
-
-def test_the_default_folder_is_the_users_own(monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/7")
-    assert default_runtime_folder() == Path("/run/user/7/intrasplat")
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    assert str(os.geteuid()) in default_runtime_folder().name
 
 
 def test_the_record_of_a_running_process_is_kept(runtime):

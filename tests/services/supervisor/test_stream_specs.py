@@ -139,6 +139,6 @@ def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_pa
     settings = live_settings(asked, tmp_path, "a source")
     assert (settings.depth, settings.eyes, settings.poses) == ("stereo", "both", "estimated")
     usual = live_settings(engine_of(), tmp_path, "a source")
-    assert (usual.depth, usual.trained_eyes, usual.poses) == ("auto", "left", "given")
+    assert (usual.depth, usual.eyes, usual.poses) == ("auto", None, "given")
     with pytest.raises(InvalidSetting, match="eyes"):
         engine_of(eyes="right")
