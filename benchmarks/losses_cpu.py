@@ -19,7 +19,7 @@ from gsplat_core.ops.image_loss.image_loss import image_loss
 from gsplat_core.ops.native import instruction_set
 from gsplat_core.ops.ssim.ssim import ssim_map
 from gsplat_core.reference.image_loss import image_loss as reference_image_loss
-from gsplat_core.training.optimiser import FusedAdam
+from gsplat_core.training.steps.optimiser import FusedAdam
 
 WIDTH_PX, HEIGHT_PX, GAUSSIANS = 640, 512, 50_000
 ROWS = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (16, 3)}

@@ -29,11 +29,11 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.optimiser import FusedAdam
-from gsplat_core.training.photometric import LossWeights, loss_and_gradients
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.optimiser import FusedAdam
+from gsplat_core.training.steps.photometric import LossWeights, loss_and_gradients
+from gsplat_core.training.steps.step import TrainingStep
 
 WINDOW_S = (0.0, 6.0)
 FOCAL_PX = 560.0

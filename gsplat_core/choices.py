@@ -6,6 +6,7 @@ from here. A new implementation is a module and one line in this file.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsplat_core.registry import Registry
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from gsplat_core.deformation.registry import FieldKind
     from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.renderer import RendererKind
+    from gsplat_core.training.config import ReconstructorConfig
+    from gsplat_core.training.motion.prior import MotionPrior
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
@@ -47,6 +50,16 @@ DEPTHS: Registry[type[Estimator]] = Registry(
 """Depth estimators by name. The constructor takes an address if the name is in `DEPTHS_WITH_ADDRESS`."""
 DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
 """Names that are followed by a colon and an address, with an example of the syntax."""
+
+MOTION_PRIORS: Registry[Callable[[ReconstructorConfig], MotionPrior | None]] = Registry(
+    "motion prior",
+    {
+        "bumps": "gsplat_core.training.motion.prior:no_prior",
+        "flow": "gsplat_core.training.motion.prior:FlowPrior",
+        "learned": "gsplat_core.experimental.learned_prior:LearnedPrior",
+    },
+)
+"""Motion priors by name: factories that take a `ReconstructorConfig`. `bumps` uses no prior, only the field's own extrapolation."""
 
 Eyes = Literal["left", "both"]
 """Eyes of a stereo scope whose pictures are trained on."""

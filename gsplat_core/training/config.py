@@ -7,13 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import get_args
 
-from gsplat_core.choices import FIELDS, Eyes
+from gsplat_core.choices import FIELDS, MOTION_PRIORS, Eyes
 from gsplat_core.deformation.registry import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.image_motion import Detail
-from gsplat_core.training.motion_priors import MOTION_PRIORS
+from gsplat_core.training.motion.image_motion import Detail
 
 
 def check_eyes(eyes: str) -> None:

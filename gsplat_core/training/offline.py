@@ -18,9 +18,9 @@ from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.registration import EXACT_KD_TREE
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.densification import UNSEEN_PX, densify, on_tissue, shares_of
+from gsplat_core.training.growth.densification import UNSEEN_PX, densify, on_tissue, shares_of
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy, tensor_of
 
 NEIGHBOURS = 8

@@ -32,12 +32,11 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, Gaussians
-from gsplat_core.training.growth import UNCOVERED_ALPHA
-from gsplat_core.training.hole_filling import filled
-from gsplat_core.training.image_motion import NEAREST, Seen, beside
-from gsplat_core.training.initialisation import tissue_depth
+from gsplat_core.training.growth.covering import UNCOVERED_ALPHA
+from gsplat_core.training.growth.initialisation import filled, tissue_depth
+from gsplat_core.training.motion.image_motion import NEAREST, Seen, beside
 from gsplat_core.training.observations import Observation, known_depth, learned_depth
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 MOST_LATE = 30

@@ -14,7 +14,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 
 MOST_PLACES = 8
 """Largest number of kept places; the one left first is dropped."""

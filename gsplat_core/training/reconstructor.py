@@ -20,18 +20,18 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth import Covering
-from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.motion_prior import Following, continued, newest_state
+from gsplat_core.training.growth.covering import Covering
+from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.growth.start_on_device import StartOnDevice
+from gsplat_core.training.motion.prior import Following, continued, newest_state
+from gsplat_core.training.motion.surface_tracks import SurfaceTracks
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.offline import OfflineTraining, to_fit
 from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
 from gsplat_core.training.places import LeftScenes
 from gsplat_core.training.right_eye import BothEyes, for_eyes
 from gsplat_core.training.schedule import LiveTraining, NewestFirstSchedule, Schedule, WindowSchedule
-from gsplat_core.training.start_on_device import StartOnDevice
-from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_tracks import SurfaceTracks
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.upkeep import PostponedGrowth
 from gsplat_core.transfers import HostCopy
 

@@ -25,9 +25,9 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.initialisation import unprojected
+from gsplat_core.training.growth.initialisation import unprojected
+from gsplat_core.training.growth.unseen import pixels_of
 from gsplat_core.training.observations import Observation, RightEye, scene_colours
-from gsplat_core.training.unseen import pixels_of
 from gsplat_core.transfers import tensor_of
 
 LOOKED_AT_PX = 80

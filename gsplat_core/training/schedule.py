@@ -14,10 +14,10 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.budget import Budget, ObserveReport, Spending, StepsInFlight
-from gsplat_core.training.colour_correction import MOST_RELAXATION, check_colours
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.colour_correction import MOST_RELAXATION, check_colours
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
 JUMP_RATIO = 1.8

@@ -12,6 +12,7 @@ from time import perf_counter
 
 import numpy as np
 
+from gsplat_core.choices import MOTION_PRIORS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import AGES, Baselines, measure_baselines
 from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
@@ -39,7 +40,6 @@ from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
-from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s

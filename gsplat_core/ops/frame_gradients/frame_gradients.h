@@ -7,7 +7,7 @@ namespace gsplat::frame {
 
 constexpr int kTensors = 5;  // of the Gaussians: means, quats, log-scales, logit opacities, spherical harmonics
 
-// Colours corrected by what the picture is off by, in place of a gradient (gsplat_core/training/colour_correction.py); null: they
+// Colours corrected by what the picture is off by, in place of a gradient (gsplat_core/training/steps/colour_correction.py); null: they
 // have a gradient.
 struct ColourCorrection {
   const float* residuals;   // [H, W, 4]: tissue (1, else 0) times picture wanted - picture shown; tissue

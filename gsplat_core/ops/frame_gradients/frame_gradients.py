@@ -58,7 +58,7 @@ class GaussianAdam(NamedTuple):
 class ColourCorrection(NamedTuple):
     """Colour update from image residuals in place of a gradient.
 
-    See `gsplat_core.training.colour_correction`.
+    See `gsplat_core.training.steps.colour_correction`.
     """
 
     residuals: Tensor

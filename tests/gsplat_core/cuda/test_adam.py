@@ -6,7 +6,7 @@ import torch
 from gsplat_core import InvalidInput
 from gsplat_core.ops.adam.adam import adam_step, adam_step_at_
 from gsplat_core.reference.adam import adam_step as reference_adam_step
-from gsplat_core.training.optimiser import FusedAdam
+from gsplat_core.training.steps.optimiser import FusedAdam
 
 pytestmark = pytest.mark.cuda
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, render
-from gsplat_core.training.fused_step import FusedStep
 from gsplat_core.training.observations import Observation, RightEye
-from gsplat_core.training.optimiser import FusedAdam
-from gsplat_core.training.photometric import LossWeights
+from gsplat_core.training.steps.fused_step import FusedStep
+from gsplat_core.training.steps.optimiser import FusedAdam
+from gsplat_core.training.steps.photometric import LossWeights
 
 pytestmark = pytest.mark.cuda
 
@@ -67,7 +67,7 @@ def train(
 @pytest.mark.parametrize("weights", [LossWeights(squared=True), LossWeights(ssim=0.2, depth=0.5)])
 def test_colours_are_corrected_as_on_the_cpu(make_gaussians, observation, weights):
     """Correct colours by the residual for every loss; the other gradients follow the loss."""
-    from gsplat_core.training.photometric import loss_and_gradients
+    from gsplat_core.training.steps.photometric import loss_and_gradients
 
     seen = dataclasses.replace(observation, depth=None)
     start = make_gaussians(800, sh_degree=0)
@@ -129,7 +129,7 @@ def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
 def test_the_right_eye_trains_its_own_colours_as_on_the_cpu(make_gaussians, observation, relaxation):
     """Several steps of both eyes by turns, whose pictures differ in colour: the same as without a captured graph."""
-    from gsplat_core.training.photometric import loss_and_gradients, with_eye
+    from gsplat_core.training.steps.photometric import loss_and_gradients, with_eye
 
     left = dataclasses.replace(observation, depth=None)
     right = dataclasses.replace(left, image=255 - left.image, of_right=True)
@@ -156,7 +156,7 @@ def test_the_right_eye_trains_its_own_colours_as_on_the_cpu(make_gaussians, obse
 
 def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observation):
     """Pose and intrinsics of each observation are those that its step renders with: the same as two eyes trained on the CPU."""
-    from gsplat_core.training.photometric import loss_and_gradients
+    from gsplat_core.training.steps.photometric import loss_and_gradients
 
     left = dataclasses.replace(observation, depth=None)
     eye = left.camera.right_eye(0.3)
@@ -184,7 +184,7 @@ def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observati
 
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5), LossWeights(squared=True)])
 def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
-    from gsplat_core.training.photometric import loss_and_gradients
+    from gsplat_core.training.steps.photometric import loss_and_gradients
 
     start = make_gaussians(800, sh_degree=1)
     gaussians = start.clone().to("cuda")

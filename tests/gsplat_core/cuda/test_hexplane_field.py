@@ -7,7 +7,7 @@ from gsplat_core.deformation import HexPlaneField
 from gsplat_core.deformation.hexplane import PLANE_NAMES, HexPlaneTraining
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.optimiser import FusedAdam
+from gsplat_core.training.steps.optimiser import FusedAdam
 
 pytestmark = pytest.mark.cuda
 

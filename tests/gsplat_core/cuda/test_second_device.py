@@ -13,7 +13,7 @@ from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
 from gsplat_core.rendering.frame_renderer import FrameRenderer
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 
 pytestmark = [
     pytest.mark.cuda,

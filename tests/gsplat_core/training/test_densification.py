@@ -10,10 +10,10 @@ from gsplat_core.deformation import BasisField
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.densification import UNSEEN_PX, Shares, densify, halves, shares_of
-from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.growth.densification import UNSEEN_PX, Shares, densify, halves, shares_of
+from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 
 
 @pytest.fixture(params=[False, True], ids=["exact", "preallocated"])

@@ -11,9 +11,9 @@ from gsplat_core.deformation import BasisField
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.image_motion import Seen, SurfaceMotion
-from gsplat_core.training.motion_prior import DepthFromMotion
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.motion.image_motion import Seen, SurfaceMotion
+from gsplat_core.training.motion.prior import DepthFromMotion
+from gsplat_core.training.steps.step import TrainingStep
 
 WIDTH, HEIGHT = 160, 128
 FIRST = Camera.from_focal(140.0, WIDTH, HEIGHT)

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training.initialisation import facing, gaussians_from_frame, tissue_colours, tissue_depth
+from gsplat_core.training.growth.initialisation import facing, gaussians_from_frame, tissue_colours, tissue_depth
 from gsplat_core.training.metrics import psnr_frame_db
 
 TURNED = np.array([[0.0, 0, 1, 5], [0, 1, 0, -3], [-1, 0, 0, 80], [0, 0, 0, 1]])

@@ -15,7 +15,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 
 WIDTH, HEIGHT = 48, 40
 CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)

@@ -15,7 +15,7 @@ from gsplat_core.training import offline
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, nearest_others
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 
 CONFIG = ReconstructorConfig(field="basis", gaussians=300, max_gaussians=500, squared_error=True)
 

@@ -14,11 +14,11 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import RowMoves
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.growth.unseen import Archive, LastSeen, pixels_of
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
-from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
 
 WIDTH, HEIGHT = 48, 40
 FOCAL = 50.0

@@ -10,7 +10,7 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.photometric import LossWeights, loss_and_gradients
+from gsplat_core.training.steps.photometric import LossWeights, loss_and_gradients
 
 WIDTH_PX, HEIGHT_PX = 53, 37
 MOVED = np.array(

@@ -11,7 +11,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.places import MOST_PLACES, Places, likeness_of
 from gsplat_core.training.reconstructor import Reconstructor

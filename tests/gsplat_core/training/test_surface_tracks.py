@@ -15,12 +15,12 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.image_motion import Seen
-from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.motion.image_motion import Seen
+from gsplat_core.training.motion.surface_tracks import SurfaceDepth, SurfaceTracks, between_known, steady_course
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_tracks import SurfaceDepth, SurfaceTracks, between_known, steady_course
+from gsplat_core.training.steps.step import TrainingStep
 
 FRAMES, FPS = 12, 8.0
 ASKED = RenderSettings(FRAMES, 192, 160, FPS, seed=1)

@@ -16,11 +16,11 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth import gaussians_beside, grid_of, grid_spacing, uncovered_pixels
-from gsplat_core.training.initialisation import unprojected
+from gsplat_core.training.growth.covering import gaussians_beside, grid_of, grid_spacing, uncovered_pixels
+from gsplat_core.training.growth.initialisation import unprojected
+from gsplat_core.training.growth.unseen import Archive, LastSeen, around_cells, pixels_of, value_at
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.unseen import Archive, LastSeen, around_cells, pixels_of, value_at
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy, tensor_of
 
 SEE_EVERY = 8

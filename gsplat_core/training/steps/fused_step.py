@@ -24,10 +24,10 @@ from gsplat_core.rendering.frame_renderer import (
 )
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import COLOUR, Gaussians
-from gsplat_core.training.colour_correction import ResidualTarget
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.optimiser import FusedAdam
-from gsplat_core.training.photometric import LEFT, RIGHT, LossWeights
+from gsplat_core.training.steps.colour_correction import ResidualTarget
+from gsplat_core.training.steps.optimiser import FusedAdam
+from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights
 from gsplat_core.transfers import copy_each
 
 

@@ -21,10 +21,10 @@ from torch import Tensor
 from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
-from gsplat_core.training.motion_prior import followed
+from gsplat_core.training.motion.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
+from gsplat_core.training.motion.prior import followed
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 EDGE_PX = 1

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.training.image_motion import Seen
+from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 
 UNSEEN_PX = 0.5
 """Sum of blending weights in every picture, in pixels, below which a Gaussian counts as invisible.

@@ -24,8 +24,8 @@ from gsplat_core.rendering.pipeline import Geometry, RenderedSplats, StepOperati
 from gsplat_core.rendering.settings import EPS2D, RenderSettings
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.training.colour_correction import colour_correction
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.steps.colour_correction import colour_correction
 
 LEFT, RIGHT = "sh", "right_sh"
 """Tensor names in `Gaussians`. The right eye sees the sum of both."""

@@ -14,11 +14,11 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.fused_step import FusedStep
+from gsplat_core.training.growth.unseen import depth_of
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.optimiser import FusedAdam
-from gsplat_core.training.photometric import LEFT, RIGHT, LossWeights, loss_and_gradients, with_eye
-from gsplat_core.training.unseen import depth_of
+from gsplat_core.training.steps.fused_step import FusedStep
+from gsplat_core.training.steps.optimiser import FusedAdam
+from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, loss_and_gradients, with_eye
 
 
 class AutogradTraining:

@@ -17,19 +17,19 @@ from torch.nn.functional import max_pool2d, pad
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.training.hole_filling import filled
-from gsplat_core.training.image_motion import beside
-from gsplat_core.training.initialisation import (
+from gsplat_core.training.growth.initialisation import (
     FIRST_OPACITY,
     SIGMA_IN_SPACINGS,
     THICKNESS,
     TOOL_MARGIN_PX,
     blur_sigma_px,
     facing,
+    filled,
     jittered_grid,
     tissue_depth,
     unprojected,
 )
+from gsplat_core.training.motion.image_motion import beside
 from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import tensor_of
 

@@ -21,9 +21,9 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.snapshots import SnapshotSlots
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
+from gsplat_core.training.growth.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
 UNCOVERED_ALPHA = 0.5
