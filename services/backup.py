@@ -11,6 +11,7 @@ BACKUP/
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
@@ -18,6 +19,7 @@ import shutil
 import sqlite3
 import stat
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -38,6 +40,8 @@ from services.version import product_version
 
 MANIFEST = "backup.json"
 DATA = "data"
+STAGE = ".restore-"
+"""Name prefix of the folder in a target that holds the files of a running restore, and marks an unfinished one."""
 FORMAT = 1
 TRIES = 5
 """Attempts to copy data that a running service may change meanwhile."""
@@ -157,6 +161,8 @@ def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
     backup = check_backup(folder)
     places = Places.of(settings)
     moves = _moves(places, folder / DATA)
+    for _, target in moves:
+        _remove_dead_stage(target)
     for target in dict.fromkeys(target for _, target in moves):
         if _is_within(target, folder) or _is_within(folder, target):
             raise BackupFailed(f"{target} and the backup {folder} lie in each other; restore from elsewhere")
@@ -165,20 +171,65 @@ def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
                 f"{target} is not empty, and a backup replaces nothing; move what is there away, or give another --data"
             )
     _require_space(places.data, backup.size_bytes)
-    try:
-        _, files = _manifest(folder)
-        apart = {source.name for source, _ in moves} - {DATA}
-        staged = [(_stage(source, target, files, apart), target) for source, target in moves]
-        for stage_, target in staged:
-            for each in sorted(stage_.iterdir()):
-                os.rename(each, target / each.name)
-            stage_.rmdir()
-            sync_folder(target)
-    except OSError as error:
-        raise BackupFailed(
-            f"the backup was not restored as a whole: {error}; empty the folders and try again"
-        ) from error
+    _, files = _manifest(folder)
+    apart = {source.name for source, _ in moves} - {DATA}
+    with ExitStack() as stages:
+        try:
+            staged = [(stages.enter_context(_stage(source, target, files, apart)), target) for source, target in moves]
+        except OSError as error:
+            raise BackupFailed(f"the backup was not restored: {error}; nothing is left of it, try again") from error
+        try:
+            for stage_, target in staged:
+                for each in sorted(stage_.iterdir()):
+                    os.rename(each, target / each.name)
+            for _, target in staged:
+                sync_folder(target)
+        except OSError as error:
+            stages.pop_all()  # they mark the folders as incomplete
+            raise BackupFailed(
+                f"the backup was not restored as a whole: {error}; empty the folders and try again"
+            ) from error
     return backup
+
+
+def refuse_unfinished_restore(settings: ServiceSettings) -> None:
+    """Check that no restore into the folders of a service was stopped before its end.
+
+    Raises:
+        BackupFailed: if one was, or if it still runs.
+    """
+    places = Places.of(settings)
+    for target in (places.data, places.recordings, places.replays):
+        for stage_ in _stages(target):
+            raise BackupFailed(
+                f"{target} is incomplete: a restore into it has not ended ({stage_.name}); if none runs, empty the folder and"
+                " restore the backup again"
+            )
+
+
+def _stages(target: Path) -> list[Path]:
+    return sorted(path for path in target.glob(f"{STAGE}*") if path.is_dir() and not path.is_symlink())
+
+
+def _remove_dead_stage(target: Path) -> None:
+    """Remove the staging folder of a killed restore that had not moved anything into place yet.
+
+    Raises:
+        BackupFailed: if the restore runs, or had moved a part of the backup.
+    """
+    for stage_ in _stages(target):
+        held = os.open(stage_, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if any(path not in _stages(target) for path in target.iterdir()):
+                raise BackupFailed(
+                    f"{target} is incomplete: a restore into it was stopped before its end; empty the folder and try again"
+                )
+            shutil.rmtree(stage_)
+        except BlockingIOError:
+            raise BackupFailed(f"another restore into {target} runs; wait for its end") from None
+        finally:
+            os.close(held)
 
 
 def _fill(places: Places, folder: Path) -> Backup:
@@ -334,20 +385,29 @@ def _moves(places: Places, data: Path) -> list[tuple[Path, Path]]:
     return [*apart, (data, places.data)]
 
 
-def _stage(source: Path, target: Path, files: dict[str, tuple[int, str]], apart: set[str]) -> Path:
+@contextmanager
+def _stage(source: Path, target: Path, files: dict[str, tuple[int, str]], apart: set[str]) -> Iterator[Path]:
     """Copy a folder of the backup into a new staging folder in its target, verifying each digest.
-    `apart` names folders with a target of their own."""
+
+    The staging folder is locked while the block runs, and removed at its end. `apart` names folders with a target of
+    their own."""
     target.mkdir(mode=0o700, parents=True, exist_ok=True)
-    stage_ = target / f".restore-{os.getpid()}"
+    stage_ = target / f"{STAGE}{os.getpid()}"
     stage_.mkdir(mode=0o700)
+    held = os.open(stage_, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     within = PurePosixPath(DATA) if source.name == DATA else PurePosixPath(DATA, source.name)
-    for path in _walk(source):
-        relative = path.relative_to(source)
-        if source.name == DATA and relative.parts[0] in apart:
-            continue
-        if _copy(path, stage_ / relative) != files[(within / relative.as_posix()).as_posix()][1]:
-            raise BackupFailed(f"{path} changed while it was read; nothing was restored, empty {target}")
-    return stage_
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        for path in _walk(source):
+            relative = path.relative_to(source)
+            if source.name == DATA and relative.parts[0] in apart:
+                continue
+            if _copy(path, stage_ / relative) != files[(within / relative.as_posix()).as_posix()][1]:
+                raise BackupFailed(f"{path} changed while it was read; nothing was restored, try again")
+        yield stage_
+    finally:
+        os.close(held)
+        shutil.rmtree(stage_, ignore_errors=True)
 
 
 def _manifest(folder: Path) -> tuple[dict[str, Any], dict[str, tuple[int, str]]]:

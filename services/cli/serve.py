@@ -21,7 +21,7 @@ from services.api.service import bind_probe
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verify
 from services.auth.keys import ApiKey, KeyConflict, KeyStore, append_key_change
 from services.auth.roles import Role
-from services.backup import Backup, check_backup, make_backup, restore_backup
+from services.backup import Backup, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.terminal import KEY_COLUMNS, printable, table
 from services.private_files import keep_files_private, make_state_private
@@ -39,6 +39,7 @@ def serve_command(
     settings = load_settings(config, {**_assigned(setting), **flags})
     log_to_stderr(settings.log)
     listener = bind(settings)  # before anything is created or started
+    refuse_unfinished_restore(settings)
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     parts = assembled(settings)
     certificate = certificate_of(settings, parts.events)

@@ -7,7 +7,8 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,11 +66,16 @@ class Batch:
     def __init__(self, folder: Path, out: Path, options: JobOptions) -> None:
         recordings, self.unusable = recordings_in(folder)
         _check_out(out, folder)
-        self._results = Results(out.absolute())
-        self._store = JobStore(f"sqlite:///{(out / DATABASE).absolute()}")
-        self._options = options.chosen()
-        self._submit(recordings)
-        self.already = self._store.counts()["done"]
+        with _removed_on_failure(out):
+            self._results = Results(out.absolute())
+            self._store = JobStore(f"sqlite:///{(out / DATABASE).absolute()}")
+            try:
+                self._options = options.chosen()
+                self._submit(recordings)
+                self.already = self._store.counts()["done"]
+            except BaseException:
+                self._store.close()
+                raise
 
     def run(
         self, runner: Runner, settings: PoolSettings, say: Callable[[Counts], None], stop_requested: Callable[[], bool]
@@ -167,6 +173,24 @@ class Batch:
             noted[path.name] = now
         with storage_errors(notes.parent), PartialFile(notes) as partial:
             partial.file.write(json.dumps(noted, indent=0).encode())
+
+
+@contextmanager
+def _removed_on_failure(out: Path) -> Iterator[None]:
+    """Remove what a new batch has created in its output folder if the block fails, such as on a full disk."""
+    before = {path.name for path in out.iterdir()} if out.is_dir() else None
+    try:
+        yield
+    except BaseException:
+        if DATABASE not in (before or ()):
+            for name in (*(f"{DATABASE}{suffix}" for suffix in ("", "-wal", "-shm", "-journal")), RECORDINGS):
+                (out / name).unlink(missing_ok=True)
+            with suppress(OSError):  # not empty, or not there
+                (out / RUNNING).rmdir()
+            with suppress(OSError):
+                if before is None:
+                    out.rmdir()
+        raise
 
 
 def fingerprint_of(recording: Path) -> str:

@@ -7,6 +7,7 @@ The registry, the recordings and the jobs have separate tables and migrations (`
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ from services.errors import SchemaTooNew, StoreUnavailable
 
 BUSY_TIMEOUT_S = 10.0
 """Seconds that a writer waits for another one."""
+INDEX_BYTES = 1 << 16
+"""Free space below which an I/O error of SQLite is caused by a full disk."""
 _WRITERS_LOCK = 0x1_5B1A7
 """Key of the PostgreSQL advisory lock for writers; SQLite locks the file itself."""
 
@@ -125,9 +128,25 @@ class Database:
             yield
         except (DBAPIError, PoolTimeout) as error:
             said = " ".join(str(getattr(error, "orig", None) or error).split())[:300]
+            if self._disk_is_full(error):
+                raise StoreUnavailable(
+                    f"the database {self} cannot be written: its disk is full; free space"
+                ) from error
             raise StoreUnavailable(
                 f"the database {self} does not answer: {said}; check that it runs and may be written"
             ) from error
+
+    def _disk_is_full(self, error: Exception) -> bool:
+        """Return True if a full disk is the cause. SQLite reports a full disk as an I/O error where it cannot enlarge its
+        index of the write-ahead log."""
+        name = getattr(getattr(error, "orig", None), "sqlite_errorname", "")
+        if name == "SQLITE_FULL":
+            return True
+        if not name.startswith("SQLITE_IOERR") or not self._url.database:
+            return False
+        with contextlib.suppress(OSError):
+            return shutil.disk_usage(Path(self._url.database).parent).free < INDEX_BYTES
+        return False
 
     def __str__(self) -> str:
         return self._url.render_as_string(hide_password=True)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import hashlib
 import json
 import os
 import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +25,7 @@ from services.audit import AuditLog, verify
 from services.audit.system_events import SystemEvents
 from services.auth.keys import KeyStore
 from services.auth.roles import Role
-from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, restore_backup
+from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.serve import backup_command, restore_command
 from services.errors import StoreUnavailable
 from services.jobs.records import JOBS
@@ -29,6 +33,7 @@ from services.recordings.store import RECORDINGS, State
 from services.registry.records import MODELS, VERSIONS
 from services.settings import ServiceSettings
 
+ROOT = Path(__file__).resolve().parents[2]
 AT = "2026-01-01T00:00:00+00:00"
 
 
@@ -267,6 +272,64 @@ def test_a_restore_replaces_nothing(service, tmp_path, there):
     with pytest.raises(BackupFailed):
         restore_backup(settings, tmp_path / "backup")
     assert contents(tmp_path) == before
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from services import backup
+from services.settings import ServiceSettings
+
+owner, name = {"copy": (backup, "_copy"), "move": (os, "rename")}[sys.argv[1]]
+act, calls = getattr(owner, name), []
+
+def killed(*arguments):
+    calls.append(arguments)
+    if len(calls) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return act(*arguments)
+
+setattr(owner, name, killed)
+backup.restore_backup(ServiceSettings(paths={"data": Path(sys.argv[2])}), Path(sys.argv[3]))
+"""
+
+
+@pytest.mark.parametrize("when", ["copy", "move"])
+def test_a_restore_that_was_killed_is_noticed_by_the_next_start_and_restore(service, tmp_path, when):
+    make_backup(service.settings, tmp_path / "backup")
+    new = tmp_path / "new"
+    settings = ServiceSettings(paths={"data": new})
+    command = [sys.executable, "-c", KILLED, when, str(new), str(tmp_path / "backup")]
+    assert subprocess.run(command, cwd=ROOT).returncode == -signal.SIGKILL
+    with pytest.raises(BackupFailed, match="is incomplete: a restore into it has not ended"):
+        refuse_unfinished_restore(settings)
+    if when == "move":
+        with pytest.raises(BackupFailed, match=r"is incomplete: .* empty the folder and try again"):
+            restore_backup(settings, tmp_path / "backup")
+        shutil.rmtree(new)
+    restore_backup(settings, tmp_path / "backup")
+    refuse_unfinished_restore(settings)
+    assert contents(new)["snapshots/endoscope/1/snapshot.json"] == b"{}"
+    assert not list(new.glob(".restore-*"))
+
+
+def test_a_restore_beside_a_running_one_is_refused(service, tmp_path):
+    make_backup(service.settings, tmp_path / "backup")
+    stage = tmp_path / "new" / ".restore-7"
+    stage.mkdir(parents=True)
+    held = os.open(stage, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with pytest.raises(BackupFailed, match=r"another restore into .* runs"):
+        restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
+    os.close(held)
+
+
+def test_a_restore_onto_a_full_disk_leaves_nothing(service, tmp_path, monkeypatch):
+    make_backup(service.settings, tmp_path / "backup")
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(BackupFailed, match=r"No space left .* nothing is left of it"):
+        restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
+    assert list((tmp_path / "new").iterdir()) == []
 
 
 @pytest.mark.parametrize("target", ["data", "data/backup", "there", "a file", "no/such", "data/recordings/x"])

@@ -12,8 +12,10 @@ from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
 from operators.output_folder import OutputFolder
 from operators.settings import CallerJobOptions, JobOptions
+from services.errors import StoreUnavailable
 from services.jobs.batch import Batch, recordings_in
 from services.jobs.records import JOBS, JobState
+from services.jobs.store import JobStore
 
 
 @pytest.fixture
@@ -139,3 +141,32 @@ def test_jobs_take_estimated_poses():
     assert CallerJobOptions(poses="estimated").chosen() == {"poses": "estimated"}
     with pytest.raises(InvalidSetting):
         CallerJobOptions(poses="x")
+
+
+def test_a_batch_that_cannot_begin_leaves_nothing(tmp_path, monkeypatch):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.mp4").write_bytes(b"a")
+
+    def full(*_):
+        raise StoreUnavailable("its disk is full; free space")
+
+    monkeypatch.setattr(JobStore, "submit", full)
+    with pytest.raises(StoreUnavailable):
+        Batch(tmp_path / "in", tmp_path / "out", JobOptions())
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+    (tmp_path / "out").mkdir()
+    with pytest.raises(StoreUnavailable):
+        Batch(tmp_path / "in", tmp_path / "out", JobOptions())
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_batch_that_cannot_go_on_keeps_its_jobs(place, monkeypatch):
+    def full(*_):
+        raise StoreUnavailable("its disk is full; free space")
+
+    (place / "in" / "c.mp4").write_bytes(b"c")
+    with monkeypatch.context() as patch:
+        patch.setattr(JobStore, "submit", full)
+        with pytest.raises(StoreUnavailable):
+            begin(place)
+    assert begin(place)["done"] == 2

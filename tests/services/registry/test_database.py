@@ -1,6 +1,9 @@
 """The database: migrated at start, one writer at a time, refused when a later version wrote it, and errors with a sentence."""
 
+import shutil
+import sqlite3
 import threading
+from types import SimpleNamespace
 
 import pytest
 import sqlalchemy as sa
@@ -140,3 +143,22 @@ def test_connections_that_the_server_ended_are_opened_again(postgresql):
         assert connection.execute(sa.select(MODELS)).all() == []
     database.close()
     other.close()
+
+
+def test_a_full_disk_is_said_with_its_remedy(tmp_path):
+    database = Database(f"sqlite:///{tmp_path / 'registry.sqlite'}")
+    with pytest.raises(StoreUnavailable, match="its disk is full; free space"), database.writing() as connection:
+        connection.exec_driver_sql("PRAGMA max_page_count = 1")
+        connection.exec_driver_sql("CREATE TABLE more (name TEXT)")
+    database.close()
+
+
+@pytest.mark.parametrize(("free", "said"), [(4096, "its disk is full; free space"), (1 << 30, "check that it runs")])
+def test_an_error_of_the_disk_is_a_full_disk_only_where_no_space_is_free(tmp_path, monkeypatch, free, said):
+    database = Database(f"sqlite:///{tmp_path / 'registry.sqlite'}")
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    cause = sqlite3.OperationalError("disk I/O error")
+    cause.sqlite_errorname = "SQLITE_IOERR_SHMSIZE"
+    with pytest.raises(StoreUnavailable, match=said), database.reading():
+        raise sa.exc.OperationalError("SELECT", {}, cause)
+    database.close()
