@@ -13,9 +13,9 @@ import torch
 from service_server import Server
 
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 from services.registry.bundle_file import pack
 
 NAME = "swapped"

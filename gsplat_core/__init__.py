@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from gsplat_core.io.bundle import load_bundle, save_bundle
     from gsplat_core.io.ply import load_ply, save_ply
     from gsplat_core.io.recordings import open_recording
+    from gsplat_core.models.model import Model
+    from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
     from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
     from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
@@ -28,8 +30,6 @@ if TYPE_CHECKING:
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.frames import Frame, FrameStatus
     from gsplat_core.scene.gaussians import Gaussians
-    from gsplat_core.scene.model import Model
-    from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
     from gsplat_core.training.config import ReconstructorConfig
     from gsplat_core.training.reconstructor import Reconstructor
 
@@ -76,13 +76,13 @@ _HOME = {
     "FrameStatus": "scene.frames",
     "Gaussians": "scene.gaussians",
     "InvalidInput": "errors",
-    "Model": "scene.model",
+    "Model": "models.model",
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",
     "Renderer": "rendering.renderer",
-    "Snapshot": "scene.snapshots",
-    "SnapshotSlots": "scene.snapshots",
+    "Snapshot": "models.snapshots",
+    "SnapshotSlots": "models.snapshots",
     "fully_fused_projection": "ops.projection.projection",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",

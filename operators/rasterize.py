@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
 from operators.messages import DeformedScene, Prediction, Reconstruction, RenderedFrame

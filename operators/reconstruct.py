@@ -13,9 +13,9 @@ from typing import Any
 import torch
 
 from gsplat_core.choices import Eyes
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction

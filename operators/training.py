@@ -22,9 +22,9 @@ from gsplat_core.io.sessions.records import (
     SceneBegun,
     ScheduleLine,
 )
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.reconstructor import Reconstructor

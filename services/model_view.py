@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.files import rows_of
+from gsplat_core.models.model import Model
 from gsplat_core.scene.gaussians import SH_C0
-from gsplat_core.scene.model import Model
 
 log = logging.getLogger(__name__)
 DISTANCE = 100.0

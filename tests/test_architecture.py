@@ -104,6 +104,15 @@ def test_no_other_module_names_a_deformation_field():
             assert name.startswith(FIELD_MODULES) or not named_fields(path), name
 
 
+def test_scene_data_imports_nothing_above_it():
+    files = sorted((ROOT / "gsplat_core/scene").rglob("*.py"))
+    allowed = {"scene", "errors", "registry", "value_ranges", "plain_numbers", "transfers"}
+    imported = {
+        name.split(".")[1] for path in files for name in imported_modules(path) if name.startswith("gsplat_core.")
+    }
+    assert files and imported <= allowed
+
+
 def test_geometry_knows_nothing_of_training():
     files = sorted((ROOT / "gsplat_core/geometry").rglob("*.py"))
     assert files

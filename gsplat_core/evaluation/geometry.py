@@ -37,12 +37,12 @@ from gsplat_core.evaluation.scores import why_left_out
 from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
 from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
 from gsplat_core.io.recordings.truth import GroundTruth
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 
 MOTION, COLOUR, SIZE = "motion", "colour", "size"
 PARTS: dict[str, tuple[str, ...]] = {

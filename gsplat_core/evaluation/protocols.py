@@ -21,12 +21,12 @@ from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.depth import DepthErrors, DepthSums
 from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, finite, measures, number, why_left_out
 from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import Renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db, psnrs_db
 
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.surface import in_world, rays_of
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.surface import COVERED, Surface
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import UNKNOWN_ERROR
-from gsplat_core.scene.model import Model
 from gsplat_core.transfers import HostCopy
 
 MOST_STEPS = 4096

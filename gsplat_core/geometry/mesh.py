@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import ExportError
 from gsplat_core.geometry.surface import in_world, joined, points_of
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.surface import COVERED
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.model import Model
 from gsplat_core.transfers import HostCopy
 
 LEAST_OPACITY = 0.5

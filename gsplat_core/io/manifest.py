@@ -13,11 +13,11 @@ from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.registry import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
-from gsplat_core.scene.model import Model
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 FORMAT_VERSION = 1

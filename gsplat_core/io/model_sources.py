@@ -15,9 +15,9 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.model_files import check_memory, open_model_file
 from gsplat_core.io.ply import load_ply
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.scene.model import Model
 
 WIDTH_PX, HEIGHT_PX = 640, 512
 FIELD_OF_VIEW = 0.9

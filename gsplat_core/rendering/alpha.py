@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, LaunchedFrame
 from gsplat_core.rendering.rasterization import RenderOutput, render
@@ -25,8 +27,6 @@ from gsplat_core.rendering.renderer import (
 )
 from gsplat_core.rendering.surface import SURFACE_OUTPUTS
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 
 
 class AlphaRenderer:

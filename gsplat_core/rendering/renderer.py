@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 
 Precision = Literal["fp32", "fp16"]
 STANDARD_OUTPUTS = RenderOutput._fields

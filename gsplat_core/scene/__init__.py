@@ -1,1 +1,1 @@
-"""Scene types shared by training and rendering: Gaussians, cameras, frames, models."""
+"""Scene data shared by all packages of the core: Gaussians, cameras, frames, depth origins. Imports nothing above it."""

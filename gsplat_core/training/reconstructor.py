@@ -12,12 +12,12 @@ from torch import Tensor
 from gsplat_core.deformation.continuation import NewestState
 from gsplat_core.deformation.registry import FIELDS, NewField
 from gsplat_core.errors import InvalidInput
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.covering import Covering
@@ -336,7 +336,7 @@ class Reconstructor:
         next version number.
 
         On a GPU the whole model is copied into a preallocated slot without allocation or
-        synchronisation, see `gsplat_core.scene.snapshots`. On a CPU with a motion prior only the
+        synchronisation, see `gsplat_core.models.snapshots`. On a CPU with a motion prior only the
         current state is copied; `whole_model` includes the past. Otherwise it equals `snapshot`.
         """
         step, prior = self._step, self._motion.prior

@@ -36,10 +36,10 @@ from gsplat_core.evaluation.views import SecondEye, evaluate_second_eye
 from gsplat_core.io.recordings.calibration import read_poses
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.truth import GroundTruth, open_truth
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s

@@ -13,9 +13,9 @@ import numpy as np
 from gsplat_core.choices import Eyes
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.sessions import SessionReader, is_session
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
 from operators.applications.session import FirstFrames
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription

@@ -14,10 +14,10 @@ from typing import Any
 
 import cv2
 
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture

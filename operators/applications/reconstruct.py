@@ -16,8 +16,8 @@ from torch import Tensor
 from gsplat_core.depth.registry import DepthFinder, of_recording
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
+from gsplat_core.models.model import Model
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
 from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.right_eye import BothEyes
 from operators.applications.device import seeded

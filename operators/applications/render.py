@@ -20,10 +20,10 @@ from gsplat_core.io.camera_path import read_camera_path
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.model_sources import is_scene_file, load_model
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.registry import check_renderer, new_renderer
 from gsplat_core.rendering.renderer import Renderer
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.model import Model
 from gsplat_core.scene.orbit import Orbit
 from gsplat_core.transfers import HostCopy
 from operators.applications.device import check_device

@@ -14,8 +14,8 @@ from typing import Protocol, TypeVar, cast
 from gsplat_core.errors import CoreError
 from gsplat_core.evaluation.baselines import measure_baselines
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
 from operators.applications.device import seeded
 from operators.errors import OperatorsError, RunFailed
 from operators.graph import Application, DurationSummary, run

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.reconstructor import Reconstructor
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.scene.model import Model
+from gsplat_core.models.model import Model
 from gsplat_core.scene.orbit import Orbit
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed

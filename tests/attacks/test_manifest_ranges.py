@@ -26,9 +26,9 @@ from gsplat_core.io.manifest import (
     SIDE_PX,
     VERSION,
 )  # fmt: skip
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 
 NO_INTEGERS = (None, True, 1.5, "5", [], {}, -1, 10**400, 2**63, float(2**20))
 NO_NUMBERS = (None, False, "1", [], {}, 10**400, -(10**400), 1e300)

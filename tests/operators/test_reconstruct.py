@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import torch
 
-from gsplat_core.scene.model import Model
-from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.transfers import HostCopy
 from operators.reconstruct import ReconstructOp
 from operators.training import EveryFrame

@@ -11,6 +11,7 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import synthesize
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
@@ -22,7 +23,6 @@ from gsplat_core.rendering.renderer import (
 )
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0
-from gsplat_core.scene.model import Model
 from operators.applications.replay import ReplaySettings, replay
 from operators.metrics import QualityResult
 from operators.reconstruct import ModelResult

@@ -25,8 +25,8 @@ from gsplat_core.io.exports.files import (
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.ply import ply_pieces
+from gsplat_core.models.model import Model
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 
 TIMES_FILE = "times.json"
 NODE_NAME = "reconstruction"

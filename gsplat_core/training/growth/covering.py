@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
+from gsplat_core.models.snapshots import SnapshotSlots
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.snapshots import SnapshotSlots
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
 from gsplat_core.training.observations import Observation

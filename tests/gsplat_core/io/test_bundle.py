@@ -12,10 +12,10 @@ from gsplat_core.deformation import new_field
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io import bundle, files
 from gsplat_core.io.bundle import load_bundle, save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.model import Model
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.remembered import share_of
-from gsplat_core.scene.model import Model
 
 CAMERA = Camera.from_focal(40.0, 37, 29)
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference, render
+from gsplat_core.models.model import Model
 from gsplat_core.rendering.settings import EPS2D
 from gsplat_core.rendering.surface import COVERED, LEAST_VARIANCE, certainty, render_surface
-from gsplat_core.scene.model import Model
 
 CAMERA = Camera.from_focal(50.0, 45, 37)
 

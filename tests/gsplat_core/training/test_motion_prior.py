@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.model import Model
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion.prior import HORIZON_S, FlowPrior, new_motion_prior, widened

@@ -46,9 +46,9 @@ def inputs(tmp_path_factory):
     import torch
 
     from gsplat_core.io.recordings import synthesize
+    from gsplat_core.models.model import Model
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.gaussians import Gaussians
-    from gsplat_core.scene.model import Model
 
     folder = tmp_path_factory.mktemp("inputs")
     gaussians = Gaussians(

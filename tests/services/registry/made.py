@@ -9,9 +9,9 @@ import torch
 
 from gsplat_core.deformation import new_field
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 from services.registry.bundle_file import pack
 from services.registry.models import ModelRegistry
 from services.registry.records import Recovery

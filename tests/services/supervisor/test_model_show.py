@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 from operators.sources.source import SourceState
 from services.errors import BadMessage, CommandRefused
 from services.supervisor import model_show

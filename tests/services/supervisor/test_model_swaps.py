@@ -10,9 +10,9 @@ import torch
 import zmq.asyncio
 
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 from services.bus.pictures import picture_from, subscribe
 from services.settings import StreamSettings
 from services.supervisor.launcher import Direct

@@ -16,9 +16,9 @@ import torch
 import zmq
 
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 from services.bus.pictures import split, subscribe
 from services.bus.runtime import ProcessIdentity, RuntimeFolder
 from services.settings import StreamSettings

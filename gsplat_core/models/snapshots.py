@@ -20,10 +20,10 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField, FieldSlot
 from gsplat_core.errors import InvalidInput
+from gsplat_core.models.model import Model, clamp_time
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model, clamp_time
 from gsplat_core.scene.rows import inert_gaussians
 from gsplat_core.transfers import copy_each
 

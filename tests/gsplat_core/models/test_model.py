@@ -7,8 +7,8 @@ import torch
 
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidInput
+from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.model import Model
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
 KINDS = pytest.mark.parametrize("kind", ["basis", "hexplane", None])
