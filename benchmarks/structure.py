@@ -28,7 +28,7 @@ MAX_FLAT_FILES = 15
 MAX_COLUMNS = 120
 DIALECT = ("What", "How", "Of", "Whether", "Which", "As", "By")
 SETTINGS = re.compile(r"(Settings|Config|Options|Limits|Rates|Budget)$")
-PATH = re.compile(r"[\w.:\[\]| ,]+")
+PATH = re.compile(r"[\w.:\[\]| ,;()]+")
 IDENTIFIER = re.compile(r"[A-Za-z_]\w*")
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef

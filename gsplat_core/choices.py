@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from gsplat_core.deformation.registry import FieldKind
     from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.renderer import RendererKind
-    from gsplat_core.training.config import ReconstructorConfig
-    from gsplat_core.training.motion.prior import MotionPrior
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
@@ -51,7 +49,7 @@ DEPTHS: Registry[type[Estimator]] = Registry(
 DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
 """Names that are followed by a colon and an address, with an example of the syntax."""
 
-MOTION_PRIORS: Registry[Callable[[ReconstructorConfig], MotionPrior | None]] = Registry(
+MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     "motion prior",
     {
         "bumps": "gsplat_core.training.motion.prior:no_prior",
