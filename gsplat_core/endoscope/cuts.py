@@ -26,9 +26,7 @@ from gsplat_core.endoscope.reduced import lowest_and_highest, median_of, reduced
 WIDTH_PX, HEIGHT_PX = 64, 48
 BLOCK_WIDTH_PX, BLOCK_HEIGHT_PX, SEARCH_PX = 16, 12, 8
 DARK = 28
-"""Level below which pixels are not compared, since black surrounds and cavities look alike in every
-scene.
-"""
+"""Level below which pixels are not compared, since black surrounds and cavities look alike in every scene."""
 OFFSET = 8.0
 """Offset of levels before the logarithm, to suppress noise in dark regions."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(OFFSET))
@@ -142,8 +140,7 @@ SAME_MOVED = 0.83
 two frames show the same scene.
 """
 SAME_AFTER_GAP_DIFFERENCE = 0.2
-"""Difference up to which frames after a gap of unusable frames may show the same scene, if
-their colours agree as well.
+"""Difference up to which frames after a gap of unusable frames may show the same scene, if their colours agree as well.
 """
 SAME_AFTER_GAP_COLOURS = 0.65
 """Overlap of colours required for frames after a gap."""
@@ -170,9 +167,7 @@ class SceneVerdict:
     "resized" or "frame rate". None for the same scene.
     """
     in_doubt: bool = False
-    """True for an unmatched frame; the next frame decides whether it was a cut. Such a frame is not
-    trained on.
-    """
+    """True for an unmatched frame; the next frame decides whether it was a cut. Such a frame is not trained on."""
 
 
 class CutDetector:
@@ -255,9 +250,7 @@ class CutDetector:
 
 
 class FrameRate:
-    """Detector of lasting changes of the frame rate. Lost frames are accounted for by their
-    numbers.
-    """
+    """Detector of lasting changes of the frame rate. Lost frames are accounted for by their numbers."""
 
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=RATE_FRAMES)

@@ -82,9 +82,7 @@ def ratio(sample: Sample, reference: Sample, channel: int) -> tuple[float, float
 
 
 def share_with(sample: Sample, reference: Sample, log_gain: NDArray[np.float64]) -> float:
-    """Return the share of pixels whose ratios agree with log gains [3] within `AGREEMENT` in every
-    comparable channel.
-    """
+    """Return the share of pixels whose ratios agree with log gains [3] within `AGREEMENT` in every comparable channel."""
     both = sample.valid & reference.valid
     agrees = np.abs(sample.logs - reference.logs - log_gain.astype(np.float32)) <= AGREEMENT
     some = both.any(axis=1)
@@ -98,15 +96,11 @@ UNCHANGED: Gains = (1.0, 1.0, 1.0)
 DEAD_ZONE = 0.08
 """Difference from the present gain that is ignored while the gain is held."""
 DRIFT_ZONE = 0.1
-"""Threshold for slow changes against older references; larger because the tissue has moved
-since.
-"""
+"""Threshold for slow changes against older references; larger because the tissue has moved since."""
 MORE_PIXELS = 1.5
 """Ratio of pixels that agree with a change to those that agree with no change."""
 ANCHOR_ZONE = 0.15
-"""Largest deviation of a settled gain from the comparison with the scene's first frame, if that
-is possible.
-"""
+"""Largest deviation of a settled gain from the comparison with the scene's first frame, if that is possible."""
 RELEASE_ZONE = 0.04
 """Distance from 1 within which a settled gain is set to exactly 1."""
 SETTLED_CHANGE = 0.02
@@ -116,20 +110,15 @@ SETTLED_FRAMES = 6
 MOST_REFERENCES = 12
 """Number of reference pictures."""
 REFERENCE_EVERY = 4
-"""Number of frames between references; 12 references every 4 frames cover 1.6 s at 30 frames/s.
-"""
+"""Number of frames between references; 12 references every 4 frames cover 1.6 s at 30 frames/s."""
 YOUNG_REFERENCES = 4
-"""Number of newest references that are not used yet, so that they contain no part of a slow
-change.
-"""
+"""Number of newest references that are not used yet, so that they contain no part of a slow change."""
 LEAST_CLEAR_JUMP = 1.5
 """Smallest ratio of a sudden change to the dissimilarity from the previous frame."""
 LEAST_CLEAR_DRIFT = 1.0
 """Smallest ratio of a slow change to the dissimilarity from the references."""
 MOST_UNLIKE = 0.25
-"""Median difference from every reference, after removing the gain, above which a frame's
-exposure is not measured.
-"""
+"""Median difference from every reference, after removing the gain, above which a frame's exposure is not measured."""
 LARGEST_GAIN = 8.0
 """Bound of gains and their inverses."""
 FORGET_S = 300.0
@@ -145,10 +134,9 @@ BRIGHTEST_LEVEL = 225
 class ExposureEstimator:
     """Gain estimator of a stream; call it for each frame in order.
 
-    While the gain is held, sudden changes are detected against the previous frame and slow ones
-    against older references. While it changes, the previous frame and the references are averaged,
-    weighted by similarity. A bounded number of reduced pictures is kept. Without exposure changes
-    the gains are exactly (1, 1, 1).
+    While the gain is held, sudden changes are detected against the previous frame and slow ones against older
+    references. While it changes, the previous frame and the references are averaged, weighted by similarity. A bounded
+    number of reduced pictures is kept. Without exposure changes the gains are exactly (1, 1, 1).
     """
 
     def __init__(self) -> None:
@@ -249,9 +237,7 @@ class ExposureEstimator:
             self._settle(sample)
 
     def _settle(self, sample: Sample) -> None:
-        """Limit the deviation from the scene's first frame, so that errors of many changes do not
-        accumulate.
-        """
+        """Limit the deviation from the scene's first frame, so that errors of many changes do not accumulate."""
         assert self._anchor is not None
         found = self._compare(sample, [self._anchor])
         if found is not None:

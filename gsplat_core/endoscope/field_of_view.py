@@ -1,9 +1,8 @@
-"""Detection of the field of view in the picture: a circle, an octagon, or a rectangle between black
-bars.
+"""Detection of the field of view in the picture: a circle, an octagon, or a rectangle between black bars.
 
-The surround is dark, constant over time, adjoins the picture's edge and ends sharply. A dark cavity
-has a soft boundary or does not reach the edge. Gaps of the outline at cavities and tools are closed
-by the convex hull, or by an ellipse if most of the outline is on one.
+The surround is dark, constant over time, adjoins the picture's edge and ends sharply. A dark cavity has a soft boundary
+or does not reach the edge. Gaps of the outline at cavities and tools are closed by the convex hull, or by an ellipse if
+most of the outline is on one.
 """
 
 from __future__ import annotations
@@ -36,12 +35,9 @@ ELLIPSE_SHARE = 0.7
 ELLIPSE_DISTANCE = 0.015
 """Largest distance from the ellipse, as a share of its size."""
 LIT_OUTSIDE = 0.25
-"""Largest share of lit pixels outside the outline, such as text, logos and compression
-artefacts.
-"""
+"""Largest share of lit pixels outside the outline, such as text, logos and compression artefacts."""
 MARGIN_SHARE = 0.01
-"""Margin inside the outline that is excluded because it is blurred or has a bright ring, as a
-share of the longer side.
+"""Margin inside the outline that is excluded because it is blurred or has a bright ring, as a share of the longer side.
 """
 WINDOW_FRAMES = 30
 """Number of frames per examined window; the first frame is examined alone."""
@@ -183,9 +179,7 @@ def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Ou
 
 
 def _as_ellipse(hull: Outline, shape: tuple[int, int]) -> Outline:
-    """Return the ellipse on which most of the hull is, clipped to the hull's bounding box, or the
-    hull itself.
-    """
+    """Return the ellipse on which most of the hull is, clipped to the hull's bounding box, or the hull itself."""
     height, width = shape
     points = _along(hull)
     free = points[

@@ -1,8 +1,7 @@
-"""Detection of specular highlights: reflections of the lamp on wet tissue, which move with the
-scope.
+"""Detection of specular highlights: reflections of the lamp on wet tissue, which move with the scope.
 
-Highlights are nearly white (bright in every channel) and brighter than their surroundings. Bright
-or overexposed areas are not brighter than their surroundings.
+Highlights are nearly white (bright in every channel) and brighter than their surroundings. Bright or overexposed areas
+are not brighter than their surroundings.
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ LONG_SIDE_PX = 800
 SHRINK = 8
 """Reduction factor for averaging the surroundings."""
 BLACK = 28
-"""Level below which pixels are excluded from the surroundings, since they may be outside the field
-of view.
-"""
+"""Level below which pixels are excluded from the surroundings, since they may be outside the field of view."""
 
 
 BRIGHTEST_CHANNEL = 235
@@ -36,15 +33,11 @@ SURROUNDINGS_SHARE = 0.12
 GROWN_SHARE = 0.003
 """Dilation of highlights as a share of the longer side, 2 px of 640."""
 MOST_SHARE = 0.25
-"""Largest share of highlights in a picture; more indicates overexposure or a white object, and
-none are reported.
-"""
+"""Largest share of highlights in a picture; more indicates overexposure or a white object, and none are reported."""
 
 
 def without_highlights(image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-    """Return a mask uint8 [H, W], 0 on highlights, for a picture RGB uint8 [H, W, 3]; None without
-    highlights.
-    """
+    """Return a mask uint8 [H, W], 0 on highlights, for a picture RGB uint8 [H, W, 3]; None without highlights."""
     return HighlightFinder().without(image)
 
 

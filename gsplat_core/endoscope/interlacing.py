@@ -1,9 +1,8 @@
 """Detection and removal of interlacing.
 
-Even and odd lines of an interlaced picture are taken at two times. Where something moves,
-neighbouring lines then differ more than lines two apart; in progressive video it is the reverse.
-While a stream is interlaced, even lines are kept, and outliers of odd lines are replaced by the
-mean of their neighbours. Static parts are unchanged.
+Even and odd lines of an interlaced picture are taken at two times. Where something moves, neighbouring lines then
+differ more than lines two apart; in progressive video it is the reverse. While a stream is interlaced, even lines are
+kept, and outliers of odd lines are replaced by the mean of their neighbours. Static parts are unchanged.
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ BLOCK_ROWS, BLOCK_COLUMNS, COLUMN_STEP = 16, 8, 4
 
 
 COMB_RATIO = 1.2
-"""Ratio of the difference of neighbouring lines to that of lines two apart, from which a block
-is combed.
-"""
+"""Ratio of the difference of neighbouring lines to that of lines two apart, from which a block is combed."""
 COMB_LEVELS = 5.0
 """Smallest difference of neighbouring lines of a combed block, in levels 0 to 255."""
 COMB_SHARE = 0.02
@@ -35,9 +32,7 @@ JUDGED_FRAMES = 12
 FORGOTTEN_FRAMES = 600
 """Consecutive pictures without combs after which a stream is no longer interlaced."""
 STAND_OUT_LEVELS = 4
-"""Excess over both neighbouring lines, in levels, from which a pixel of an odd line is
-replaced.
-"""
+"""Excess over both neighbouring lines, in levels, from which a pixel of an odd line is replaced."""
 
 
 class Deinterlacer:
@@ -50,9 +45,7 @@ class Deinterlacer:
         self._without = 0
 
     def process(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the picture RGB uint8 [H, W, 3] without combs. It is the given array unless the
-        stream is interlaced.
-        """
+        """Return the picture RGB uint8 [H, W, 3] without combs. It is the given array unless the stream is interlaced."""
         combed = comb_share(image) >= COMB_SHARE
         self._recent.append(combed)
         self._without = 0 if combed else self._without + 1
@@ -80,9 +73,7 @@ def comb_share(image: NDArray[np.uint8]) -> float:
 
 
 def without_combs(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a copy of a picture [H, W, 3] with outliers of odd lines replaced by the mean of the
-    neighbouring lines.
-    """
+    """Return a copy of a picture [H, W, 3] with outliers of odd lines replaced by the mean of the neighbouring lines."""
     result = image.copy()
     odd = result[1:-1:2]
     count = len(odd)

@@ -24,13 +24,9 @@ LOST_FRAMES = 5
 FARTHEST_MM = 2000.0
 """Largest plausible depth for an endoscope, in millimetres."""
 WRONG_DEPTH_SHARE = 0.2
-"""Share of invalid values (not finite, negative or too far) from which a frame's depth is
-discarded.
-"""
+"""Share of invalid values (not finite, negative or too far) from which a frame's depth is discarded."""
 USUAL_DEPTH_RATIO = 4.0
-"""Ratio of the median depth to that of earlier frames, in either direction, from which a
-frame's depth is discarded.
-"""
+"""Ratio of the median depth to that of earlier frames, in either direction, from which a frame's depth is discarded."""
 UNUSUAL_FRAMES = 10
 """Largest number of such frames; then the new distance is accepted."""
 
@@ -60,9 +56,7 @@ class CheckedDepth:
     """Depth of a frame without invalid values."""
 
     depth: NDArray[np.float32] | None
-    """float32 [H, W] in millimetres, 0 = unknown; the given array if it is valid. None if
-    discarded.
-    """
+    """float32 [H, W] in millimetres, 0 = unknown; the given array if it is valid. None if discarded."""
     finding: str | None = None
     """Finding "depth repaired", "depth not usable" or "depth at another scale", or None."""
 

@@ -26,9 +26,7 @@ from gsplat_core.io.files import read_regular
 MOST_BYTES = 512 * 2**20
 MOST_NESTING = 64
 _EXTERNAL_DATA, _DATA_LOCATION, _EXTERNAL = 13, 14, 1
-"""Field numbers of a tensor in onnx.proto, and the value of the second field that marks external
-data.
-"""
+"""Field numbers of a tensor in onnx.proto, and the value of the second field that marks external data."""
 _PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
@@ -51,8 +49,7 @@ def read_model(path: Path, what: str) -> bytes:
         what: description of the model for error messages, such as "tool network".
 
     Raises:
-        InvalidSetting: for an unreadable or invalid file, one that is too large, or one with
-            external data.
+        InvalidSetting: for an unreadable or invalid file, one that is too large, or one with external data.
     """
     try:
         data = read_regular(path, MOST_BYTES)
@@ -159,17 +156,12 @@ class ToolSettings(PictureSettings):
     """Settings of a tool segmentation network."""
 
     values: Literal["auto", "logits", "probability"] = "auto"
-    """Kind of a single-channel output. `auto` is probability if three trial pictures give no value
-    outside 0..1.
-    """
+    """Kind of a single-channel output. `auto` is probability if three trial pictures give no value outside 0..1."""
     tool_classes: Annotated[tuple[ClassIndex, ...], Field(min_length=1)] | None = None
-    """Tool classes; None for all but 0. A single channel is the score of class 1; [0] declares it
-    as tissue.
-    """
+    """Tool classes; None for all but 0. A single channel is the score of class 1; [0] declares it as tissue."""
     threshold: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """Probability from which a pixel is tool. With several classes it compares the most likely tool
-    class with the most likely other class. Below 0.5 fewer tools are missed and more tissue is
-    lost.
+    """Probability from which a pixel is tool. With several classes it compares the most likely tool class with the most
+    likely other class. Below 0.5 fewer tools are missed and more tissue is lost.
     """
 
 
@@ -177,8 +169,7 @@ Settings = TypeVar("Settings", bound=PictureSettings)
 
 
 def read_settings(path: Path, metadata: Mapping[str, str], kind: type[Settings]) -> Settings:
-    """Read the settings of the network at `path` from `path` + `.json`, else from its metadata,
-    else return defaults.
+    """Read the settings of the network at `path` from `path` + `.json`, else from its metadata, else return defaults.
 
     Raises:
         InvalidSetting: for unreadable or invalid settings.

@@ -22,10 +22,9 @@ SMALLEST_MASK_PX = 4
 class OnnxToolFinder:
     """Tool segmentation with an ONNX model on the CPU.
 
-    The model has one input, a float picture [1, 3, h, w]. Its output is [1, 1, h', w'] logits or
-    probabilities, [1, K, h', w'] scores of K >= 2 classes, or [1, h', w'] or [h', w'] with integer
-    classes or a single float channel. `ToolSettings` describes the conventions. A picture whose
-    output contains NaN counts as tool everywhere.
+    The model has one input, a float picture [1, 3, h, w]. Its output is [1, 1, h', w'] logits or probabilities, [1, K,
+    h', w'] scores of K >= 2 classes, or [1, h', w'] or [h', w'] with integer classes or a single float channel.
+    `ToolSettings` describes the conventions. A picture whose output contains NaN counts as tool everywhere.
     """
 
     def __init__(self, path: Path) -> None:

@@ -61,9 +61,7 @@ MOST_INTERVAL_RATIO = 1.7
 
 
 class OrdinaryPictures:
-    """Test for ordinary pictures of a stream, called for each frame. It keeps a reduced picture and
-    a few numbers.
-    """
+    """Test for ordinary pictures of a stream, called for each frame. It keeps a reduced picture and a few numbers."""
 
     def __init__(self) -> None:
         self.reset()
@@ -125,9 +123,7 @@ class OrdinaryPictures:
 
 
 def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
-    """Return some of the pixels, their mean colour, and the mean difference of neighbours in some
-    of the rows.
-    """
+    """Return some of the pixels, their mean colour, and the mean difference of neighbours in some of the rows."""
     height, width = image.shape[:2]
     size = min(width, SAMPLES_PER_SIDE), min(height, SAMPLES_PER_SIDE)
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)

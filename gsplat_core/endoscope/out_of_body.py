@@ -32,16 +32,11 @@ SMALLEST_PX = 16
 DARKEST = 25
 """Brightness (largest channel, 0..255) below which a pixel's colour is not judged."""
 DIM = 40.0
-"""Brightness that 5 % of the lit pixels must exceed; rounding decides the colours of darker
-pictures.
-"""
+"""Brightness that 5 % of the lit pixels must exceed; rounding decides the colours of darker pictures."""
 CLIPPED = 252
-"""Level from which a channel counts as clipped. With two clipped channels a pixel's colour is
-unknown.
-"""
+"""Level from which a channel counts as clipped. With two clipped channels a pixel's colour is unknown."""
 LEAST_LIT, LEAST_JUDGED = 0.05, 0.1
-"""Smallest share of lit pixels in the picture, and of unclipped ones among them, for a judgement.
-"""
+"""Smallest share of lit pixels in the picture, and of unclipped ones among them, for a judgement."""
 NOISE = 6.0
 """Offset added to each channel before ratios are computed."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(NOISE))
@@ -50,19 +45,13 @@ RATIOS = np.array([[1, -1, 0], [1, 0, -1]], np.float32)
 COOL = 0.12
 """Log ratio of red to both green and blue below which a pixel is cool."""
 STRAIGHT, COOL_BESIDE_STRAIGHT = 0.47, 0.4
-"""Agreement of the edges' directions and share of cool pixels from which straight edges are
-evidence.
-"""
+"""Agreement of the edges' directions and share of cool pixels from which straight edges are evidence."""
 ROOM_LIGHT, COOL_BESIDE_LIGHT = 0.8, 0.6
-"""Sum of `Evidence.even` and `Evidence.smooth` and share of cool pixels from which even light is
-evidence.
-"""
+"""Sum of `Evidence.even` and `Evidence.smooth` and share of cool pixels from which even light is evidence."""
 FLAT = 0.01
 """Relative brightness change from pixel to pixel below which a surface is smooth."""
 EDGE_SHARE, EDGE_CONTRAST = 0.2, 0.12
-"""Share of the lit area that counts as edges, and least gradient (Sobel) of an edge relative to the
-brightness.
-"""
+"""Share of the lit area that counts as edges, and least gradient (Sobel) of an edge relative to the brightness."""
 LITTLE_COOL, REDNESS = 0.3, 0.34
 """Share of cool pixels below which, and log of red over green that a quarter of the pixels must
 exceed, for a picture to be clear tissue.
@@ -75,9 +64,7 @@ FRAMES_WITHOUT_EVIDENCE = 60
 
 @dataclass(frozen=True)
 class Evidence:
-    """Colour and light measures of a picture. Shares are 0..1 of the lit, unclipped pixels unless
-    stated otherwise.
-    """
+    """Colour and light measures of a picture. Shares are 0..1 of the lit, unclipped pixels unless stated otherwise."""
 
     cool: float
     """Share of pixels in which red hardly exceeds green and blue."""
@@ -88,9 +75,8 @@ class Evidence:
     smooth: float
     """Share of the lit area, without its border, with hardly any brightness change."""
     straight: float
-    """Agreement of the edges' directions: length of the mean of unit vectors with fourfold angles,
-    so that right angles agree. 1 for a grid, 0 for uniformly distributed directions or with too few
-    cool pixels.
+    """Agreement of the edges' directions: length of the mean of unit vectors with fourfold angles, so that right angles
+    agree. 1 for a grid, 0 for uniformly distributed directions or with too few cool pixels.
     """
 
     @property
@@ -156,10 +142,9 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
 class BodyGate:
     """Gate of a stream that closes at once on evidence of the outside.
 
-    A picture passes unless it contains such evidence. After one that does, the gate stays closed
-    until `FRAMES_TO_RETURN` consecutive pictures show clear tissue, or `FRAMES_WITHOUT_EVIDENCE`
-    contain no evidence. Pictures that cannot be judged, such as dark ones, pass an open gate and
-    are not counted by a closed one.
+    A picture passes unless it contains such evidence. After one that does, the gate stays closed until
+    `FRAMES_TO_RETURN` consecutive pictures show clear tissue, or `FRAMES_WITHOUT_EVIDENCE` contain no evidence.
+    Pictures that cannot be judged, such as dark ones, pass an open gate and are not counted by a closed one.
     """
 
     def __init__(self) -> None:
@@ -215,17 +200,13 @@ def _size(image: NDArray[np.uint8], long_side_px: int) -> tuple[int, int]:
 def _gradient(
     plane: NDArray[np.uint8], scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return derivatives along x and y and the gradient's magnitude, by the Sobel kernel times
-    `scale`.
-    """
+    """Return derivatives along x and y and the gradient's magnitude, by the Sobel kernel times `scale`."""
     across, down = (np.asarray(cv2.Sobel(plane, cv2.CV_32F, x, 1 - x, scale=scale), np.float32) for x in (1, 0))
     return across, down, np.asarray(cv2.magnitude(across, down), np.float32)
 
 
 def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
-    """Return the share of the judged area, without a border of two pixels, with hardly any
-    brightness change.
-    """
+    """Return the share of the judged area, without a border of two pixels, with hardly any brightness change."""
     inner = np.asarray(cv2.erode(judged.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)) > 0
     *_, steepness = _gradient(grey, 1 / 8)
     area = int(np.count_nonzero(inner))

@@ -20,9 +20,7 @@ def median_of(values: NDArray[np.floating], share: float = 0.5) -> float:
 
 
 SAMPLES = 128
-"""Approximate number of rows and columns of the shorter side that are averaged; others are skipped
-to save time.
-"""
+"""Approximate number of rows and columns of the shorter side that are averaged; others are skipped to save time."""
 
 
 def sampled(plane: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
@@ -34,11 +32,9 @@ def sampled(plane: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
 
 
 def reduced(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Reduce [H, W] or [H, W, C] to [height_px, width_px] or [height_px, width_px, C], ignoring the
-    aspect ratio.
+    """Reduce [H, W] or [H, W, C] to [height_px, width_px] or [height_px, width_px, C], ignoring the aspect ratio.
 
-    Only every k-th row and column is averaged. Noise is suppressed as well as with all pixels of a
-    smaller picture.
+    Only every k-th row and column is averaged. Noise is suppressed as well as with all pixels of a smaller picture.
     """
     some = sampled(image, max(1, min(image.shape[:2]) // SAMPLES))
     return _resized(some, width_px, height_px, cv2.INTER_AREA)
@@ -53,9 +49,8 @@ def _resized(plane: NDArray[np.uint8], width_px: int, height_px: int, how: int) 
 def averaged(image: NDArray[np.uint8], size: tuple[int, int], samples: int = 2) -> NDArray[np.uint8]:
     """Reduce a picture [H, W, 3] to `size` (width, height) for judging colours.
 
-    `samples` rows and columns are averaged per result pixel, if available; more would cost time
-    with little effect. `reduced` may use a single one, which suffices for brightness but not for
-    ratios of noisy channels.
+    `samples` rows and columns are averaged per result pixel, if available; more would cost time with little effect.
+    `reduced` may use a single one, which suffices for brightness but not for ratios of noisy channels.
     """
     samples = min(samples, image.shape[1] // size[0], image.shape[0] // size[1])
     if samples > 1:

@@ -1,6 +1,4 @@
-"""Detection of unusable or repeated pictures: black, single-coloured, noise, duplicate, frozen or
-torn.
-"""
+"""Detection of unusable or repeated pictures: black, single-coloured, noise, duplicate, frozen or torn."""
 
 from __future__ import annotations
 
@@ -15,17 +13,13 @@ from gsplat_core.endoscope.reduced import luma
 SAMPLES = 128
 """Approximate number of sampled rows, and of pixels per row."""
 SMALLEST_FOR_NOISE_PX = 32
-"""Shortest side of a picture tested for noise, in pixels; neighbours in smaller pictures differ
-without noise.
-"""
+"""Shortest side of a picture tested for noise, in pixels; neighbours in smaller pictures differ without noise."""
 
 
 BLACK_LEVEL = 20
 """Level below which a picture is black, except for `odd_share` of it."""
 ONE_COLOUR_LEVELS = 3
-"""Deviation from the most frequent colour within which a picture is single-coloured, except for
-`odd_share` of it.
-"""
+"""Deviation from the most frequent colour within which a picture is single-coloured, except for `odd_share` of it."""
 ODD_SHARE = 0.03
 """Tolerated share of other pixels, such as a line of text or a logo."""
 NOISE_SHARE = 0.5
@@ -37,15 +31,11 @@ SAME_LEVELS = 2
 SAME_SHARE = 0.9995
 """Share of equal pixels from which a picture repeats the previous one."""
 FROZEN_S = 0.25
-"""Seconds without a new picture after which the stream is frozen; before, frames are
-duplicates.
-"""
+"""Seconds without a new picture after which the stream is frozen; before, frames are duplicates."""
 FROZEN_FRAMES = 8
 """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
 TORN_SHARE = 0.08
-"""Share of rows, up to the lower edge, equal to the previous picture from which a picture is
-torn.
-"""
+"""Share of rows, up to the lower edge, equal to the previous picture from which a picture is torn."""
 MOVING_SHARE = 0.9
 """Share of frames in which a row must change to be used in the test for torn pictures; excludes
 black borders and recorder overlays.
@@ -53,9 +43,7 @@ black borders and recorder overlays.
 
 
 class SequenceCheck:
-    """Check of each picture against the previous one. It keeps one reduced picture and a number per
-    row.
-    """
+    """Check of each picture against the previous one. It keeps one reduced picture and a number per row."""
 
     def __init__(self) -> None:
         self._previous: NDArray[np.uint8] | None = None
@@ -106,9 +94,7 @@ class SequenceCheck:
         return None
 
     def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
-        """Return True if enough pixels have one grey level for a single colour; faster than
-        comparing colours.
-        """
+        """Return True if enough pixels have one grey level for a single colour; faster than comparing colours."""
         # One more level on either side, since grey is rounded.
         wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
         below = np.append(0, levels.cumsum())

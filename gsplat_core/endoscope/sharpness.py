@@ -1,14 +1,12 @@
 """Detection of blurred and smoky frames relative to the stream's recent frames.
 
-Sharpness is the mean difference of neighbouring pixels over that of pixels eight apart, along rows
-and along columns. The lower of the two, relative to its usual value, is compared. It is independent
-of contrast and exposure, and motion blur reduces it in one direction only. The usual value is the
-median of recent frames, including blurred ones. A stream that is or becomes permanently soft
-therefore passes.
+Sharpness is the mean difference of neighbouring pixels over that of pixels eight apart, along rows and along columns.
+The lower of the two, relative to its usual value, is compared. It is independent of contrast and exposure, and motion
+blur reduces it in one direction only. The usual value is the median of recent frames, including blurred ones. A stream
+that is or becomes permanently soft therefore passes.
 
-Smoke reduces contrast (spread of log brightness) and saturation and brightens dark regions, which a
-tool does not. Smoke gathers slowly, so the usual values are those of frames without smoke, until it
-has lasted for the same time.
+Smoke reduces contrast (spread of log brightness) and saturation and brightens dark regions, which a tool does not.
+Smoke gathers slowly, so the usual values are those of frames without smoke, until it has lasted for the same time.
 """
 
 from __future__ import annotations

@@ -40,21 +40,15 @@ TEXT_LEVELS = 25.0
 TEXT_STEADINESS = 5.0
 """Smallest ratio of this step to its mean temporal deviation."""
 TEXT_LENGTH = 0.02
-"""Smallest extent of text as a share of the longer side of the band; a third of it in the other
-direction.
-"""
+"""Smallest extent of text as a share of the longer side of the band; a third of it in the other direction."""
 
 
 class StripDetector:
-    """Overlay detector of a stream, called for each frame. It keeps mean gradients near each
-    border.
-    """
+    """Overlay detector of a stream, called for each frame. It keeps mean gradients near each border."""
 
     def __init__(self) -> None:
         self.mask: NDArray[np.uint8] | None = None
-        """Mask uint8 [H, W], 0 on strips and text; None without any. Read-only, and the same array
-        until it changes.
-        """
+        """Mask uint8 [H, W], 0 on strips and text; None without any. Read-only, and the same array until it changes."""
         self._shape: tuple[int, ...] = ()
         self._bands: list[_Band] = []
         self._small: tuple[int, int] = (0, 0)

@@ -31,9 +31,7 @@ SMALLEST_INNER_REGION = 0.01
 MOST_GLARE = 0.3
 """Share of such a region that may be as bright as the brightest pixels, as highlights are."""
 SHARP_EDGE = 0.36
-"""Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare
-change gradually.
-"""
+"""Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare change gradually."""
 CORE = 0.35
 """Share of a region that must be below the threshold by at least `CLEARLY_BELOW`."""
 CLEARLY_BELOW = 0.08
@@ -121,9 +119,7 @@ def tool_regions(view: Regions) -> Bytes:
 
 
 def whole_tools(view: Regions, found: Bytes) -> Bytes:
-    """Return the tools extended by edges that reflect surrounding tissue, closed, and dilated by a
-    margin; 1 on tools.
-    """
+    """Return the tools extended by edges that reflect surrounding tissue, closed, and dilated by a margin; 1 on tools."""
     if not cv2.countNonZero(found):
         return found
     own = cv2.mean(view.redness, found)[0]
@@ -157,9 +153,7 @@ def _evidence(view: Regions) -> Bytes:
 
 
 def _change(view: Regions) -> Plane:
-    """Return the range of redness within three pixels. Valid only where that neighbourhood is
-    inside the view.
-    """
+    """Return the range of redness within three pixels. Valid only where that neighbourhood is inside the view."""
     return np.asarray(cv2.morphologyEx(view.redness, cv2.MORPH_GRADIENT, neighbourhood(7)), np.float32)
 
 
@@ -209,17 +203,13 @@ MEMORY = 0.9
 FINE_BINS, FINE_REACH = 4500, 4.5
 """Number and range (±) of fine bins of a frame's redness, more than bytes can resolve."""
 OTHER_SCENE = 0.7
-"""Difference of a frame's distribution (0..2, sum of absolute differences) from which another scene
-starts.
-"""
+"""Difference of a frame's distribution (0..2, sum of absolute differences) from which another scene starts."""
 EXPECTED_VALLEY, VALLEY_SPREAD, HIGHEST_VALLEY = 0.15, 0.3, 0.33
 """Mean and standard deviation of the expected threshold, and its upper bound. With correct white
 balance grey is at 0 and pale tissue at 0.3.
 """
 NO_VALLEY, SHARPER_EDGE = 0.25, 0.8
-"""Threshold without a valley, which includes pale tissue, and the sharper outline then required of
-tools.
-"""
+"""Threshold without a valley, which includes pale tissue, and the sharper outline then required of tools."""
 CLEAR_VALLEY = 1.15
 """Smallest ratio of both peaks to a valley."""
 SMALLEST_SHARE = 0.003
@@ -250,12 +240,11 @@ class View:
 
 
 class ToolFinder:
-    """Tool segmentation of one stream, called for each frame in order. Deterministic, with constant
-    memory.
+    """Tool segmentation of one stream, called for each frame in order. Deterministic, with constant memory.
 
-    Redness is log-opponent chromaticity (Berens and Finlayson, "Log-opponent chromaticity coding of
-    colour space", ICPR 2000): brightness cancels, and white balance adds a constant. The threshold
-    is found by the mode method (Prewitt and Mendelsohn, "The analysis of cell images", 1966).
+    Redness is log-opponent chromaticity (Berens and Finlayson, "Log-opponent chromaticity coding of colour space", ICPR
+    2000): brightness cancels, and white balance adds a constant. The threshold is found by the mode method (Prewitt and
+    Mendelsohn, "The analysis of cell images", 1966).
     """
 
     def __init__(self) -> None:
@@ -270,8 +259,7 @@ class ToolFinder:
         self._held = 0
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Segment the stream's next picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue,
-        0 = tool.
+        """Segment the stream's next picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool.
 
         Raises:
             InvalidInput: for any other array.
@@ -312,9 +300,7 @@ class ToolFinder:
         return tools
 
     def _stretched(self, redness: Plane, lit: Bytes) -> Plane:
-        """Update the running distribution with a frame and return its redness, normalised by the
-        scene's contrast.
-        """
+        """Update the running distribution with a frame and return its redness, normalised by the scene's contrast."""
         counts = cv2.calcHist([redness], [0], lit, [FINE_BINS], [-FINE_REACH, FINE_REACH])
         below = np.append(0.0, np.cumsum(counts, dtype=np.float64))
         reach = float(np.interp(0.75 * below[-1], below, FINE_EDGES))
@@ -352,9 +338,7 @@ def view_of(image: NDArray[np.uint8]) -> View:
 
 
 def field_of_view(brightness: Bytes) -> Bytes:
-    """Return 1 except on black pixels connected to the border of the picture. `brightness` is uint8
-    [h, w].
-    """
+    """Return 1 except on black pixels connected to the border of the picture. `brightness` is uint8 [h, w]."""
     darkest = math.ceil(min(24.0, 0.15 * cv2.minMaxLoc(brightness)[1])) - 1
     dark = np.empty_like(brightness)
     cv2.threshold(brightness, darkest, 1, cv2.THRESH_BINARY_INV, dst=dark)

@@ -48,8 +48,7 @@ def half_velocity(before_last: NDArray[np.uint8], last: NDArray[np.uint8]) -> ND
 
 
 def half_way(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """Interpolate the picture between two frames: the mean of both, each moved half-way to the
-    other.
+    """Interpolate the picture between two frames: the mean of both, each moved half-way to the other.
 
     Non-causal. Arguments and result are those of `half_velocity`.
     """
@@ -94,9 +93,7 @@ _MAX_THREADS = 4
 
 @dataclass(frozen=True)
 class BaselineScore:
-    """Score of one baseline: means in decibels over `frames` frames; None if no frame has the
-    measure.
-    """
+    """Score of one baseline: means in decibels over `frames` frames; None if no frame has the measure."""
 
     psnr_tissue_db: float | None = None
     psnr_frame_db: float | None = None
@@ -104,8 +101,7 @@ class BaselineScore:
     psnr_both_db: float | None = None
     """PSNR of a copy over pixels that are tissue both in the frame and in the copy.
 
-    Published frame-hold curves use this mask, so tissue occluded in the copy does not count as
-    error.
+    Published frame-hold curves use this mask, so tissue occluded in the copy does not count as error.
     """
 
 
@@ -128,9 +124,7 @@ class Baselines:
 
     @property
     def previous_frame_db(self) -> float | None:
-        """PSNR of frame i-1 against frame i, over all frames from the second on; baseline of live
-        quality.
-        """
+        """PSNR of frame i-1 against frame i, over all frames from the second on; baseline of live quality."""
         return self.copies.get(1, _NOTHING).psnr_tissue_db
 
     @property
@@ -313,9 +307,7 @@ class _Pool:
             self._pool.shutdown(cancel_futures=True)
 
     def put(self, work: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]) -> None:
-        """Submit `work(*arguments)` to the pool; `done` receives the results in order of
-        submission.
-        """
+        """Submit `work(*arguments)` to the pool; `done` receives the results in order of submission."""
         self._pending.append((self._pool.submit(work, *arguments), done))
         if len(self._pending) > 2 * self._threads:
             self._take()

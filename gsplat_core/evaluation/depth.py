@@ -123,9 +123,7 @@ class DepthErrors:
     relative: float
     """Mean absolute error divided by the true depth."""
     scaled_rmse_mm: float
-    """RMSE after scaling each frame by its median of true over rendered depth; measures shape
-    alone.
-    """
+    """RMSE after scaling each frame by its median of true over rendered depth; measures shape alone."""
     covered: float
     """Share of tissue pixels with known depth at which the model has depth. Others add no error."""
     frames: int
@@ -286,17 +284,13 @@ def normals_of(
 
 
 class NormalSums:
-    """Streaming accumulator of normal errors; both normals are computed from depth in
-    the same way.
-    """
+    """Streaming accumulator of normal errors; both normals are computed from depth in the same way."""
 
     def __init__(self) -> None:
         self._mean, self._median, self._plane, self._level = (ScoredMean() for _ in range(4))
 
     def add(self, camera: Camera, true: NDArray[Any], shown: NDArray[Any], known: NDArray[np.bool_]) -> None:
-        """Compare the surface of rendered depth z [H, W], 0 = empty, with the true surface where
-        known.
-        """
+        """Compare the surface of rendered depth z [H, W], 0 = empty, with the true surface where known."""
         compared = known & np.isfinite(shown) & (shown > 0)
         right, both = normals_of(camera, true, compared)
         found, _ = normals_of(camera, shown, compared)

@@ -7,14 +7,12 @@
 * parts of the deformation: shares of the pictures' change explained by motion, by colour, and by
   size and opacity
 
-Lengths are compared in the left camera's coordinates frame by frame, so the origin of a model does
-not matter. For a model of unknown scale, the `scaled` figures multiply all lengths by one factor
-for the whole sequence.
+Lengths are compared in the left camera's coordinates frame by frame, so the origin of a model does not matter. For a
+model of unknown scale, the `scaled` figures multiply all lengths by one factor for the whole sequence.
 
-A model that repaints tissue instead of moving it shows correct pictures with wrong motion.
-`PartSums` therefore renders frames with parts of the deformation frozen at a reference time. The
-share of a part is its Shapley value: the mean reduction of the squared difference over all orders
-of unfreezing.
+A model that repaints tissue instead of moving it shows correct pictures with wrong motion. `PartSums` therefore renders
+frames with parts of the deformation frozen at a reference time. The share of a part is its Shapley value: the mean
+reduction of the squared difference over all orders of unfreezing.
 """
 
 from __future__ import annotations
@@ -170,11 +168,10 @@ def evaluate_geometry(
     Reads the frames once, and again for the scaled views of a model without known scale.
 
     Args:
-        frames: frames of the recording, in order on each iteration; `Frame.seq` counts from 0 as in
-            `truth`.
+        frames: frames of the recording, in order on each iteration; `Frame.seq` counts from 0 as in `truth`.
         camera: camera of the frames; its pose is used for frames without one.
-        model_pose: callback that returns the left camera's world-to-camera pose in model space at a
-            frame; None selects that of `camera`.
+        model_pose: callback that returns the left camera's world-to-camera pose in model space at a frame; None selects
+            that of `camera`.
     """
     own = lambda frame: _posed(camera, model_pose(frame))
     depth, normals, views = DepthShareSums(), NormalSums(), ViewSums(camera, shown, truth)

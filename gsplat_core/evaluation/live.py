@@ -1,8 +1,7 @@
 """Scores of a live run: the picture on the screen when frame i+1 arrives, against frame i.
 
-The picture on the screen is the last one displayed before that moment. It shows frame i if it was
-in time, and an older frame otherwise. Pictures replaced earlier are not scored. Nothing is scored
-while a stopped source sends no frames.
+The picture on the screen is the last one displayed before that moment. It shows frame i if it was in time, and an older
+frame otherwise. Pictures replaced earlier are not scored. Nothing is scored while a stopped source sends no frames.
 """
 
 from __future__ import annotations
@@ -89,9 +88,7 @@ class Live:
     age_when_shown: Ages | None
     """Time from a frame's arrival until its picture is displayed."""
     age_on_screen: Ages | None
-    """Age of the displayed picture at the arrival of the next frame; at least one frame
-    interval.
-    """
+    """Age of the displayed picture at the arrival of the next frame; at least one frame interval."""
     in_time: int
     """Number of frames whose own picture was on the screen when the next frame arrived."""
     behind: Mapping[int, int]
@@ -129,13 +126,11 @@ class LiveSums:
         """Score the picture that was on the screen when the next frame arrived.
 
         Args:
-            quality: quality of the picture against frame `quality.seq`, the newest one at that
-                time.
+            quality: quality of the picture against frame `quality.seq`, the newest one at that time.
             time_s: recording time of that frame in seconds.
             behind: lateness of the picture in frames.
             age_ms: age of the picture at that moment in milliseconds.
-            before_db: PSNR in dB of the previous raw frame, over tissue and over the whole frame;
-                NaN if unavailable.
+            before_db: PSNR in dB of the previous raw frame, over tissue and over the whole frame; NaN if unavailable.
         """
         if self._first_s is None:
             self._first_s = time_s

@@ -59,8 +59,7 @@ def _neighbours(gaussians: Gaussians, points: Tensor) -> tuple[Tensor, Tensor]:
         points: [P, 3].
 
     Returns:
-        Indices [P, K] and weights [P, K] that sum to 1. A weight is the opacity times a Gaussian of
-            the distance.
+        Indices [P, K] and weights [P, K] that sum to 1. A weight is the opacity times a Gaussian of the distance.
     """
     shows = gaussians.opacities.detach()
     candidates = torch.nonzero(shows > LEAST_OPACITY).flatten()
@@ -229,9 +228,7 @@ class EndPointErrors:
     median_px: float
     mean_px: float
     median_mm: float | None
-    """Errors of the scene flow in the recording's unit; None (as `mean_mm`) without true scene
-    flow.
-    """
+    """Errors of the scene flow in the recording's unit; None (as `mean_mm`) without true scene flow."""
     mean_mm: float | None
 
 
@@ -266,8 +263,7 @@ class _Started:
 class FlowSums:
     """Flow errors accumulated over all frames in order.
 
-    `begin` samples the pixels of a frame. `arrive` compares their motion when the next frame
-    arrives.
+    `begin` samples the pixels of a frame. `arrive` compares their motion when the next frame arrives.
     """
 
     def __init__(self, model: Model, camera: Camera, files: MotionFiles) -> None:

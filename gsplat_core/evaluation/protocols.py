@@ -182,15 +182,14 @@ def evaluate_causal(
 ) -> Score:
     """Predict, score, then train on each frame in order. The first frame has no prediction.
 
-    Damaged and withheld frames are neither scored nor trained on. Frames without tissue are trained
-    on but not scored.
+    Damaged and withheld frames are neither scored nor trained on. Frames without tissue are trained on but not scored.
 
     Args:
         frames: frames in order; leading frames unfit for training are skipped.
         learner: untrained learner.
         picture_of: callback that renders a model for a frame.
-        predict: callback that returns the model to render for an unseen frame. The frame passed to
-            it has a black image.
+        predict: callback that returns the model to render for an unseen frame. The frame passed to it has a black
+            image.
         record: callback that receives the figures of each scored frame.
 
     Returns:
@@ -293,9 +292,7 @@ class PlaceFinder:
 
 
 def _last_stay(apart: NDArray[np.float64]) -> int | None:
-    """Return the index of the newest earlier stay at the same place with an absence
-    since, or None.
-    """
+    """Return the index of the newest earlier stay at the same place with an absence since, or None."""
     away = np.flatnonzero(apart >= AWAY)
     if not len(away):
         return None
@@ -306,8 +303,7 @@ def _last_stay(apart: NDArray[np.float64]) -> int | None:
 def _distances(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return pairwise distances [K, K] of poses [K, 4, 4]; 1 is the limit of the same place.
 
-    The distance is the larger of the position and the viewing-direction difference, each divided by
-    its own limit.
+    The distance is the larger of the position and the viewing-direction difference, each divided by its own limit.
     """
     rotations, translations = poses[:, :3, :3], poses[:, :3, 3]
     centres = -np.einsum("kij,ki->kj", rotations, translations)

@@ -148,8 +148,7 @@ Shown = Callable[[Camera, Frame], Picture]
 class ViewSums:
     """Novel-view scores accumulated over frames in any order.
 
-    Camera positions are divided by `scale`, the factor that converts model lengths to the
-    recording's unit.
+    Camera positions are divided by `scale`, the factor that converts model lengths to the recording's unit.
     """
 
     def __init__(self, camera: Camera, shown: Shown, truth: GroundTruth, scale: float = 1.0) -> None:
@@ -179,9 +178,7 @@ class ViewSums:
     def _distance(
         self, frame: Frame, own: Camera, true: NDArray[Any] | None, depth: NDArray[Any] | None
     ) -> float | None:
-        """Return the median tissue distance, from true depth if known, otherwise from the model's
-        depth.
-        """
+        """Return the median tissue distance, from true depth if known, otherwise from the model's depth."""
         known = np.zeros(0) if true is None else true[(true > 0) & (True if frame.mask is None else frame.mask != 0)]
         if not known.size:
             shows = self._shown(own, frame).depth if depth is None else depth

@@ -1,9 +1,8 @@
 """Tracks of a grid of key-frame points through all pictures of a recording.
 
-Optical flow is computed directly between a key picture and every other one, initialised with the
-flow to the neighbouring picture. Errors therefore do not accumulate as in frame-to-frame tracking.
-Pictures are compared by local texture relative to the surrounding contrast, because light and
-reflections move with the scope.
+Optical flow is computed directly between a key picture and every other one, initialised with the flow to the
+neighbouring picture. Errors therefore do not accumulate as in frame-to-frame tracking. Pictures are compared by local
+texture relative to the surrounding contrast, because light and reflections move with the scope.
 """
 
 from __future__ import annotations
@@ -31,9 +30,7 @@ BROAD_PX, CONTRAST_PX = 5.0, 10.0
 window for the local contrast.
 """
 LEAST_CONTRAST = 0.01
-"""Lower bound of the local contrast of log brightness; lower contrast is noise and is not
-amplified.
-"""
+"""Lower bound of the local contrast of log brightness; lower contrast is noise and is not amplified."""
 MARGIN_PX = 5
 """Distance from tools in pixels within which flow is ignored."""
 BORDER_PX = 6
@@ -90,9 +87,7 @@ def small_camera(frame: Frame, camera: Camera) -> Camera:
 
 
 def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
-    """Return the normalised texture of a frame, reduced to `LONGEST_PX`, with tools and highlights
-    marked unusable.
-    """
+    """Return the normalised texture of a frame, reduced to `LONGEST_PX`, with tools and highlights marked unusable."""
     height, width = frame.image.shape[:2]
     small = small_camera(frame, camera)
     size = small.width_px, small.height_px
@@ -153,9 +148,7 @@ def follow_grids(
 def _from_key(
     pictures: Sequence[TexturedPicture], key: int, start: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return positions [T, N, 2] and validity [T, N] of the points `start` [N, 2] of a key picture
-    in all pictures.
-    """
+    """Return positions [T, N, 2] and validity [T, N] of the points `start` [N, 2] of a key picture in all pictures."""
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     here = start.astype(int)
     usable = pictures[key].usable[here[:, 1], here[:, 0]] > 0

@@ -115,11 +115,10 @@ class Measurement:
         return Length(value, _error_of_distance(first, second, between / value if value > 0 else np.zeros(3)))
 
     def length_along(self, first: SurfacePoint, second: SurfacePoint) -> Length:
-        """Return the length along the surface under the straight line between two points in the
-        picture.
+        """Return the length along the surface under the straight line between two points in the picture.
 
-        Steps are two pixels long, about the detail of the splats, so that jitter of z does not
-        lengthen the path. The error combines the errors of both ends and the jitter.
+        Steps are two pixels long, about the detail of the splats, so that jitter of z does not lengthen the path. The
+        error combines the errors of both ends and the jitter.
 
         Raises:
             InvalidSetting: if any point of the path was not observed.
@@ -147,9 +146,7 @@ def _error_of_distance(first: SurfacePoint, second: SurfacePoint, direction: NDA
 
 
 def _roughness(places: NDArray[np.floating]) -> float:
-    """Return the difference in length between the path through all points and the path through
-    every other point.
-    """
+    """Return the difference in length between the path through all points and the path through every other point."""
     if len(places) < 3:
         return 0.0
     fine = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())

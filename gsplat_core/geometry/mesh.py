@@ -1,6 +1,4 @@
-"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at
-occlusion edges.
-"""
+"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at occlusion edges."""
 
 from __future__ import annotations
 
@@ -33,8 +31,7 @@ class Mesh:
     colours: NDArray[np.uint8]
     """Displayed RGB colours [V, 3]."""
     triangles: NDArray[np.int32]
-    """Vertex indices [T, 3], counter-clockwise seen from the visible side; empty for a point cloud.
-    """
+    """Vertex indices [T, 3], counter-clockwise seen from the visible side; empty for a point cloud."""
 
 
 def mesh_of(model: Model, time_s: float, camera: Camera | None = None) -> Mesh:
@@ -103,9 +100,7 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer
 
 
 def _triangles(across: NDArray[np.bool_], down: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return pixel indices [T, 3]: two triangles for each square with four connected sides, one if
-    a corner is cut off.
-    """
+    """Return pixel indices [T, 3]: two triangles for each square with four connected sides, one if a corner is cut off."""
     height, width = across.shape[0], down.shape[1]
     pixel = np.arange(height * width).reshape(height, width)
     upper_left, upper_right = pixel[:-1, :-1], pixel[:-1, 1:]

@@ -22,9 +22,8 @@ Array = NDArray[np.float64]
 SAMPLES = 100_000
 """Approximate number of samples spread over the mesh for the nearest-neighbour search."""
 CANDIDATES = 6
-"""Nearest samples whose triangles are tested exactly. The closest point may be on another triangle
-where triangles of very different sizes meet. The error is then less than the distance between
-samples.
+"""Nearest samples whose triangles are tested exactly. The closest point may be on another triangle where triangles of
+very different sizes meet. The error is then less than the distance between samples.
 """
 MOST_TRIANGLES = 5_000_000
 LEAST_EXTENT, MOST_EXTENT = 1e-6, 1e9
@@ -118,9 +117,7 @@ def _on_segment(points: Array, start: Array, end: Array) -> Array:
 
 
 def _sampled(corners: Array, areas: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return points spread evenly over the triangles, at least one each, and their triangle
-    indices.
-    """
+    """Return points spread evenly over the triangles, at least one each, and their triangle indices."""
     # Each triangle is cut into n² equal parts; the centroid of each part is a sample.
     cuts = np.clip(np.ceil(np.sqrt(areas * SAMPLES / areas.sum())), 1, 400).astype(int)
     samples, owners = [], []
@@ -144,9 +141,7 @@ TRIM = 0.8
 """Share of the pairs used, closest first."""
 MOST_ROUNDS = 60
 SETTLED = 1e-6
-"""Largest displacement of a point in one round, as a share of the surface's extent, below which the
-iteration ends.
-"""
+"""Largest displacement of a point in one round, as a share of the surface's extent, below which the iteration ends."""
 MOST_POINTS = 5000
 """Largest number of points used; larger sets are subsampled."""
 
@@ -167,9 +162,7 @@ class Registration:
 
 @dataclass(frozen=True)
 class Distances:
-    """Statistics of signed point-to-surface distances, positive on the side of the surface's
-    normals.
-    """
+    """Statistics of signed point-to-surface distances, positive on the side of the surface's normals."""
 
     mean: float
     median: float

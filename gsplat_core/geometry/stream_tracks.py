@@ -151,9 +151,7 @@ class StreamTracks:
         self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
 
     def take_up(self) -> Numbers:
-        """Detect new corners if points are missing. Returns their numbers, which are larger than
-        all earlier ones.
-        """
+        """Detect new corners if points are missing. Returns their numbers, which are larger than all earlier ones."""
         picture, missing = self.picture, MOST_POINTS - len(self.numbers)
         if picture is None or missing < MOST_POINTS // 10:
             return np.zeros(0, np.int64)

@@ -15,8 +15,7 @@ TORN_DEGREES = 80.0
 counts as an occlusion edge.
 """
 MOST_ANGLE_RAD = 1.5
-"""Largest angle of a fisheye ray to the axis in radians; at 90 degrees a ray has no point at z = 1.
-"""
+"""Largest angle of a fisheye ray to the axis in radians; at 90 degrees a ray has no point at z = 1."""
 
 
 def rays_of(camera: Camera, pixels: Array) -> tuple[Array, Array]:
@@ -101,9 +100,7 @@ def _pair(values: NDArray, axis: int) -> tuple[NDArray, NDArray]:
 
 
 def _tangent(points: Array, joins: NDArray[np.bool_], axis: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the tangent along `axis` [H, W, 3], from both connected neighbours or one, and where
-    it exists [H, W].
-    """
+    """Return the tangent along `axis` [H, W, 3], from both connected neighbours or one, and where it exists [H, W]."""
     before, after = _pair(points, axis)
     step = np.where(joins[..., None], after - before, 0)
     padding = [(0, 0), (0, 0), (0, 0)]

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Points = NDArray[np.float32]
-"""Pixel positions (x, y) float32 [N, 2] in OpenCV's convention: the centre of the first pixel is at
-0.
-"""
+"""Pixel positions (x, y) float32 [N, 2] in OpenCV's convention: the centre of the first pixel is at 0."""
 
 
 def followed(
@@ -37,8 +35,7 @@ def followed(
         levels: pyramid levels in addition to the full picture.
 
     Returns:
-        Positions in `second` [N, 2], and forward-backward errors in pixels [N], infinite for lost
-            points.
+        Positions in `second` [N, 2], and forward-backward errors in pixels [N], infinite for lost points.
     """
     if not len(points):
         return points, np.zeros(0, np.float32)
@@ -124,9 +121,7 @@ class FeatureTracks:
         self._seen.append((self._numbers.copy(), self._points.astype(np.float64) + 0.5))
 
     def observations(self, least: int = 3) -> Observations:
-        """Return all observations so far of points observed at least `least` times, with the points
-        renumbered from 0.
-        """
+        """Return all observations so far of points observed at least `least` times, with the points renumbered from 0."""
         frames = np.concatenate([np.full(len(numbers), index) for index, (numbers, _) in enumerate(self._seen)])
         points = np.concatenate([numbers for numbers, _ in self._seen])
         pixels = np.concatenate([pixels for _, pixels in self._seen])

@@ -34,9 +34,7 @@ ALIGNMENT = 8
 
 
 def safetensors_pieces(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memoryview]:
-    """Yield a safetensors file of contiguous float32 CPU tensors, as `safetensors.torch.save`
-    would.
-    """
+    """Yield a safetensors file of contiguous float32 CPU tensors, as `safetensors.torch.save` would."""
     names = sorted(tensors)
     entries, start = {}, 0
     for name in names:
@@ -112,10 +110,8 @@ def load_bundle(folder: str | Path) -> Model:
 
     Raises:
         UnknownFormatVersion: if a later version wrote the bundle.
-        BundleCorrupt: for out-of-range values, wrong digest, truncation, wrong tensors, NaN or
-            infinity.
-        BundleError: if the file is missing, unreadable, not a regular file, or larger than the
-            available memory.
+        BundleCorrupt: for out-of-range values, wrong digest, truncation, wrong tensors, NaN or infinity.
+        BundleError: if the file is missing, unreadable, not a regular file, or larger than the available memory.
     """
     folder = Path(folder)
     path = folder / TENSORS
@@ -226,8 +222,7 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
 def _check_size(path: Path, expected: dict[str, Tensor], start: bytes, size: int) -> None:
     """Check the file size against the manifest and the header length, before reading anything.
 
-    A safetensors file consists of eight bytes with the header's length, the JSON header, and the
-    tensors without gaps.
+    A safetensors file consists of eight bytes with the header's length, the JSON header, and the tensors without gaps.
     """
     if len(start) < 8:
         raise BundleCorrupt(f"{path} has only {size} bytes; copy the bundle again")

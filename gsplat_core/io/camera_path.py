@@ -71,9 +71,7 @@ class CameraPath:
         return self._times[0], self._times[-1]
 
     def camera(self, start: Camera, time_s: float) -> Camera:
-        """Return `start` at the path's pose and, if given, with its intrinsics; times
-        are clamped.
-        """
+        """Return `start` at the path's pose and, if given, with its intrinsics; times are clamped."""
         k = min(max(bisect_right(self._times, time_s) - 1, 0), len(self._times) - 1)
         before, after = self._waypoints[k], self._waypoints[min(k + 1, len(self._times) - 1)]
         span = after.time_s - before.time_s
@@ -130,9 +128,7 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _turned(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """Interpolate between two rotations [3, 3] by `share` along the geodesic
-    (Rodrigues' formula).
-    """
+    """Interpolate between two rotations [3, 3] by `share` along the geodesic (Rodrigues' formula)."""
     import cv2  # imported lazily, because most processes read no path
 
     between, _ = cv2.Rodrigues(first.T @ second)

@@ -118,10 +118,9 @@ def unfinished(path: Path) -> Iterator[None]:
 class PartialFile:
     """Temporary file next to `target` that is renamed to `target` when complete.
 
-    `file` is open for reading and writing bytes. `path` serves libraries that open files by name;
-    it has the target's suffix, which they use to select a format. As a context manager, the object
-    finishes the file, or removes it after an exception. Alternatively call `finish()` or
-    `discard()`.
+    `file` is open for reading and writing bytes. `path` serves libraries that open files by name; it has the target's
+    suffix, which they use to select a format. As a context manager, the object finishes the file, or removes it after
+    an exception. Alternatively call `finish()` or `discard()`.
 
     Raises:
         OSError: if the file cannot be created or written.
@@ -196,8 +195,7 @@ class PartialFolder:
         """Move the folder to `target`, atomically if the system can exchange two names.
 
         Returns:
-            New path of the folder previously at `target`, to be removed by the caller; None if
-                there was none.
+            New path of the folder previously at `target`, to be removed by the caller; None if there was none.
         """
         earlier = None
         if os.path.lexists(self.target):

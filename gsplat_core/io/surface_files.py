@@ -1,8 +1,7 @@
 """Reader of triangle meshes (positions and faces) from `.ply`, `.stl` and `.obj` files.
 
-`.ply` and `.stl` may be ASCII or binary. Faces with more than three corners become triangle fans.
-Normals, colours and textures are skipped. Files are untrusted: sizes are validated before memory is
-allocated, and nothing is executed.
+`.ply` and `.stl` may be ASCII or binary. Faces with more than three corners become triangle fans. Normals, colours and
+textures are skipped. Files are untrusted: sizes are validated before memory is allocated, and nothing is executed.
 """
 
 from __future__ import annotations

@@ -53,8 +53,7 @@ class Model:
     unseen_s: Tensor | None = None
     """Time since each Gaussian was last visible, float64 [N], in seconds of the stream.
 
-    Live training updates it every few frames; 0 means visible. None if unknown. Neither saved nor
-    part of the digest.
+    Live training updates it every few frames; 0 means visible. None if unknown. Neither saved nor part of the digest.
     """
 
     depth_source: DepthSource | None = None
@@ -148,9 +147,7 @@ class Model:
         return deformed
 
     def seen_by_right(self) -> Model:
-        """Return the model with the right eye's colours; itself if the right eye was
-        not trained.
-        """
+        """Return the model with the right eye's colours; itself if the right eye was not trained."""
         if self.gaussians.right_sh is None:
             return self
         return dataclasses.replace(self, gaussians=self.gaussians.seen_by_right())

@@ -1,10 +1,9 @@
 """Snapshots of a scene in training, published without allocation or host synchronisation.
 
-On a GPU, the publisher owns a few slots: tensors at fixed addresses with spare capacity for
-Gaussians and bumps. Each snapshot is copied into a free slot on the current stream. A renderer that
-captured a CUDA graph for a slot replays it for every later snapshot in that slot. A slot becomes
-free when its snapshot has no references left. Pending GPU reads are awaited on the stream before
-the slot is overwritten.
+On a GPU, the publisher owns a few slots: tensors at fixed addresses with spare capacity for Gaussians and bumps. Each
+snapshot is copied into a free slot on the current stream. A renderer that captured a CUDA graph for a slot replays it
+for every later snapshot in that slot. A slot becomes free when its snapshot has no references left. Pending GPU reads
+are awaited on the stream before the slot is overwritten.
 """
 
 from __future__ import annotations
@@ -74,9 +73,7 @@ class SnapshotSlot:
         return self._holder is None or self._holder() is None
 
     def write(self, gaussians: Gaussians, field: DeformationField | None) -> None:
-        """Enqueue the copy of a scene on the current stream, after pending reads of the old
-        content.
-        """
+        """Enqueue the copy of a scene on the current stream, after pending reads of the old content."""
         self._order.before_writing()
         with torch.no_grad():
             if not self._overwrite(gaussians, field):
@@ -211,8 +208,7 @@ class SnapshotSlots:
         Args:
             device: device of the slots.
             most: maximum number of slots.
-            rows: initial capacity of each slot in Gaussians; 0 selects 1.25 times the first scene's
-                count.
+            rows: initial capacity of each slot in Gaussians; 0 selects 1.25 times the first scene's count.
         """
         self._device = torch.device(device)
         self._rows = rows
@@ -243,8 +239,7 @@ class SnapshotSlots:
     ) -> Snapshot:
         """Enqueue a copy of a scene on the current stream and return its snapshot.
 
-        The originals may be changed on that stream immediately. `unseen_s` is not copied and must
-        stay unchanged.
+        The originals may be changed on that stream immediately. `unseen_s` is not copied and must stay unchanged.
 
         Raises:
             InvalidInput: if all slots are in use, or the field cannot be stored in a slot.

@@ -1,7 +1,6 @@
 """Alpha compositing of depth-sorted splats in plain torch (Kerbl et al. 2023, eq. 3).
 
-Any floating dtype, differentiable; test reference of the compiled op. Constants default to those of
-gsplat 1.6.
+Any floating dtype, differentiable; test reference of the compiled op. Constants default to those of gsplat 1.6.
 """
 
 from __future__ import annotations
@@ -112,9 +111,7 @@ class _Instances:
             self.absolute = absolute.view(-1, 2)
 
     def blend(self, tile: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return colours [P, D] and remaining transmittance [P] at the pixel centres [P, 2] of a
-        tile.
-        """
+        """Return colours [P, D] and remaining transmittance [P] at the pixel centres [P, 2] of a tile."""
         colors = pixels.new_zeros(len(pixels), self.values[tile].shape[-1] - 6)
         product = through = pixels.new_ones(len(pixels))
         parts = zip(self.ids[tile].split(SPLATS_AT_A_TIME), self.values[tile].split(SPLATS_AT_A_TIME), strict=True)

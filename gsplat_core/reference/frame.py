@@ -1,6 +1,4 @@
-"""One frame from raw Gaussians and deltas in plain torch: test reference of the fused
-frame path.
-"""
+"""One frame from raw Gaussians and deltas in plain torch: test reference of the fused frame path."""
 
 from __future__ import annotations
 
@@ -23,16 +21,14 @@ def render_frame(
 ) -> tuple[Tensor, Tensor]:
     """Deform, activate and render N Gaussians for one camera (Kerbl et al. 2023); differentiable.
 
-    Accepts any floating dtype. A Gaussian with a non-finite parameter or delta is culled and gets
-    zero gradients.
+    Accepts any floating dtype. A Gaussian with a non-finite parameter or delta is culled and gets zero gradients.
 
     Args:
-        gaussians: raw parameters: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3],
-            logit_opacities [N], sh [N, B, 3] with B a square.
+        gaussians: raw parameters: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3], logit_opacities [N],
+            sh [N, B, 3] with B a square.
         deltas: [N, 16], added to the raw parameters in the layout of `scene.layout`, or None.
         view: camera; its tensors have the Gaussians' dtype.
-        expected_depth: normalise the fourth channel to the weighted mean of z; otherwise it is the
-            weighted sum.
+        expected_depth: normalise the fourth channel to the weighted mean of z; otherwise it is the weighted sum.
 
     Returns:
         Image [H, W, 4] (red, green, blue, depth) and alphas [H, W].

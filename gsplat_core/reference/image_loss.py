@@ -17,9 +17,7 @@ STEEP_AS_L1 = 0.01
 
 
 def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
-    """Return the mean of the kept values, or 0 if none is kept. NaN in other values has
-    no effect.
-    """
+    """Return the mean of the kept values, or 0 if none is kept. NaN in other values has no effect."""
     return torch.where(keep, values, torch.zeros_like(values)).sum() / keep.sum().clamp(min=1)
 
 

@@ -28,8 +28,7 @@ FISHEYE_SERIES_BELOW = 0.01
 def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Project with the pinhole model.
 
-    Returns image points [..., C, N, 2] and Jacobians [..., C, N, 2, 3] of camera-space points [...,
-    C, N, 3].
+    Returns image points [..., C, N, 2] and Jacobians [..., C, N, 2, 3] of camera-space points [..., C, N, 3].
     """
     x, y, z = p.unbind(-1)
     fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -55,8 +54,7 @@ def _ortho(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tens
 def _fisheye(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Project with the equidistant fisheye model, in which the image radius is f θ.
 
-    With s = θ/r and q = (dθ/dr - s)/r², du/dx = fx (s + q x²). Results have the shapes of
-    `_pinhole`.
+    With s = θ/r and q = (dθ/dr - s)/r², du/dx = fx (s + q x²). Results have the shapes of `_pinhole`.
     """
     x, y, z = p.unbind(-1)
     fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))

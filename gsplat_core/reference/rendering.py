@@ -24,9 +24,7 @@ def bin_splats(
     n_images: int | None = None,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Run `isect_tiles` (sorted) and `isect_offset_encode`; `options` are those of
-    `isect_tiles`.
-    """
+    """Run `isect_tiles` (sorted) and `isect_offset_encode`; `options` are those of `isect_tiles`."""
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, n_images=n_images, **options)
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
     offsets = isect_offset_encode(isect_ids, images, grid.tile_width, grid.tile_height)

@@ -1,7 +1,6 @@
 """Structural similarity (Wang et al. 2004) in plain torch: any floating dtype, differentiable.
 
-Usual parameters: 11x11 Gaussian window of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, values
-in 0..1.
+Usual parameters: 11x11 Gaussian window of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, values in 0..1.
 """
 
 from __future__ import annotations

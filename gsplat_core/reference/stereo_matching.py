@@ -26,8 +26,7 @@ def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> t
     """Match rectified grey pictures, uint8 [H, W].
 
     Returns:
-        Disparities in 1/16 px, int32 [H, W], and a mask [H, W] of pixels without jump or hole
-            nearby.
+        Disparities in 1/16 px, int32 [H, W], and a mask [H, W] of pixels without jump or hole nearby.
     """
     costs = window_costs(left.long(), right.long(), lowest, count)
     messages = (
@@ -81,9 +80,7 @@ def _slope(grey: Tensor) -> Tensor:
 
 
 def _range(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return minimum and maximum of each value and its interpolated half-pixel neighbours in the
-    row.
-    """
+    """Return minimum and maximum of each value and its interpolated half-pixel neighbours in the row."""
     before, after = (values + _moved(values, 0, -1)) // 2, (values + _moved(values, 0, 1)) // 2
     least, most = torch.minimum(before, after), torch.maximum(before, after)
     return torch.minimum(values, least), torch.maximum(values, most)
@@ -110,8 +107,7 @@ def checked_winners(totals: Tensor, lowest: int) -> Tensor:
         lowest: smallest disparity in pixels.
 
     Returns:
-        Disparities in 1/16 px [H, W]; `UNKNOWN` where ambiguous or inconsistent with the right
-            picture.
+        Disparities in 1/16 px [H, W]; `UNKNOWN` where ambiguous or inconsistent with the right picture.
     """
     height, width, count = totals.shape
     numbers = torch.arange(count, device=totals.device)
@@ -147,9 +143,7 @@ def checked_winners(totals: Tensor, lowest: int) -> Tensor:
 
 
 def without_patches(found: Tensor) -> Tensor:
-    """Invalidate small connected patches (at most `PATCH_PIXELS`) that differ from their
-    surroundings.
-    """
+    """Invalidate small connected patches (at most `PATCH_PIXELS`) that differ from their surroundings."""
     known = found != UNKNOWN
     labels = torch.arange(found.numel(), device=found.device).reshape(found.shape)
     while True:

@@ -131,8 +131,7 @@ class Camera:
     def right_eye(self, baseline: float) -> Camera:
         """Return the right eye's camera of a rectified pair in which this is the left camera.
 
-        The intrinsics are equal. The pose maps left-camera coordinates to its own
-        (`Frame.right_camera`).
+        The intrinsics are equal. The pose maps left-camera coordinates to its own (`Frame.right_camera`).
 
         Args:
             baseline: distance between the eyes in the scene's unit.

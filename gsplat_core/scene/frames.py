@@ -22,9 +22,7 @@ class FrameStatus(Enum):
     REPLAY = "replay"
     STALE = "stale"
     DAMAGED = "damaged"
-    """Parts may be the decoder's guess. The frame is displayed, but neither trained on
-    nor scored.
-    """
+    """Parts may be the decoder's guess. The frame is displayed, but neither trained on nor scored."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +38,7 @@ class Frame:
     right_image: NDArray[np.uint8] | None = None
     """The right eye of a rectified stereo pair, RGB uint8 [H, W, 3]."""
     right_camera: Camera | None = None
-    """Camera of `right_image`; its pose maps left-camera coordinates to its own. None
-    if unknown.
-    """
+    """Camera of `right_image`; its pose maps left-camera coordinates to its own. None if unknown."""
     depth: NDArray[np.float32] | None = None
     """z in millimetres [H, W]; 0 = unknown."""
     depth_confidence: NDArray[np.float32] | None = None
@@ -71,9 +67,7 @@ class Frame:
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
     withheld: str | None = None
-    """Reason for withholding the frame from training ("blur", "out of body"); None to
-    train on it.
-    """
+    """Reason for withholding the frame from training ("blur", "out of body"); None to train on it."""
     new_scene: str | None = None
     """Reason for a scene change at this frame ("cut", "resized"); None if the scene continues."""
     scene: int = 0
@@ -126,8 +120,7 @@ class Frame:
     def depth_is_metric(self) -> bool:
         """True if the unit of `depth` is known.
 
-        The answer stays valid after `depth` was dropped to save memory, because `depth_origin` is
-        kept.
+        The answer stays valid after `depth` was dropped to save memory, because `depth_origin` is kept.
         """
         return self.depth_origin is not None and self.depth_origin.is_metric(self.right_camera is not None)
 

@@ -38,8 +38,7 @@ class Orbit:
             raise InvalidSetting(f"zoom is {self.zoom:g}; it must be from {LEAST_ZOOM:g} to {MOST_ZOOM:g}")
 
     def camera(self, start: Camera, distance: float) -> Camera:
-        """Return the virtual camera orbiting the point `distance` in front of `start`, in scene
-        units.
+        """Return the virtual camera orbiting the point `distance` in front of `start`, in scene units.
 
         Without rotation and zoom this is `start`.
 

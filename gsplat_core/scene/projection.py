@@ -43,9 +43,7 @@ def pixels_of(camera: Camera, points: Points) -> Points:
 
 
 def at_pixels(plane: NDArray[Any], pixels: Points) -> NDArray[Any]:
-    """Sample a plane at the pixels [...] containing the positions [..., 2]; 0 outside
-    the picture.
-    """
+    """Sample a plane at the pixels [...] containing the positions [..., 2]; 0 outside the picture."""
     height, width = plane.shape[:2]
     inside = np.isfinite(pixels).all(axis=-1)
     column, row = (np.floor(np.where(inside, pixels[..., k], -1)).astype(np.int64) for k in (0, 1))

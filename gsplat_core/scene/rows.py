@@ -49,9 +49,7 @@ class RowMoves:
 
     @property
     def order(self) -> Tensor:
-        """Return the moves as one gather index: the old row of each remaining row,
-        int64 [count].
-        """
+        """Return the moves as one gather index: the old row of each remaining row, int64 [count]."""
         order = torch.arange(self.count, device=self.to.device)
         order[self.to] = self.source
         return order

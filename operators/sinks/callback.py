@@ -9,8 +9,7 @@ from operators.graph import Operator, OperatorSpec
 
 
 class CallbackSinkOp(Operator):
-    """Calls a function with each message, in the operator's thread. Its exceptions fail the
-    operator.
+    """Calls a function with each message, in the operator's thread. Its exceptions fail the operator.
 
     Inputs:
         message: any value.

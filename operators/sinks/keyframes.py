@@ -25,8 +25,7 @@ class KeyframesResult:
 class KeyframesOp(Operator):
     """Keeps every k-th frame, at most `2 * count`, doubling k when full, and also the worst frame.
 
-    Memory is bounded for an endless stream, and the frames are evenly spread whenever the stream
-    ends.
+    Memory is bounded for an endless stream, and the frames are evenly spread whenever the stream ends.
 
     Inputs:
         scored: `ScoredFrame`.
@@ -86,16 +85,12 @@ class KeyframesOp(Operator):
 
     @property
     def worst_seq(self) -> int | None:
-        """Sequence number of the frame with the lowest tissue PSNR; None before the first scored
-        frame.
-        """
+        """Sequence number of the frame with the lowest tissue PSNR; None before the first scored frame."""
         return None if self._worst is None else self._worst.rendered.frame.seq
 
 
 def _without_inputs(scored: ScoredFrame) -> ScoredFrame:
-    """Return the frame without raw planes that the report does not show, which are half of its
-    memory.
-    """
+    """Return the frame without raw planes that the report does not show, which are half of its memory."""
     frame = scored.rendered.frame.with_fields(right_image=None, depth=None)
     return replace(scored, rendered=replace(scored.rendered, frame=frame))
 

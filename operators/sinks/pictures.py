@@ -10,9 +10,7 @@ from operators.messages import RenderedFrame
 from operators.remembered import marked
 
 MINIMUM_PANE_WIDTH_PX = 320
-"""Minimum width of a pane. Smaller pictures are enlarged by an integer factor to fit the
-caption.
-"""
+"""Minimum width of a pane. Smaller pictures are enlarged by an integer factor to fit the caption."""
 CAPTION_HEIGHT_PX = 26
 ERROR_FULL_SCALE = 32
 """Mean absolute RGB difference (0..255) at the bright end of the error colours."""
@@ -92,8 +90,7 @@ def error_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
 
 
 def depth_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """Draw depth in colours (bright = near) from its 2nd to its 98th percentile, uint8 RGB [H, W,
-    3].
+    """Draw depth in colours (bright = near) from its 2nd to its 98th percentile, uint8 RGB [H, W, 3].
 
     Unknown depth is grey.
     """

@@ -25,9 +25,7 @@ class SinkOptions:
 
 
 def input_of(sink: Operator) -> tuple[str, type]:
-    """Return name and type of a sink's input. Raises InvalidInput if the operator is not a valid
-    sink.
-    """
+    """Return name and type of a sink's input. Raises InvalidInput if the operator is not a valid sink."""
     ports = [(port.name, port.type) for port in sink.spec.inputs.values()]
     if len(ports) != 1 or ports[0][1] not in (RenderedFrame, ScoredFrame):
         raise InvalidInput(

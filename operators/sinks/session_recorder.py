@@ -50,9 +50,7 @@ class Recorded:
     shown: int = 0
     """Number of written displayed pictures."""
     lost: Mapping[str, int] | None = None
-    """Items that were not written, by kind and reason, for example `frame: the disk is too
-    slow`.
-    """
+    """Items that were not written, by kind and reason, for example `frame: the disk is too slow`."""
     bytes: int = 0
     """Size on disk in bytes."""
     deleted_segments: int = 0
@@ -86,9 +84,7 @@ def stated(recorded: Recorded) -> list[str]:
 QUEUE_BYTES = 256 * 2**20
 """Capacity of the queue in bytes of pictures: about three seconds of 640x512 at 30 frames/s."""
 SHOWN_SHARE = 0.5
-"""Fill level of the queue at which displayed pictures are dropped. They can be recomputed, input
-frames cannot.
-"""
+"""Fill level of the queue at which displayed pictures are dropped. They can be recomputed, input frames cannot."""
 MOST_LINES = 100_000
 """Maximum number of queued items. If it is reached, the disk is considered unresponsive."""
 MOST_ARRIVED = 64
@@ -116,21 +112,17 @@ class _Part:
     """Fill level of the queue above which the item is dropped."""
 
     def lost(self, why: str) -> LostLine | None:
-        """Return the schedule line that records the loss; None for a line without pictures or an
-        invalid number.
-        """
+        """Return the schedule line that records the loss; None for a line without pictures or an invalid number."""
         if self.what is None or not 0 <= self.seq <= MOST_NS:
             return None
         return LostLine(seq=self.seq, what=self.what, why=why)
 
 
 class SessionRecorder:
-    """Records frames, schedule lines and displayed pictures, from any thread, in the order of the
-    calls.
+    """Records frames, schedule lines and displayed pictures, from any thread, in the order of the calls.
 
-    Call `open` first and `close` at the end. A full or unresponsive disk ends the recording but not
-    the session; `recorded.ended` has the reason. Any other exception in the thread is raised by
-    `close`.
+    Call `open` first and `close` at the end. A full or unresponsive disk ends the recording but not the session;
+    `recorded.ended` has the reason. Any other exception in the thread is raised by `close`.
     """
 
     def __init__(
@@ -172,8 +164,7 @@ class SessionRecorder:
         """Create the folder and start the thread.
 
         Raises:
-            OutputError: the folder cannot be used or already holds a recording; it is left
-                unchanged.
+            OutputError: the folder cannot be used or already holds a recording; it is left unchanged.
         """
         if (self.folder / SESSION_FILE).exists():
             raise OutputError(f"{self.folder} already holds a recording; choose another folder")
@@ -243,8 +234,7 @@ class SessionRecorder:
     def close(self, why: str = "the session ended") -> None:
         """Write the queue and finish the files. No effect if the recorder is not open.
 
-        Waits at most `MOST_CLOSE_S` seconds. Raises the exception of the thread unless the disk
-        caused it.
+        Waits at most `MOST_CLOSE_S` seconds. Raises the exception of the thread unless the disk caused it.
 
         Args:
             why: reason for the end, stored in the recording.
@@ -349,9 +339,7 @@ class SessionRecorder:
 
 
 def _remove(made: Sequence[Path]) -> None:
-    """Remove the folders created for a recording that failed to start. Parents that are not empty
-    are kept.
-    """
+    """Remove the folders created for a recording that failed to start. Parents that are not empty are kept."""
     for folder in made:
         if folder == made[0]:
             shutil.rmtree(folder, ignore_errors=True)
@@ -377,8 +365,7 @@ class RecordingResult:
 
 
 class RecordFramesOp(Operator):
-    """Passes each frame unchanged and queues it for recording without blocking. Opens and closes
-    the recorder.
+    """Passes each frame unchanged and queues it for recording without blocking. Opens and closes the recorder.
 
     Inputs:
         frame: `Frame`, after the out-of-body gate.

@@ -24,9 +24,7 @@ from operators.storage import StorageReserve, storage_errors
 CODEC = "libvpx-vp9"
 """VP9 by libvpx: playable in an MP4 by browsers, readable by OpenCV, and BSD-licensed."""
 _QUALITY = "24"
-"""Constant quality of libvpx, 0 to 63, lower is better. Gives at least 38 dB
-(benchmarks/results/graph.md).
-"""
+"""Constant quality of libvpx, 0 to 63, lower is better. Gives at least 38 dB (benchmarks/results/graph.md)."""
 _FRAMES_WAITING = 2
 """Capacity of the encoder's queue in frames; a further frame blocks the caller."""
 _OPTIONS = {
@@ -49,9 +47,8 @@ MARK = "written by IntraSplat"
 class VideoFile:
     """Writes RGB frames of one size to an MP4 file. Use as a context manager, or call `close()`.
 
-    Frames are encoded in a separate thread. An error there is raised by the next call, at the
-    latest by `close()`, and no new file is left. An existing file is replaced only when the new one
-    is complete.
+    Frames are encoded in a separate thread. An error there is raised by the next call, at the latest by `close()`, and
+    no new file is left. An existing file is replaced only when the new one is complete.
     """
 
     def __init__(

@@ -1,9 +1,8 @@
 """Writer of the audit log. Each line is on the disk before `append` returns.
 
-An entry is valid once its line and the head that names it are on the disk. If either write fails,
-the line is removed again and `append` raises AuditUnwritable. A kill between both writes leaves the
-log ahead of its head; the next start follows the chain from the head to the end and moves the head
-forward.
+An entry is valid once its line and the head that names it are on the disk. If either write fails, the line is removed
+again and `append` raises AuditUnwritable. A kill between both writes leaves the log ahead of its head; the next start
+follows the chain from the head to the end and moves the head forward.
 """
 
 from __future__ import annotations
@@ -51,10 +50,9 @@ log = logging.getLogger(__name__)
 class AuditLog:
     """Audit log for one process at a time, thread-safe. Long files are closed as segments.
 
-    Opening repairs the traces of a crash and records each repair as `audit.recovered`. An
-    incomplete last line is removed, and a valid chain ahead of its head moves the head forward. A
-    log with an inconsistent end is renamed to `…broken-TIME`, and a new log begins with an entry
-    that names it.
+    Opening repairs the traces of a crash and records each repair as `audit.recovered`. An incomplete last line is
+    removed, and a valid chain ahead of its head moves the head forward. A log with an inconsistent end is renamed to
+    `…broken-TIME`, and a new log begins with an entry that names it.
     """
 
     def __init__(self, path: Path, keeping: Keeping | None = None) -> None:
@@ -117,8 +115,7 @@ class AuditLog:
 
     @property
     def head(self) -> Head:
-        """Return number and digest of the newest entry. A copy elsewhere reveals truncation of the
-        log."""
+        """Return number and digest of the newest entry. A copy elsewhere reveals truncation of the log."""
         return self._head
 
     @property
@@ -209,8 +206,7 @@ class AuditLog:
     def _remove_old(self) -> None:
         """Delete segments beyond the retention limits. Order: audit entry, anchor, files.
 
-        Disk errors are logged and retried later, because leftover segments do not justify refusing
-        an entry.
+        Disk errors are logged and retried later, because leftover segments do not justify refusing an entry.
         """
         old = too_old(closed_segments(self.path), self._keeping)
         if old:
@@ -313,8 +309,7 @@ def _advice(error: OSError) -> str:
 
 
 def _owned(lock: Path, log: Path) -> int:
-    """Lock a separate file while the log is open, because the log's own file is replaced by
-    segments.
+    """Lock a separate file while the log is open, because the log's own file is replaced by segments.
 
     Returns:
         The descriptor of the lock.

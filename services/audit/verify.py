@@ -49,8 +49,7 @@ class Verdict:
 
     @property
     def intact(self) -> bool:
-        """Return True if nothing was changed, removed, inserted or truncated, except by the
-        recorded retention."""
+        """Return True if nothing was changed, removed, inserted or truncated, except by the recorded retention."""
         return not self.findings
 
 

@@ -105,8 +105,7 @@ class KeyStore:
         self._on_change = on_change
 
     def find(self, token: str) -> ApiKey | None:
-        """Return the valid key of a token, or None. The time does not depend on the reason for
-        None."""
+        """Return the valid key of a token, or None. The time does not depend on the reason for None."""
         key = self._match(token)
         return None if key is None or key.has_expired() else key
 
@@ -235,8 +234,7 @@ class KeyStore:
             return keys.pop(key_id)
 
     def _match(self, token: str) -> ApiKey | None:
-        """Return the key of a token, expired or not. An unknown key id takes as long as a wrong
-        secret."""
+        """Return the key of a token, expired or not. An unknown key id takes as long as a wrong secret."""
         prefix, _, rest = token.partition("_")
         key_id, _, secret = rest.partition("_")
         key = self._current().get(key_id)
@@ -279,8 +277,7 @@ class KeyStore:
 
     @contextmanager
     def _changing(self) -> Iterator[dict[str, ApiKey]]:
-        """Provide the keys for a change under the file lock; written if the block ends without an
-        error."""
+        """Provide the keys for a change under the file lock; written if the block ends without an error."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             opened = open(self._path.with_suffix(".lock"), "a", opener=_private)  # noqa: SIM115 - closed below
@@ -374,8 +371,7 @@ def _key_of(values: Mapping[str, Any]) -> ApiKey:
 
 
 def _parse_used(path: Path) -> dict[str, str]:
-    """Read the times of last use; empty if the file is missing or damaged, because it will be
-    rewritten."""
+    """Read the times of last use; empty if the file is missing or damaged, because it will be rewritten."""
     if not path.is_file():
         return {}
     try:

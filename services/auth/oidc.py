@@ -28,8 +28,7 @@ FRESH_S = 600.0
 KEPT_S = 24 * 3600.0
 """Seconds for which cached keys stay usable while the issuer does not answer."""
 AGAIN_S = 10.0
-"""Minimum seconds between requests to the issuer, so unknown key ids and failures do not cause a
-request each."""
+"""Minimum seconds between requests to the issuer, so unknown key ids and failures do not cause a request each."""
 FETCH_S = 5.0
 MOST_BYTES = 1 << 20
 
@@ -138,8 +137,7 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9._@+-]{1,80}")
 
 
 class OpenIdPersons:
-    """Verifier of one issuer's tokens: signature, algorithm, issuer, audience and times, then user
-    and role."""
+    """Verifier of one issuer's tokens: signature, algorithm, issuer, audience and times, then user and role."""
 
     def __init__(self, settings: OidcSettings, keys: IssuerKeys | None = None) -> None:
         self._settings = settings

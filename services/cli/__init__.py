@@ -1,5 +1,4 @@
-"""Command line interface `intrasplat`. Imports are fast because each command imports its
-dependencies when it runs."""
+"""Command line interface `intrasplat`. Imports are fast because each command imports its dependencies when it runs."""
 
 import os
 import sys

@@ -101,8 +101,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Export a model for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its
-    surface."""
+    """Export a model for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its surface."""
     from services.cli.models import export_command
 
     return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)
@@ -148,8 +147,7 @@ def compare(
     ] = None,
     json: JsonOption = False,
 ) -> int:
-    """Align a model's surface rigidly to a mesh (.ply, .stl or .obj, for example from CT) and
-    report the distances."""
+    """Align a model's surface rigidly to a mesh (.ply, .stl or .obj, for example from CT) and report the distances."""
     from services.cli.models import compare_command
 
     return compare_command(model, mesh, time, pairs, inlier, as_json=json)
@@ -257,8 +255,7 @@ def _common(
 @app.command()
 @takes_options(ReplayOptions, "replay")
 def replay(recording: RecordingArgument, out: OutOption, options: Mapping[str, Any], json: JsonOption = False) -> int:
-    """Reconstruct a recording as if it were live: train on each frame as it arrives, display it,
-    score it."""
+    """Reconstruct a recording as if it were live: train on each frame as it arrives, display it, score it."""
     from operators.applications.replay import ReplaySettings
     from services.cli.runs import replay_command
 
@@ -298,8 +295,7 @@ def live(
     record_keep: RecordKeepOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Reconstruct a stream live: display each frame's reconstruction within its time budget, with
-    its age."""
+    """Reconstruct a stream live: display each frame's reconstruction within its time budget, with its age."""
     from services.cli.runs import live_command, live_settings
 
     with live_settings(source, out, record, record_keep or (), **options) as settings:

@@ -449,8 +449,7 @@ def result(
     ca: CaOption = None,
     overwrite: OverwriteOption = False,
 ) -> int:
-    """Download a result file of a replay: report.html, report.json, frames.jsonl,
-    reconstruction.mp4, model.isplat."""
+    """Download a result file of a replay: report.html, report.json, frames.jsonl, reconstruction.mp4, model.isplat."""
     target = out or Path(Path(name).name)
     check_download(target, overwrite)
     with_client(url, key_file, ca, lambda client: client.result(job_id, name, target, overwrite=overwrite))
@@ -571,8 +570,7 @@ def _deleted(
     find: Callable[[Client], object],
     act: Callable[[Client], None],
 ) -> int:
-    """Delete an existing resource. The lookup comes first, so a mistyped name fails before the
-    confirmation."""
+    """Delete an existing resource. The lookup comes first, so a mistyped name fails before the confirmation."""
 
     def look_and_act(client: Client) -> None:
         find(client)
@@ -779,8 +777,7 @@ def _show_audit(client: Client, wanted: Mapping[str, Any], count: int, follow: b
 
 
 def _filled(client: Client, wanted: Mapping[str, Any], count: int) -> AuditPage:
-    """Collect up to `count` entries. Several requests may be needed, because the server searches
-    the log in parts."""
+    """Collect up to `count` entries. Several requests may be needed, because the server searches the log in parts."""
     page = first = client.audit(count, **wanted)
     entries = list(page.entries)
     while page.next_before is not None and len(entries) < count:

@@ -1,5 +1,4 @@
-"""Implementation of `intrasplat doctor`: capabilities of this machine, missing components and
-remedies."""
+"""Implementation of `intrasplat doctor`: capabilities of this machine, missing components and remedies."""
 
 from __future__ import annotations
 

@@ -35,8 +35,7 @@ _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memo
 def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
     """Print an error to stderr.
 
-    A UserError (file, option, disk) prints one sentence. Everything else is a bug and prints a
-    traceback.
+    A UserError (file, option, disk) prints one sentence. Everything else is a bug and prints a traceback.
 
     Args:
         error: the exception.
@@ -82,8 +81,7 @@ def _showed_nothing(error: BaseException) -> bool:
 
 
 def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | None:
-    """Return a message if memory, a disk or a file of the command line caused the error, otherwise
-    None."""
+    """Return a message if memory, a disk or a file of the command line caused the error, otherwise None."""
     if _is_out_of_memory(error):
         said = str(error).strip().splitlines() or ["an allocation failed"]
         return f"there is not enough memory ({said[0][:200]}); free some, or give a smaller --scale or fewer frames"

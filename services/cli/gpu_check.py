@@ -43,8 +43,7 @@ def look() -> Graphics:
 
 
 def _unseen(cuda: str) -> Graphics:
-    """Explain why torch sees no GPU. A container always has the host driver's version file, but not
-    the device file."""
+    """Explain why torch sees no GPU. A container always has the host driver's version file, but not the device file."""
     if DEVICE.exists() or WSL.exists():
         return Graphics(
             False,

@@ -1,5 +1,4 @@
-"""Progress output on stderr, so stdout holds only the result: a live bar on a terminal, plain lines
-otherwise."""
+"""Progress output on stderr, so stdout holds only the result: a live bar on a terminal, plain lines otherwise."""
 
 from __future__ import annotations
 

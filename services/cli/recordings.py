@@ -60,8 +60,7 @@ def _shown(value: object) -> str:
 
 
 MOSTLY = 0.75
-"""Share of the motion that the endoscope must explain; below it a static endoscope is reported as
-likely."""
+"""Share of the motion that the endoscope must explain; below it a static endoscope is reported as likely."""
 OFF = 0.002
 """Share of the focal length. A larger median reprojection error is attributed to tissue motion, not
 to tracking noise."""
@@ -184,8 +183,7 @@ def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording,
 
 
 def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) -> int:
-    """Write a synthetic recording and print its path. An interrupt leaves an existing recording
-    unchanged."""
+    """Write a synthetic recording and print its path. An interrupt leaves an existing recording unchanged."""
     extras = Extras(
         scene=options.scene,
         third=options.third,

@@ -86,8 +86,7 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
 
 
 def quality_line(name: str, psnr_db: float | None, previous_db: float | None) -> list[str]:
-    """Return a line with a mean tissue PSNR and the trivial baseline on the same frames; empty
-    without the PSNR."""
+    """Return a line with a mean tissue PSNR and the trivial baseline on the same frames; empty without the PSNR."""
     if psnr_db is None:
         return []
     beside = "" if previous_db is None else f" (previous frame shown instead: {previous_db:.2f} dB)"
@@ -95,8 +94,7 @@ def quality_line(name: str, psnr_db: float | None, previous_db: float | None) ->
 
 
 def next_frame_line(report: RunReport) -> list[str]:
-    """Return the line of the next-frame prediction score, which is no training error; empty if it
-    was not measured."""
+    """Return the line of the next-frame prediction score, which is no training error; empty if it was not measured."""
     measured = report.quality.next_frame
     if measured is None:
         return []
@@ -133,8 +131,7 @@ PLAIN_PERIOD_S = 5.0
 
 
 class LiveStatus:
-    """Status line of the display on stderr: refreshed on a terminal, printed periodically
-    otherwise."""
+    """Status line of the display on stderr: refreshed on a terminal, printed periodically otherwise."""
 
     def __init__(self, quiet: bool = False) -> None:
         self._quiet = quiet
@@ -179,8 +176,7 @@ def live_settings(
     record_keep: Sequence[str] = (),
     **settings: Any,
 ) -> Iterator[LiveSettings]:
-    """Provide the settings of a run. Without `out`, results go to a temporary folder and recording
-    is not possible.
+    """Provide the settings of a run. Without `out`, results go to a temporary folder and recording is not possible.
 
     Raises:
         InvalidSetting: if a setting is not valid.
@@ -199,8 +195,7 @@ def live_settings(
 
 
 def recording_kept(texts: Sequence[str]) -> WriterOptions:
-    """Parse retention limits of session recordings: a size such as `20GiB`, an age such as `90min`,
-    or both.
+    """Parse retention limits of session recordings: a size such as `20GiB`, an age such as `90min`, or both.
 
     Raises:
         InvalidSetting: if a text is malformed.

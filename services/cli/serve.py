@@ -155,8 +155,7 @@ def keys_revoke_command(config: Path | None, data: Path | None, key_id: str) -> 
 
 
 def _audited(config: Path | None, data: Path | None, event: str, key: ApiKey) -> None:
-    """Write the change to the audit log. A running server holds the log and writes the entry itself
-    within seconds."""
+    """Write the change to the audit log. A running server holds the log and writes the entry itself within seconds."""
     settings = _settings(config, data)
     keep = settings.audit
     with suppress(AuditInUse):

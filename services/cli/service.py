@@ -95,8 +95,7 @@ def igtl(
         bool, typer.Option("--plaintext", help="Allow addresses beyond this machine, although nothing is encrypted.")
     ] = False,
 ) -> int:
-    """Send a stream's pictures and the pose of its camera over OpenIGTLink, for example to 3D
-    Slicer."""
+    """Send a stream's pictures and the pose of its camera over OpenIGTLink, for example to 3D Slicer."""
     from services.cli.igtl import igtl_command
 
     return igtl_command(

@@ -29,8 +29,7 @@ _NAMES = "intrasplat-names"
 
 
 class _Descriptor(io.RawIOBase):
-    """Raw stream that writes to a descriptor. After the first error, which is kept, all output is
-    dropped."""
+    """Raw stream that writes to a descriptor. After the first error, which is kept, all output is dropped."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -129,8 +128,7 @@ def sentence(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text on one line, with control characters escaped, because file names may contain
-    terminal sequences."""
+    """Return a text on one line, with control characters escaped, because file names may contain terminal sequences."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
 
 
@@ -215,8 +213,7 @@ def size(count: float) -> str:
 INTERRUPTED = 130
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INSISTING = (signal.SIGINT, signal.SIGTERM)
-"""Signals whose repetition ends the run at once. Not SIGHUP, which a closing terminal may send
-repeatedly."""
+"""Signals whose repetition ends the run at once. Not SIGHUP, which a closing terminal may send repeatedly."""
 GRACE_S = 2.0
 """Seconds that a run has to unwind after the second signal before the process is terminated."""
 

@@ -105,8 +105,7 @@ class ReplayMethods(Requests):
         self._ask("DELETE", f"/v1/replays/{job_id}")
 
     def result(self, job_id: str, name: str, file: Path, *, overwrite: bool = False) -> None:
-        """Download a result file such as `report.html`. An existing file is replaced only with
-        `overwrite`."""
+        """Download a result file such as `report.html`. An existing file is replaced only with `overwrite`."""
         self._get_file(f"/v1/replays/{job_id}/results/{name}", file, overwrite=overwrite)
 
     def keep_model(self, job_id: str, model: str) -> VersionView:
@@ -128,8 +127,7 @@ class SnapshotMethods(Requests):
     def take_snapshot(
         self, stream: str, model: str | None = None, *, idempotency_key: str | None = None
     ) -> SnapshotView:
-        """Take a snapshot of a stream's live model, stored as a file or as the next version of
-        `model`."""
+        """Take a snapshot of a stream's live model, stored as a file or as the next version of `model`."""
         headers = {} if idempotency_key is None else {"Idempotency-Key": idempotency_key}
         wanted = {} if model is None else {"model": model}
         answer = self._ask("POST", f"/v1/streams/{stream}/snapshots", json=wanted, headers=headers)
@@ -176,10 +174,8 @@ WAITING = ("uploaded", "validated")
 class Client(ReplayMethods, SnapshotMethods):
     """Client of one server with one API key.
 
-        with Client("http://127.0.0.1:8000", key) as client:
-            version = client.upload("liver", Path("liver.isplat"))
-            client.checked("liver", version.version)
-            client.activate("liver", version.version, expected_current=None)
+        with Client("http://127.0.0.1:8000", key) as client: version = client.upload("liver", Path("liver.isplat"))
+        client.checked("liver", version.version) client.activate("liver", version.version, expected_current=None)
 
     All methods raise Unreachable and Refused.
     """
@@ -238,8 +234,7 @@ class Client(ReplayMethods, SnapshotMethods):
         self._ask("PUT", f"/v1/streams/{stream}/camera", json=wanted)
 
     def pictures(self, stream: str, kind: str = "shown", quality: int = 75) -> Iterator[Picture]:
-        """Yield a stream's pictures until the stream or the server stops. Close the iterator to
-        unsubscribe."""
+        """Yield a stream's pictures until the stream or the server stops. Close the iterator to unsubscribe."""
         path = f"/v1/streams/{stream}/display"
         ticket = self._ask("POST", "/v1/tickets", json={"path": path})["ticket"]
         return pictures(self.url, path, ticket, kind, quality, self._verify)
@@ -257,8 +252,7 @@ class Client(ReplayMethods, SnapshotMethods):
         return VersionView.model_validate(self._ask("GET", f"/v1/models/{name}/versions/{number}"))
 
     def upload(self, name: str, file: Path) -> VersionView:
-        """Upload a file of `intrasplat pack`. The server checks it afterwards; `checked` waits for
-        that.
+        """Upload a file of `intrasplat pack`. The server checks it afterwards; `checked` waits for that.
 
         Raises:
             ClientError: if the file cannot be read.
@@ -302,8 +296,7 @@ class Client(ReplayMethods, SnapshotMethods):
     def make_key(
         self, name: str, role: str, *, expires_at: datetime | None = None, streams: Sequence[str] | None = None
     ) -> MadeKey:
-        """Create a key. The token is returned only here. A name may have two valid keys for a
-        change-over.
+        """Create a key. The token is returned only here. A name may have two valid keys for a change-over.
 
         Args:
             name: owner.
@@ -379,8 +372,7 @@ class Client(ReplayMethods, SnapshotMethods):
         since: datetime | None = None,
         until: datetime | None = None,
     ) -> Iterator[str]:
-        """Yield the lines of the audit log as `jsonl` or `csv`, oldest first. The filter is that of
-        `audit`."""
+        """Yield the lines of the audit log as `jsonl` or `csv`, oldest first. The filter is that of `audit`."""
         wanted = {"format": form} | _filter(event, actor, subject, outcome, since, until)
         given = {name: value for name, value in wanted.items() if value is not None}
         try:

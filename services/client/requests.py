@@ -187,8 +187,7 @@ class Requests:
             Size of the file.
 
         Raises:
-            ClientError: if the verification fails, the file cannot be written, or it exists and
-                `overwrite` is False.
+            ClientError: if the verification fails, the file cannot be written, or it exists and `overwrite` is False.
         """
         if os.path.lexists(file) and not overwrite:
             raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it")

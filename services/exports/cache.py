@@ -242,8 +242,7 @@ class ExportCache:
             shutil.rmtree(new, ignore_errors=True)
 
     def _evict(self) -> None:
-        """Evict the oldest files until the total size is within the limit. The caller holds the
-        lock."""
+        """Evict the oldest files until the total size is within the limit. The caller holds the lock."""
         files = sorted(self._folder.glob("*.data"), key=lambda path: path.stat().st_mtime_ns)
         total = sum(path.stat().st_size for path in files)
         for path in files:

@@ -48,8 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def export(folder: Path, file: Path, wish: ExportWish) -> None:
-    """Export to a format of other programs. Imports here take seconds, and packing does not need
-    them."""
+    """Export to a format of other programs. Imports here take seconds, and packing does not need them."""
     from gsplat_core.io.bundle import load_bundle
     from gsplat_core.io.exports.export import export_model
 

@@ -257,8 +257,7 @@ def recordings_in(folder: Path) -> tuple[list[Path], list[tuple[str, str]]]:
 
 
 def _check_out(out: Path, folder: Path) -> None:
-    """Check that the output folder is empty or from an earlier batch, so results never mix with
-    other files.
+    """Check that the output folder is empty or from an earlier batch, so results never mix with other files.
 
     Raises:
         InvalidSetting: if it is not usable.

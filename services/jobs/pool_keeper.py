@@ -28,8 +28,7 @@ PASSED_ON = (
 
 
 class PoolKeeper:
-    """Starts the pool process when jobs are queued and restarts it after a crash. Its output is
-    logged."""
+    """Starts the pool process when jobs are queued and restarts it after a crash. Its output is logged."""
 
     def __init__(self, pool: PoolProcess, open_jobs: Callable[[], int]) -> None:
         self._pool, self._open_jobs = pool, open_jobs

@@ -159,5 +159,4 @@ SUBMISSIONS = sa.Table(
     sa.Column("batch", sa.String(32), nullable=False),
     sa.Column("created_at", sa.String(40), nullable=False),
 )
-"""Submissions by idempotency key (a digest with the caller), with the request digest and the
-resulting batch."""
+"""Submissions by idempotency key (a digest with the caller), with the request digest and the resulting batch."""

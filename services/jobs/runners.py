@@ -42,8 +42,7 @@ ORPHANED = 3
 
 
 def load() -> None:
-    """Import everything that attempts need. Call before the first fork, in a single-threaded
-    process."""
+    """Import everything that attempts need. Call before the first fork, in a single-threaded process."""
     # The NVML check detects GPUs without initialising CUDA; after initialisation no forked process
     # could use CUDA.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
@@ -126,8 +125,7 @@ def _print_into(task: Task) -> None:
 
 
 def _end_with_the_pool(life: int) -> None:
-    """Exit when the pool has ended. Only the pool holds the pipe's write end, so a read returns
-    after its death."""
+    """Exit when the pool has ended. Only the pool holds the pipe's write end, so a read returns after its death."""
     os.read(life, 1)
     os._exit(ORPHANED)
 

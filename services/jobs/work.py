@@ -1,5 +1,4 @@
-"""Body of a job process: replay, reports and packed model. Only this module of the jobs loads
-torch."""
+"""Body of a job process: replay, reports and packed model. Only this module of the jobs loads torch."""
 
 from __future__ import annotations
 
@@ -25,8 +24,7 @@ MODEL = "model"
 
 
 def work(task: Task) -> None:
-    """Run one attempt and report its outcome. A bug is reported as failure too, because a retry
-    would fail again."""
+    """Run one attempt and report its outcome. A bug is reported as failure too, because a retry would fail again."""
     torch.set_num_threads(task.threads)
     try:
         settings = ReplaySettings(recording=Path(task.source), out=task.out, **task.options)

@@ -63,8 +63,7 @@ _ENCRYPTED = 0x1 | 0x40 | 0x2000
 _PLAIN = (0, stat.S_IFREG, stat.S_IFDIR)
 _LEFT_OUT = "__MACOSX"
 _OF_A_LAYOUT = {"images", "images_right", "masks", "depth", "segments"}
-"""Folder names of a recording's layout. A single such folder at the top is not the recording's own
-folder."""
+"""Folder names of a recording's layout. A single such folder at the top is not the recording's own folder."""
 
 
 class ArchiveInvalid(Exception):
@@ -210,8 +209,7 @@ PIECE_BYTES = 1 << 20
 
 
 def unpack(archive: Path, folder: Path, most_bytes: int) -> None:
-    """Write the files of `archive` into the new folder `folder`. After an error, files unpacked so
-    far remain.
+    """Write the files of `archive` into the new folder `folder`. After an error, files unpacked so far remain.
 
     Raises:
         ArchiveInvalid: if the archive breaks a rule.

@@ -140,8 +140,7 @@ class RecordingStore:
             folder: folder of the recordings.
             database_url: URL of the database.
             most_unpacked_bytes: largest unpacked size of an archive, and of one file, in bytes.
-            in_use: returns True if an unfinished job reads a recording; called in the deleting
-                transaction.
+            in_use: returns True if an unfinished job reads a recording; called in the deleting transaction.
             check_program: command that checks a folder.
         """
         self._folder, self._in_use, self._program = folder, in_use, check_program

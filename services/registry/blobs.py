@@ -40,16 +40,13 @@ class StoredBlob:
 
 
 class BlobStore(Protocol):
-    """Key-to-file storage. Every method raises StoreUnavailable if the store fails or does not
-    answer."""
+    """Key-to-file storage. Every method raises StoreUnavailable if the store fails or does not answer."""
 
     def publish(self, staged: Path, key: str) -> None:
-        """Store a complete, synced local file under a new key, atomically. The local file may be
-        moved away."""
+        """Store a complete, synced local file under a new key, atomically. The local file may be moved away."""
 
     def local_file(self, key: str, folder: Path) -> contextlib.AbstractContextManager[Path]:
-        """Provide the file as a local path inside the block. A remote file is downloaded into
-        `folder`."""
+        """Provide the file as a local path inside the block. A remote file is downloaded into `folder`."""
 
     def remove(self, key: str) -> None:
         """Delete the file; no effect if it does not exist."""

@@ -1,14 +1,13 @@
 """Check of an unpacked model as a separate program: `python -m services.registry.check FOLDER
 --json`.
 
-Loads the bundle with `gsplat_core.io.bundle` (header limits, allowed keys, shapes, types, finite
-values), checks it against the budgets, and renders it at its own camera. With `--json` each step
-prints one line: `{"stage": "validated", …}`, then `{"stage": "ready", …}` or `{"stage": "rejected",
-"reason": …}`. Exit code 0 means that there is a verdict; any other code means that the check itself
-failed.
+Loads the bundle with `gsplat_core.io.bundle` (header limits, allowed keys, shapes, types, finite values), checks it
+against the budgets, and renders it at its own camera. With `--json` each step prints one line: `{"stage": "validated",
+…}`, then `{"stage": "ready", …}` or `{"stage": "rejected", "reason": …}`. Exit code 0 means that there is a verdict;
+any other code means that the check itself failed.
 
-The registry never imports this module, because it loads torch. Torch is loaded before the resource
-limits are set, so the limits apply to the model alone.
+The registry never imports this module, because it loads torch. Torch is loaded before the resource limits are set, so
+the limits apply to the model alone.
 """
 
 from __future__ import annotations
@@ -49,8 +48,7 @@ _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memo
 
 
 class Unusable(Exception):
-    """The model exceeds a budget or cannot be displayed. The message is the reason for the
-    rejection."""
+    """The model exceeds a budget or cannot be displayed. The message is the reason for the rejection."""
 
 
 def main(arguments: list[str] | None = None) -> int:

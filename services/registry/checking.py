@@ -1,5 +1,4 @@
-"""Runner of the model check in a separate, limited process. No content of the model is loaded into
-this process."""
+"""Runner of the model check in a separate, limited process. No content of the model is loaded into this process."""
 
 from __future__ import annotations
 
@@ -70,8 +69,7 @@ class RunningChecks:
 
     @contextlib.contextmanager
     def counted(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
-        """Register a process while the block runs, so `end` can kill it. After `end`, the process
-        is killed at once."""
+        """Register a process while the block runs, so `end` can kill it. After `end`, the process is killed at once."""
         with self._lock:
             self._processes.add(process)
             if self.ended:

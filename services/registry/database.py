@@ -1,5 +1,4 @@
-"""Database of the service: SQLite file by default, PostgreSQL by URL. Writers are serialised, each
-in a transaction.
+"""Database of the service: SQLite file by default, PostgreSQL by URL. Writers are serialised, each in a transaction.
 
 The registry, the recordings and the jobs have separate tables and migrations (`Schema`).
 """
@@ -67,8 +66,7 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Provide a connection in autocommit mode, so each statement sees the newest committed
-        state.
+        """Provide a connection in autocommit mode, so each statement sees the newest committed state.
 
         Raises:
             StoreUnavailable: if the database does not answer.
@@ -78,8 +76,7 @@ class Database:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Provide an exclusive write transaction; committed at the end of the block, rolled back on
-        an exception.
+        """Provide an exclusive write transaction; committed at the end of the block, rolled back on an exception.
 
         Raises:
             StoreUnavailable: if the database does not answer.
@@ -171,8 +168,7 @@ def _new_engine(url: sa.URL) -> sa.Engine:
 
 
 def _prepare_sqlite(connection: Any, _: object) -> None:
-    """Set the SQLite pragmas. WAL allows readers during a write; FULL makes commits survive a power
-    failure."""
+    """Set the SQLite pragmas. WAL allows readers during a write; FULL makes commits survive a power failure."""
     cursor = connection.cursor()
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")
@@ -180,7 +176,6 @@ def _prepare_sqlite(connection: Any, _: object) -> None:
 
 
 def _begin_sqlite(connection: sa.Connection) -> None:
-    """Take the write lock at the start of a transaction, so concurrent writers wait and do not fail
-    later."""
+    """Take the write lock at the start of a transaction, so concurrent writers wait and do not fail later."""
     if connection.get_execution_options().get("isolation_level") != "AUTOCOMMIT":
         connection.exec_driver_sql("BEGIN IMMEDIATE")

@@ -77,8 +77,7 @@ _log = logging.getLogger(__name__)
 
 
 class UnpackedModels:
-    """Folders named by content; versions with equal content share a folder. Safe for threads and
-    several processes."""
+    """Folders named by content; versions with equal content share a folder. Safe for threads and several processes."""
 
     def __init__(self, folder: Path, incoming: Path, blobs: BlobStore, reached: Callable[[str], None]) -> None:
         self._folder, self._incoming, self._blobs, self._reached = folder, incoming, blobs, reached

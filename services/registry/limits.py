@@ -39,8 +39,7 @@ def lower_limit(kind: int, wanted: int, spare: int = 0) -> None:
     Args:
         kind: resource, such as `resource.RLIMIT_CPU`.
         wanted: soft limit.
-        spare: distance of the hard limit above the soft limit. For processor time, SIGXCPU comes at
-            the soft limit.
+        spare: distance of the hard limit above the soft limit. For processor time, SIGXCPU comes at the soft limit.
     """
     _, hard = resource.getrlimit(kind)
     allowed = [wanted, wanted + spare]

@@ -49,9 +49,8 @@ def _nothing(_: str) -> None:
 class ModelRegistry:
     """Versioned models. Synchronous and thread-safe; several processes may open the same registry.
 
-    Versions are immutable. Each change is one durable transaction: after a crash either the old or
-    the new state holds. Every method raises StoreUnavailable if the database or the files are
-    unavailable.
+    Versions are immutable. Each change is one durable transaction: after a crash either the old or the new state holds.
+    Every method raises StoreUnavailable if the database or the files are unavailable.
     """
 
     def __init__(
@@ -129,11 +128,9 @@ class ModelRegistry:
                 staged.path.unlink(missing_ok=True)
 
     def check(self, name: str, version: int) -> VersionRecord:
-        """Check an uploaded version in a separate process; blocks until it is `ready` or `rejected`
-        with a reason.
+        """Check an uploaded version in a separate process; blocks until it is `ready` or `rejected` with a reason.
 
-        One check runs at a time; further checks wait. A version that was already
-        checked is returned unchanged.
+        One check runs at a time; further checks wait. A version that was already checked is returned unchanged.
 
         Raises:
             NotFound: if the version does not exist.
@@ -188,8 +185,7 @@ class ModelRegistry:
         Args:
             name: the model.
             by: the caller, for the record.
-            expected_current: version that must be active, which protects newer changes; None
-                accepts any.
+            expected_current: version that must be active, which protects newer changes; None accepts any.
             reason: reason stored with the rolled back version.
 
         Raises:
@@ -281,12 +277,10 @@ class ModelRegistry:
             return self._unpacked.folder_of(row)
 
     def recover(self, wait_s: float = RECOVERY_WAIT_S) -> Recovery:
-        """Delete leftovers of dead processes and report damage. Called at start; nothing is
-        repaired.
+        """Delete leftovers of dead processes and report damage. Called at start; nothing is repaired.
 
         Args:
-            wait_s: seconds to wait for other writers. After that nothing is deleted, and `skipped`
-                is set.
+            wait_s: seconds to wait for other writers. After that nothing is deleted, and `skipped` is set.
         """
         with self._lock.alone(wait_s) as alone:
             stored = self._blobs.stored()

@@ -102,8 +102,7 @@ class Change(VersionRecord):
 
 @dataclass(frozen=True)
 class Recovery:
-    """Result of `recover`. Only `removed` items were changed; the rest needs an administrator's
-    decision."""
+    """Result of `recover`. Only `removed` items were changed; the rest needs an administrator's decision."""
 
     removed: tuple[str, ...] = ()
     """Incomplete files and files without a version."""

@@ -282,8 +282,7 @@ REMEDIES = {
 def require_shown(outcome: RunOutcome) -> None:
     """Check that a run displayed a frame.
 
-    An interrupted run without withheld frames is accepted, because it may have ended before its
-    first picture.
+    An interrupted run without withheld frames is accepted, because it may have ended before its first picture.
 
     Raises:
         NothingShown: if not; the message has the frame counts, the reasons and the remedy.

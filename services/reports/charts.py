@@ -10,8 +10,7 @@ from html import escape
 
 HEIGHT = 290
 WIDE, NARROW = 1068, 500
-"""Widths of the chart slots in CSS pixels. Matching widths keep the chart text at the page's text
-size."""
+"""Widths of the chart slots in CSS pixels. Matching widths keep the chart text at the page's text size."""
 LEFT, RIGHT, TOP, BOTTOM = 56, 16, 14, 44
 
 

@@ -80,11 +80,9 @@ def decibels(value: float | None) -> str:
 
 
 def at_age(report: EvaluationReport, age_frames: float) -> float | None:
-    """Interpolate the frame-hold curve linearly at an age in frames; None outside the measured
-    ages.
+    """Interpolate the frame-hold curve linearly at an age in frames; None outside the measured ages.
 
-    Ages below one frame count as one: a picture that stays until the next frame equals a copy of
-    the previous frame.
+    Ages below one frame count as one: a picture that stays until the next frame equals a copy of the previous frame.
     """
     copies = sorted(
         (each.age_frames, each.psnr_tissue_db)

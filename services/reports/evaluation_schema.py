@@ -160,8 +160,7 @@ class TrackFacts(Part):
 
 
 class TrackingFacts(Part):
-    """Tracking errors of tissue points, in left camera coordinates and in pixels of the evaluated
-    pictures."""
+    """Tracking errors of tissue points, in left camera coordinates and in pixels of the evaluated pictures."""
 
     model: TrackFacts
     scaled: TrackFacts
@@ -287,8 +286,7 @@ class EvaluationReport(Part):
     outputs: dict[str, str]
     """Written files, as paths relative to this file."""
     series: dict[str, list[dict[str, float | int | bool | str | None]]]
-    """Entries per scored frame, by protocol. Above 4096 frames, one entry per
-    `series_frames_per_entry` frames."""
+    """Entries per scored frame, by protocol. Above 4096 frames, one entry per `series_frames_per_entry` frames."""
     series_frames_per_entry: dict[str, Annotated[int, Field(ge=1)]]
 
     def write(self, path: Path) -> None:

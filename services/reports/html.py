@@ -201,8 +201,7 @@ def quality_over_time_section(report: RunReport) -> str:
 
 
 def _is_sampled(report: RunReport) -> bool:
-    """Return True if only some frames are predicted; their scores are drawn as points without a
-    line."""
+    """Return True if only some frames are predicted; their scores are drawn as points without a line."""
     return report.live is not None
 
 
@@ -591,8 +590,7 @@ def render_html(
     worst_seq: int | None = None,
     hidden: HiddenPictures | None = None,
 ) -> str:
-    """Render the page: inline style and SVG, pictures as `data:` URIs, no script, no external
-    resources."""
+    """Render the page: inline style and SVG, pictures as `data:` URIs, no script, no external resources."""
     recording, run = report.recording, report.run
     sections = [
         tiles_section(report),

@@ -17,8 +17,7 @@ from operators.remembered import marked
 from operators.sinks.pictures import depth_map, depth_range, error_map
 
 WIDTH_PX = 420
-"""Target width in pixels. Larger pictures are shrunk, smaller ones enlarged by whole factors only.
-"""
+"""Target width in pixels. Larger pictures are shrunk, smaller ones enlarged by whole factors only."""
 _JPEG_QUALITY = 88
 ASIDE = Orbit(16.0, 8.0)
 """Side view: orbit angles in degrees about the camera's centre of view."""

@@ -1,7 +1,6 @@
 """Schema of `report.json`: one model for writing, reading and the JSON schema.
 
-While `format_version` is unchanged, fields are only added. A missing measurement is null, never
-NaN.
+While `format_version` is unchanged, fields are only added. A missing measurement is null, never NaN.
 """
 
 from __future__ import annotations
@@ -75,8 +74,7 @@ class FrameCounts(Part):
     displayed: Count
     dropped: Count
     damaged: Count = 0
-    """Ingested frames repaired, concealed or skipped by the decoder; displayed, but neither trained
-    on nor scored."""
+    """Ingested frames repaired, concealed or skipped by the decoder; displayed, but neither trained on nor scored."""
 
 
 class Latency(Part):
@@ -106,8 +104,7 @@ class Quality(Part):
 
 
 class NextFrameQuality(Part):
-    """Prediction scores: each frame is rendered at its time and pose and scored before the model is
-    trained on it."""
+    """Prediction scores: each frame is rendered at its time and pose and scored before the model is trained on it."""
 
     psnr_tissue_db: float | None
     """Mean tissue PSNR of the predictions. In a live run: after the first second, of every fourth
@@ -144,8 +141,7 @@ class TruthFacts(Part):
     """Scores of content hidden from the camera, against the ground truth of a synthetic recording."""
 
     behind_tools_psnr_db: float | None
-    """Score over pixels behind a tool whose place was seen earlier, against the picture without the
-    tool."""
+    """Score over pixels behind a tool whose place was seen earlier, against the picture without the tool."""
     last_seen_psnr_db: float | None
     """Trivial baseline: each of these pixels as last seen."""
     inpainted_psnr_db: float | None
@@ -160,19 +156,16 @@ class TruthFacts(Part):
 
 class QualityReport(Part):
     live: Quality | None
-    """Training error: each displayed frame right after training on it. Null for an offline
-    reconstruction."""
+    """Training error: each displayed frame right after training on it. Null for an offline reconstruction."""
     next_frame: NextFrameQuality | None = None
-    """Prediction score, which is no training error. Null for an offline reconstruction and in older
-    reports."""
+    """Prediction score, which is no training error. Null for an offline reconstruction and in older reports."""
     heldout: Quality | None
     """Scores of frames without training; null without `--heldout`."""
     baselines: BaselineQuality
     truth: TruthFacts | None = None
     """Null if the recording has no ground truth behind its tools."""
     training: Quality | None = None
-    """Training error of an offline reconstruction: training frames after all training. Null for a
-    replay."""
+    """Training error of an offline reconstruction: training frames after all training. Null for a replay."""
 
 
 class ModelFacts(Part):
@@ -186,8 +179,7 @@ class LiveFacts(Part):
     """Throughput and picture ages of a live run."""
 
     settled_psnr_tissue_db: float | None
-    """Training error: mean after the first second, of the displayed picture when the next frame
-    arrived."""
+    """Training error: mean after the first second, of the displayed picture when the next frame arrived."""
     worst_psnr_tissue_db: float | None
     """Lowest of these values."""
     previous_frame_db: float | None
@@ -234,8 +226,7 @@ class FrameEntry(Part):
     previous_frame_db: float | None
     """Baseline: previous raw frame."""
     next_frame_db: float | None = None
-    """Score of the model's prediction of this frame before training on it; null without a
-    prediction."""
+    """Score of the model's prediction of this frame before training on it; null without a prediction."""
     age_ms: float | None = None
     """Live runs: age of the displayed picture at display."""
     steps: Count | None = None

@@ -132,9 +132,7 @@ def packed(document: dict[str, Any], arrays: list[NDArray[Any]]) -> Iterator[byt
 
 
 def _attributes(rows: Rows) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the vertex attributes by glTF semantic; the size of a row is a multiple of
-    four bytes.
-    """
+    """Yield the vertex attributes by glTF semantic; the size of a row is a multiple of four bytes."""
     count = len(rows.means)
     if count == 0:
         raise ExportError("the model has no Gaussians; glTF cannot hold an empty one")
@@ -208,9 +206,7 @@ FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 
 def mesh_ply_pieces(mesh: Mesh, unit: str, *, with_triangles: bool) -> Iterator[bytes]:
-    """Yield a binary `.ply`: positions, normals, 8-bit colours, and triangles unless a
-    point cloud.
-    """
+    """Yield a binary `.ply`: positions, normals, 8-bit colours, and triangles unless a point cloud."""
     names = [
         *(f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
         *(f"uchar {c}" for c in ("red", "green", "blue")),

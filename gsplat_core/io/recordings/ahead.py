@@ -1,6 +1,4 @@
-"""Read-ahead: a thread produces the next items of an iterator while the current one is
-processed.
-"""
+"""Read-ahead: a thread produces the next items of an iterator while the current one is processed."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Cameras of recordings: intrinsics, poses and stereo calibrations from data-set files.
 
-`cameras.json` contains a pinhole K, and file and camera-to-world pose of each frame. `poses.npy`
-contains poses without intrinsics. Stereo calibrations are read from the text, JSON, YAML, INI and
-MATLAB layouts listed in docs/recordings.md.
+`cameras.json` contains a pinhole K, and file and camera-to-world pose of each frame. `poses.npy` contains poses without
+intrinsics. Stereo calibrations are read from the text, JSON, YAML, INI and MATLAB layouts listed in docs/recordings.md.
 """
 
 from __future__ import annotations
@@ -34,9 +33,7 @@ from gsplat_core.io.recordings.plain_files import (
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
 
 DEFAULT_FOCAL_FACTOR = 0.9
-"""Default focal length in units of the longer image side: 58° field of view, usual in
-endoscopes.
-"""
+"""Default focal length in units of the longer image side: 58° field of view, usual in endoscopes."""
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_LENGTH = 1e9
 """Largest camera coordinate in the recording's unit, and largest focal length in pixels.
@@ -87,9 +84,8 @@ def read_poses_bounds(
 ) -> Calibration | None:
     """Read LLFF's `poses_bounds.npy`: N x 17 = 3x5 [R | t | (H, W, f)] and near, far.
 
-    Poses are camera-to-world in OpenCV axes, as stored by the endoscopic data sets. LLFF's axis
-    permutation is not applied (gsplat's and Deform3DGS's loaders apply one to EndoNeRF's identity
-    poses).
+    Poses are camera-to-world in OpenCV axes, as stored by the endoscopic data sets. LLFF's axis permutation is not
+    applied (gsplat's and Deform3DGS's loaders apply one to EndoNeRF's identity poses).
     """
     advice = "Save N x 17 float64 numbers: 3x5 [R | t | (H, W, f)], near, far for each frame, in frame order"
 
@@ -327,8 +323,7 @@ def rectified_by_file(
     Args:
         folder: folder of the recording.
         size: width and height in pixels.
-        calibration: known calibration of the left camera; its poses are rotated to the rectified
-            camera.
+        calibration: known calibration of the left camera; its poses are rotated to the rectified camera.
         findings: collector of problems and warnings.
 
     Returns:

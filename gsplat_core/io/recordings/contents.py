@@ -97,8 +97,7 @@ class Contents:
     def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
         """Yield frames at full size, decoded on demand; None for a frame with a problem.
 
-        A background thread reads the sidecars a few frames ahead while the caller's thread decodes
-        the images.
+        A background thread reads the sidecars a few frames ahead while the caller's thread decodes the images.
 
         Args:
             findings: collector of problems and warnings.

@@ -1,9 +1,8 @@
 """Packet-wise video decoding that collects every sign of damage from the decoder.
 
-After damage, arithmetic decoding often reads past the end of a picture. FFmpeg's H.265 and VP8
-decoders do so silently. `OverrunProbe` therefore decodes the same packets a second time with
-different padding. Complete pictures are identical. A difference proves that the first decoder read
-bytes that were never recorded. The probe doubles the decoding cost.
+After damage, arithmetic decoding often reads past the end of a picture. FFmpeg's H.265 and VP8 decoders do so silently.
+`OverrunProbe` therefore decodes the same packets a second time with different padding. Complete pictures are identical.
+A difference proves that the first decoder read bytes that were never recorded. The probe doubles the decoding cost.
 """
 
 from __future__ import annotations
@@ -221,9 +220,7 @@ class PictureConverter:
     """
 
     def __init__(self, rotation: int) -> None:
-        """Create a converter; `rotation` is counter-clockwise in degrees, ignored unless a multiple
-        of 90.
-        """
+        """Create a converter; `rotation` is counter-clockwise in degrees, ignored unless a multiple of 90."""
         self._reformatter = VideoReformatter()
         self._turns = _QUARTER_TURNS.get(rotation, 0)
 

@@ -23,9 +23,7 @@ class Finding:
     advice: str
     """Remedy."""
     missing: bool = False
-    """True if the file does not exist (RecordingMissing), False if it is wrong
-    (RecordingInvalid).
-    """
+    """True if the file does not exist (RecordingMissing), False if it is wrong (RecordingInvalid)."""
 
     def __str__(self) -> str:
         return f"{self.file}: {self.message}. {self.advice}."
@@ -51,9 +49,7 @@ class Findings:
         self.warnings.append(Finding(printable(file), printable(message), advice))
 
     def add(self, others: Findings) -> None:
-        """Append the findings of another collector in order; a strict collector raises the first
-        problem.
-        """
+        """Append the findings of another collector in order; a strict collector raises the first problem."""
         self.warnings.extend(others.warnings)
         for finding in others.problems:
             self._add_problem(finding)
@@ -75,9 +71,7 @@ class ValidationReport:
     """Result of `validate_recording`."""
 
     facts: dict[str, object]
-    """JSON-serialisable facts: frames, size, fps, available sidecars, source of the
-    calibration, …
-    """
+    """JSON-serialisable facts: frames, size, fps, available sidecars, source of the calibration, …"""
     problems: list[Finding]
     warnings: list[Finding]
 

@@ -91,9 +91,7 @@ class MaskFiles:
         return (~tool).astype(np.uint8)
 
     def check_polarity(self, findings: Findings) -> float | None:
-        """Return the share of tool pixels over evenly spaced frames; an implausible share is a
-        problem.
-        """
+        """Return the share of tool pixels over evenly spaced frames; an implausible share is a problem."""
         indices = np.unique(np.linspace(0, len(self.files) - 1, POLARITY_SAMPLES).round().astype(int))
         shares = []
         for index in indices:
@@ -113,9 +111,7 @@ class MaskFiles:
 
 
 class DepthFiles:
-    """Reader of depth maps: 8- or 16-bit PNG in units of `unit_mm`, or float .npy in mm; 0 =
-    unknown.
-    """
+    """Reader of depth maps: 8- or 16-bit PNG in units of `unit_mm`, or float .npy in mm; 0 = unknown."""
 
     def __init__(self, files: Sequence[Path], width_px: int, height_px: int, unit_mm: float) -> None:
         self.files = tuple(files)

@@ -131,9 +131,7 @@ def _element(stream: BinaryIO, at: int) -> tuple[int, int, int | None] | None:
 
 
 def _number(data: bytes, most_bytes: int) -> tuple[int, int] | None:
-    """Parse a variable-width EBML number; return its value with the marker bit, and its width in
-    bytes.
-    """
+    """Parse a variable-width EBML number; return its value with the marker bit, and its width in bytes."""
     if not data or not data[0]:
         return None
     width = 9 - data[0].bit_length()
@@ -227,9 +225,7 @@ def _check_iso(stream: BinaryIO, size: int) -> None:
 
 
 def _check_riff(stream: BinaryIO, size: int) -> None:
-    """Check that all top-level RIFF chunks of an AVI are complete; long files have several
-    (OpenDML).
-    """
+    """Check that all top-level RIFF chunks of an AVI are complete; long files have several (OpenDML)."""
     for kind, end in _riff_chunks(stream, size):
         if end > size:
             raise UnusableContainer(

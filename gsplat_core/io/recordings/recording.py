@@ -111,20 +111,18 @@ class FileRecording:
 def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_frames: int | None = None) -> FileRecording:
     """Open a recording, with its layout recognised from the files (see `layouts`).
 
-    Counts, header sizes, calibration and mask polarity are checked here. Frame data are checked
-    during iteration.
+    Counts, header sizes, calibration and mask polarity are checked here. Frame data are checked during iteration.
 
     Args:
         path: video file or folder.
-        scale: factor on the picture size. Images are area-averaged, masks and depth use the nearest
-            pixel, and the camera is scaled accordingly.
+        scale: factor on the picture size. Images are area-averaged, masks and depth use the nearest pixel, and the
+            camera is scaled accordingly.
         max_frames: read only the first frames; None reads all.
 
     Raises:
         RecordingMissing: if a file does not exist; the message names the file and the remedy.
         RecordingInvalid: if a file is wrong; the message names the file, the value and the remedy.
-        InvalidSetting: if `scale` is not positive or leads to unsupported frame sizes, or
-            `max_frames` is below 1.
+        InvalidSetting: if `scale` is not positive or leads to unsupported frame sizes, or `max_frames` is below 1.
     """
     if not 0 < scale < float("inf"):
         raise InvalidSetting(f"scale must be a positive number, got {scale}")

@@ -56,9 +56,7 @@ class Beside:
         return tuple(path for path in found if path is not None)
 
     def description(self) -> dict[str, Any]:
-        """Read fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each
-        optional.
-        """
+        """Read fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each optional."""
         path = self._file(DESCRIPTION_FILE)
         return (_read_description(path, self._size, self._findings) if path else None) or {}
 
@@ -101,9 +99,7 @@ class Beside:
         return _read_valid_mask(path, self._size, self._findings) if path else None
 
     def _file(self, name: str) -> Path | None:
-        """Return an existing file; a link that dangles or leads outside is reported as
-        a problem.
-        """
+        """Return an existing file; a link that dangles or leads outside is reported as a problem."""
         path = self._there(name)
         return path if path is not None and stays_inside(path.parent, path, self._findings) else None
 

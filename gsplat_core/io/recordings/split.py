@@ -1,7 +1,6 @@
 """Held-out split of the field: frames with (i - 1) % 8 == 0 (1, 9, 17, …) for testing.
 
-EndoGaussian, Deform3DGS and SurgicalGaussian use it on EndoNeRF's clips, which have no official
-split.
+EndoGaussian, Deform3DGS and SurgicalGaussian use it on EndoNeRF's clips, which have no official split.
 """
 
 from __future__ import annotations

@@ -66,8 +66,7 @@ class RecordedView:
     depth: DepthFiles | None
 
     def read(self, index: int) -> Frame:
-        """Read the view of a recording's frame at `camera`'s size, with mask and depth if
-        available.
+        """Read the view of a recording's frame at `camera`'s size, with mask and depth if available.
 
         Raises:
             RecordingInvalid: if a file cannot be used.
@@ -255,8 +254,7 @@ class TissueBehindTools:
     depth: DepthFiles
 
     def of(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]] | None:
-        """Return picture [H, W, 3] and depth z [H, W] in mm at the frame's size; None after the
-        last frame.
+        """Return picture [H, W, 3] and depth z [H, W] in mm at the frame's size; None after the last frame.
 
         Raises:
             RecordingInvalid: if a file cannot be read.

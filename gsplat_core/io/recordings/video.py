@@ -36,8 +36,7 @@ class VideoIndex:
     ordered: bool
     """True if `positions` is reliable.
 
-    False for streams without timestamps whose pictures are reordered; only the decoder knows the
-    order.
+    False for streams without timestamps whose pictures are reordered; only the decoder knows the order.
     """
 
 
@@ -217,9 +216,8 @@ class VideoFrames:
 class DamageSpread:
     """Propagation of packet damage to dependent pictures.
 
-    A picture is damaged if its own packet is suspect, or if it may be predicted from a damaged
-    picture. The latter are all later pictures up to the next key frame, including those stored
-    after the key frame but displayed before it.
+    A picture is damaged if its own packet is suspect, or if it may be predicted from a damaged picture. The latter are
+    all later pictures up to the next key frame, including those stored after the key frame but displayed before it.
     """
 
     def __init__(self, index: VideoIndex) -> None:

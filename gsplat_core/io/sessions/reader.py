@@ -87,8 +87,7 @@ class SessionReader:
     def frames(self) -> Iterator[tuple[FrameLine, Frame | None]]:
         """Yield the received frames in order, each with its log line.
 
-        A damaged frame has the status `DAMAGED`. The frame is None if its image cannot be decoded
-        at all.
+        A damaged frame has the status `DAMAGED`. The frame is None if its image cannot be decoded at all.
         """
         for segment in self.segments:
             with segment.open() as pictures:
@@ -128,17 +127,13 @@ class SessionReader:
         return count
 
     def schedule(self) -> Iterator[ScheduleLine | LostLine]:
-        """Yield the training schedule in order, including markers of lost depth at
-        their position.
-        """
+        """Yield the training schedule in order, including markers of lost depth at their position."""
         for _, line in self.lines():
             if isinstance(line, SCHEDULE_LINES) or (isinstance(line, LostLine) and line.what == "depth"):
                 yield line
 
     def late_depths(self) -> Iterator[dict[str, Any] | None]:
-        """Yield the fields of each `take_depth` line by name; None if its pictures are
-        unreadable.
-        """
+        """Yield the fields of each `take_depth` line by name; None if its pictures are unreadable."""
         for segment in self.segments:
             with segment.open() as pictures:
                 for line in segment.lines():

@@ -72,9 +72,7 @@ class SegmentWriter:
 
     @property
     def full(self) -> bool:
-        """True if the limit on track files is reached, so that a new picture size
-        cannot be added.
-        """
+        """True if the limit on track files is reached, so that a new picture size cannot be added."""
         return len(self._tracks) >= MOST_FILES
 
     def picture(self, stage: Stage, track: str, picture: NDArray[Any], pts_ns: int) -> int:
@@ -100,9 +98,7 @@ class SegmentWriter:
         self._log.sync()
 
     def close(self, why: str) -> None:
-        """Finish all files. The log is closed last, because its final line marks the tracks as
-        complete.
-        """
+        """Finish all files. The log is closed last, because its final line marks the tracks as complete."""
         for track in self._tracks.values():
             track.close()
         self._log.write(SegmentEnds(why=why, frames=self.frames))
@@ -177,9 +173,7 @@ class SegmentReader:
         return sorted([self.folder / LOG_FILE, *(index.path for index in self._indices.values() if index is not None)])
 
     def _look(self, after_seq: int) -> None:
-        """Read the log once to find its first and last line, its track files and its complete
-        frames.
-        """
+        """Read the log once to find its first and last line, its track files and its complete frames."""
         lines = self.lines()
         first = next(lines, None)
         if not isinstance(first, SegmentBegins):

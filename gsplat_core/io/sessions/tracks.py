@@ -222,9 +222,7 @@ Corresponds to nine hours at 30 pictures/s; segments last minutes.
 
 
 class TrackIndex:
-    """Index of a track file's decodable pictures: those in complete clusters up to the first bad
-    one.
-    """
+    """Index of a track file's decodable pictures: those in complete clusters up to the first bad one."""
 
     def __init__(self, path: Path, *, check_sums: bool) -> None:
         """Index the clusters of a file.

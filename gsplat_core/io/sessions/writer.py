@@ -85,8 +85,7 @@ class Retention:
     def give_up(self, now_ns: int) -> Iterator[tuple[KeptPart, str | None]]:
         """Delete parts until the limits hold.
 
-        Failure to delete an earlier session does not end the recording; failure to delete a segment
-        raises.
+        Failure to delete an earlier session does not end the recording; failure to delete a segment raises.
 
         Yields:
             Each part, and the error text if it could not be deleted, otherwise None.
@@ -168,9 +167,7 @@ class WriterOptions:
     keep_s: float | None = None
     """Age limit in seconds beyond which segments are deleted; None for no limit."""
     with_earlier: bool = False
-    """Apply both limits to all sessions in the parent folder; earlier sessions are
-    deleted first.
-    """
+    """Apply both limits to all sessions in the parent folder; earlier sessions are deleted first."""
     clock: Callable[[], int] = time.monotonic_ns
 
     def __post_init__(self) -> None:
@@ -206,9 +203,8 @@ class Shown:
 class SessionWriter:
     """Synchronous writer of a session folder; `operators.sinks.session_recorder` runs it in a thread.
 
-    The files are readable at any moment, even after a crash, except for the last one or two
-    pictures. If the disk rejects a write, methods raise OSError or av.FFmpegError; call `abandon`
-    then.
+    The files are readable at any moment, even after a crash, except for the last one or two pictures. If the disk
+    rejects a write, methods raise OSError or av.FFmpegError; call `abandon` then.
     """
 
     def __init__(self, folder: Path, info: SessionInfo, options: WriterOptions | None = None) -> None:

@@ -42,11 +42,10 @@ def adam_step_queued(
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> Tensor:
-    """Update `parameter` and its moments in place as torch.optim.Adam does, without host sync on
-    CUDA.
+    """Update `parameter` and its moments in place as torch.optim.Adam does, without host sync on CUDA.
 
-    A non-finite gradient, or one with a non-finite square, would corrupt the moments permanently. A
-    row of `row_size` consecutive values with such a gradient keeps its parameters and moments.
+    A non-finite gradient, or one with a non-finite square, would corrupt the moments permanently. A row of `row_size`
+    consecutive values with such a gradient keeps its parameters and moments.
 
     Args:
         parameter: float32, contiguous.
@@ -57,15 +56,14 @@ def adam_step_queued(
         learning_rate: learning rate.
         betas: decay rates of the moments.
         epsilon: term added to the denominator.
-        row_size: number of values that are updated together or not at all; divides the number of
-            values.
+        row_size: number of values that are updated together or not at all; divides the number of values.
 
     Returns:
         Number of skipped rows, int64 [] on the device.
 
     Raises:
-        InvalidInput: if shapes or devices differ, a tensor is not float32 or not contiguous, or
-            step is below 1. `gsplat_core.reference.adam` accepts any floating dtype.
+        InvalidInput: if shapes or devices differ, a tensor is not float32 or not contiguous, or step is below 1.
+            `gsplat_core.reference.adam` accepts any floating dtype.
     """
     _check(parameter, gradient, first_moment, second_moment, row_size)
     if step < 1:

@@ -1,8 +1,7 @@
 """Basis-function deformation: per-Gaussian deltas from bumps in time, gradients, fused lazy Adam.
 
-Maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32 on CPU and
-CUDA. On CUDA the host does not synchronise. If `tau` and the learning rates are device tensors, a
-captured launch reads them at every replay.
+Maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32 on CPU and CUDA. On CUDA the host
+does not synchronise. If `tau` and the learning rates are device tensors, a captured launch reads them at every replay.
 """
 
 from __future__ import annotations
@@ -73,9 +72,8 @@ def basis_field_backward_adam_(
 ) -> None:
     """Compute gradients and take one lazy Adam step of every bump active at `tau`, in place.
 
-    Arguments are those of `gsplat_core.reference.basis_field_backward_adam_`. Updated tensors must
-    be contiguous. `gradient` may be [N, 16]. `tau` and `learning_rates` may be float32 device
-    tensors.
+    Arguments are those of `gsplat_core.reference.basis_field_backward_adam_`. Updated tensors must be contiguous.
+    `gradient` may be [N, 16]. `tau` and `learning_rates` may be float32 device tensors.
     """
     centers = field[0]
     _check(*field)
@@ -97,8 +95,7 @@ def basis_field_move_to_(
 ) -> None:
     """Change `weights` minimally in place so that the deltas at `tau` become `target` [N, 13].
 
-    Arguments are those of `gsplat_core.reference.basis_field_move_to_`; `weights` must be
-    contiguous.
+    Arguments are those of `gsplat_core.reference.basis_field_move_to_`; `weights` must be contiguous.
     """
     _check(centers, log_widths, weights)
     if target.shape != (centers.shape[0], CHANNELS):

@@ -1,5 +1,4 @@
-"""Basis-function field ops in plain torch: any floating dtype and device, differentiable by
-autograd.
+"""Basis-function field ops in plain torch: any floating dtype and device, differentiable by autograd.
 
 `BasisField` uses them where no kernels exist. They are also the reference for tests of the kernels.
 """
@@ -25,9 +24,8 @@ def basis_field(
 ) -> Tensor:
     """Evaluate truncated bumps in time: delta[n] = sum_b exp(-u²) weights[n, b] for |u| <= 4.
 
-    u = (tau - center) / width. Based on the basis functions of Deform3DGS (Yang et al. 2024, eq.
-    5), with timing shared by all channels. NaN in a centre or width propagates to the Gaussian's
-    deltas.
+    u = (tau - center) / width. Based on the basis functions of Deform3DGS (Yang et al. 2024, eq. 5), with timing shared
+    by all channels. NaN in a centre or width propagates to the Gaussian's deltas.
 
     Args:
         centers: [N, B].
@@ -78,11 +76,10 @@ def basis_field_backward_adam_(
 ) -> None:
     """Take one lazy Adam step of every bump active at `tau`, in place.
 
-    Inactive bumps and their moments are not changed. A Gaussian with a zero gradient in all
-    channels is skipped, because it is not visible in the frame and momentum must not move it. A
-    Gaussian whose squared gradient is not finite is skipped, because it would corrupt the moments
-    permanently. The per-bump step counts give each bump Adam's bias correction (Kingma and Ba 2015,
-    algorithm 1) from its own first update.
+    Inactive bumps and their moments are not changed. A Gaussian with a zero gradient in all channels is skipped,
+    because it is not visible in the frame and momentum must not move it. A Gaussian whose squared gradient is not
+    finite is skipped, because it would corrupt the moments permanently. The per-bump step counts give each bump Adam's
+    bias correction (Kingma and Ba 2015, algorithm 1) from its own first update.
 
     Args:
         gradient: dL/d(deltas) [N, 13] or [N, 16].
@@ -124,10 +121,9 @@ def basis_field_move_to_(
 ) -> None:
     """Change the weights minimally in place so that the deltas at `tau` become `target` [N, C].
 
-    Let h_b = exp(-u_b^2) be the bump heights (see `basis_field`). The minimum-norm weight change is
-    h_b / sum(h^2) times the change of the deltas. The deltas at d bump spacings from `tau` change
-    by exp(-d^2 / 2) of it, as by training on that frame alone. Rows with a non-finite result are
-    skipped.
+    Let h_b = exp(-u_b^2) be the bump heights (see `basis_field`). The minimum-norm weight change is h_b / sum(h^2)
+    times the change of the deltas. The deltas at d bump spacings from `tau` change by exp(-d^2 / 2) of it, as by
+    training on that frame alone. Rows with a non-finite result are skipped.
     """
     with torch.no_grad():
         change = target - basis_field(centers, log_widths, weights, tau)

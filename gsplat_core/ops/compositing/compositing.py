@@ -31,11 +31,10 @@ def rasterize_to_pixels(
 ) -> tuple[Tensor, Tensor]:
     """Blend splats front to back over every pixel. Names and results are those of gsplat 1.5.3.
 
-    alpha = min(max_alpha, opacity exp(-sigma)) at the pixel's centre, where sigma is the quadratic
-    form of the conic. Splats with alpha below 1/255 or sigma below 0 are skipped. Blending of a
-    pixel ends before the splat that would reduce the transmittance to 1e-4 or less. Splats with a
-    non-finite value are skipped and have no gradient. Where alpha is clamped, opacity, mean and
-    conic have no gradient. The result does not depend on the number of threads.
+    alpha = min(max_alpha, opacity exp(-sigma)) at the pixel's centre, where sigma is the quadratic form of the conic.
+    Splats with alpha below 1/255 or sigma below 0 are skipped. Blending of a pixel ends before the splat that would
+    reduce the transmittance to 1e-4 or less. Splats with a non-finite value are skipped and have no gradient. Where
+    alpha is clamped, opacity, mean and conic have no gradient. The result does not depend on the number of threads.
 
     Args:
         means2d: [..., N, 2] pixels, `...` being the images; the centre of pixel (0, 0) is (0.5,
@@ -57,8 +56,7 @@ def rasterize_to_pixels(
         max_alpha: upper limit of alpha, from 1/255 to below 1; 0.99 in gsplat 1.6, 0.999 in 1.5.3.
 
     Returns:
-        Colours float32 [..., image_height, image_width, D] and alphas float32 [..., image_height,
-            image_width, 1].
+        Colours float32 [..., image_height, image_width, D] and alphas float32 [..., image_height, image_width, 1].
 
     Raises:
         InvalidInput: for wrong shapes, dtypes or limits.

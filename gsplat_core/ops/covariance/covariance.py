@@ -1,6 +1,4 @@
-"""Covariance and precision matrices from rotations and scales (Kerbl et al. 2023, eq.
-6), compiled.
-"""
+"""Covariance and precision matrices from rotations and scales (Kerbl et al. 2023, eq. 6), compiled."""
 
 from __future__ import annotations
 
@@ -16,8 +14,7 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 def quat_scale_to_covar_preci(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Compute covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ (Kerbl et al. 2023), as gsplat
-    1.5.3.
+    """Compute covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ (Kerbl et al. 2023), as gsplat 1.5.3.
 
     R is the rotation of the quaternion and S = diag(scales). Differentiable in both inputs.
 
@@ -26,8 +23,7 @@ def quat_scale_to_covar_preci(
         scales: float32 [..., 3], standard deviations.
         compute_covar: compute the covariances; otherwise None is returned for them.
         compute_preci: compute the precisions; otherwise None is returned for them.
-        triu: return upper triangles (xx, xy, xz, yy, yz, zz) [..., 6] instead of matrices [..., 3,
-            3].
+        triu: return upper triangles (xx, xy, xz, yy, yz, zz) [..., 6] instead of matrices [..., 3, 3].
 
     Returns:
         Covariances and precisions.

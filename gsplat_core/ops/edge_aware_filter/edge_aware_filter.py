@@ -15,17 +15,14 @@ MOST_LENGTH, MOST_CHANNELS = 4096, 4
 def smooth_within_edges(planes: Tensor, guide: Tensor, strength: float, grey_step: float) -> Tensor:
     """Smooth planes by separable weighted least squares, in three passes of decreasing strength.
 
-    The mean of a plane is preserved where the guide has no edges. On CUDA the host does not
-    synchronise. Method: Min et al., "Fast Global Image Smoothing Based on Weighted Least Squares"
-    (2014).
+    The mean of a plane is preserved where the guide has no edges. On CUDA the host does not synchronise. Method: Min et
+    al., "Fast Global Image Smoothing Based on Weighted Least Squares" (2014).
 
     Args:
         planes: float32 [C, H, W].
         guide: uint8 [H, W] or [H, W, channels] with at most 4 channels.
-        strength: weight of the smoothness term between similar neighbours, relative to the data
-            term.
-        grey_step: difference in grey values between neighbours that reduces the weight by a factor
-            e.
+        strength: weight of the smoothness term between similar neighbours, relative to the data term.
+        grey_step: difference in grey values between neighbours that reduces the weight by a factor e.
 
     Returns:
         Smoothed planes, float32 [C, H, W].

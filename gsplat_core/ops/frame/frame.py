@@ -1,8 +1,7 @@
 """Rendering of one frame on CUDA from raw Gaussians without host synchronisation.
 
-The steps are deform, activate, project, sort and blend. Splatting follows Kerbl et al. 2023 and
-Zwicker et al. 2001, with the same picture as `gsplat_core.rasterization`. An instance is a pair of
-a splat and a tile that it touches.
+The steps are deform, activate, project, sort and blend. Splatting follows Kerbl et al. 2023 and Zwicker et al. 2001,
+with the same picture as `gsplat_core.rasterization`. An instance is a pair of a splat and a tile that it touches.
 """
 
 from __future__ import annotations
@@ -50,13 +49,9 @@ class FrameMode(IntEnum):
     """Purpose of a frame, which determines the layout of its tile lists."""
 
     SHARED = 0
-    """Picture. Tile lists of any length are stored consecutively in a buffer of `capacity`
-    instances.
-    """
+    """Picture. Tile lists of any length are stored consecutively in a buffer of `capacity` instances."""
     TRAINING = 1
-    """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of
-    weight times z.
-    """
+    """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of weight times z."""
     SEGMENTS = 2
     """Picture with a segment of `capacity` instances (at most MAX_SEGMENT) for every tile.
 
@@ -75,9 +70,7 @@ class Frame(NamedTuple):
     alphas: Tensor
     """[H, W]."""
     last: Tensor
-    """Index in `sorted` of the last blended instance, int32 [H, W]; -1 for none. Empty unless
-    training.
-    """
+    """Index in `sorted` of the last blended instance, int32 [H, W]; -1 for none. Empty unless training."""
     records: Tensor
     """Projected splats [N, 12] in the kernels' format; rows of culled Gaussians are undefined.
 
@@ -105,24 +98,22 @@ def render_frame(
 ) -> Frame:
     """Render N Gaussians, given by their raw parameters, for one camera.
 
-    With float16 `sh` (not when training), blending runs in half precision on the tensor cores. This
-    is faster and nearly the same picture. Colours saturate at 65,504, and splats thinner than 0.01
-    pixel (with `eps2d` 0) are culled. All other arithmetic is float32.
+    With float16 `sh` (not when training), blending runs in half precision on the tensor cores. This is faster and
+    nearly the same picture. Colours saturate at 65,504, and splats thinner than 0.01 pixel (with `eps2d` 0) are culled.
+    All other arithmetic is float32.
 
-    The picture is that of `gsplat_core.reference.render_frame`. Gaussians with a non-finite value
-    or a zero-length rotation are culled. The host does not synchronise, and torch allocates all
-    memory, so a CUDA graph can capture the call. The view's tensors and the deltas are read on the
-    device at each replay. Equal inputs give bit-identical results.
+    The picture is that of `gsplat_core.reference.render_frame`. Gaussians with a non-finite value or a zero-length
+    rotation are culled. The host does not synchronise, and torch allocates all memory, so a CUDA graph can capture the
+    call. The view's tensors and the deltas are read on the device at each replay. Equal inputs give bit-identical
+    results.
 
     Args:
-        gaussians: float32 on CUDA: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3],
-            logit_opacities [N], and sh [N, B, 3] with B = (degree + 1)², degree at most 4.
-        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.gaussians`, or
-            None.
+        gaussians: float32 on CUDA: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3], logit_opacities [N],
+            and sh [N, B, 3] with B = (degree + 1)², degree at most 4.
+        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.gaussians`, or None.
         view: camera with its tensors on the device.
-        capacity: allocated instances, in all tiles together or, with segments, in each tile. If a
-            frame needs more, `status` reports how many, and the picture is invalid. Render again
-            with at least as many.
+        capacity: allocated instances, in all tiles together or, with segments, in each tile. If a frame needs more,
+            `status` reports how many, and the picture is invalid. Render again with at least as many.
         mode: purpose of the frame.
 
     Returns:
@@ -153,8 +144,7 @@ def accumulate_status_(status: Tensor, totals: Tensor, step: Tensor) -> Tensor:
 
     Args:
         status: int32 [4] of a `Frame`, on CUDA.
-        totals: int32 [4]; receives the maximum of every entry, but in STATUS_OVERFLOW the number of
-            overflowed frames.
+        totals: int32 [4]; receives the maximum of every entry, but in STATUS_OVERFLOW the number of overflowed frames.
         step: int64 [1]; incremented unless the frame overflowed.
 
     Returns:

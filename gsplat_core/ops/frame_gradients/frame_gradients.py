@@ -41,9 +41,7 @@ class GaussianAdam(NamedTuple):
     """
 
     first_moments: Sequence[Tensor]
-    """Five contiguous tensors with the Gaussians' shapes and separate memory; also
-    `second_moments`.
-    """
+    """Five contiguous tensors with the Gaussians' shapes and separate memory; also `second_moments`."""
     second_moments: Sequence[Tensor]
     rates: Tensor
     """float32 [5], the learning rates in the order of the tensors."""
@@ -62,9 +60,7 @@ class ColourCorrection(NamedTuple):
     """
 
     residuals: Tensor
-    """[H, W, 4]: tissue mask times (target - rendered) for red, green, blue; and the
-    tissue mask.
-    """
+    """[H, W, 4]: tissue mask times (target - rendered) for red, green, blue; and the tissue mask."""
     relaxation: Tensor
     """float32 [1]."""
 
@@ -122,8 +118,8 @@ def render_frame_backward_adam_(
 ) -> Tensor | None:
     """Run `render_frame_backward` and take one Adam step over every Gaussian, in place.
 
-    A Gaussian's row of a tensor and its moments stay unchanged if its gradient, or the square of
-    it, is not finite. If the frame's lists overflowed, nothing changes.
+    A Gaussian's row of a tensor and its moments stay unchanged if its gradient, or the square of it, is not finite. If
+    the frame's lists overflowed, nothing changes.
 
     Args:
         gaussians: five contiguous tensors with separate memory.
@@ -133,15 +129,14 @@ def render_frame_backward_adam_(
         forward: result of `render_frame` in FrameMode.TRAINING.
         v_image: [H, W, 4], dL/d(red, green, blue, sum of weight times z).
         v_alphas: [H, W], dL/dalphas; None for zero.
-        correction: residuals that replace the colour gradient. Column `COLOUR` of the result is
-            then the colour update, and `sh` is not changed. Requires SH degree 0 and a `v_image`
-            with zeros in the last channel.
+        correction: residuals that replace the colour gradient. Column `COLOUR` of the result is then the colour update,
+            and `sh` is not changed. Requires SH degree 0 and a `v_image` with zeros in the last channel.
         needs_raw: return the raw gradients.
         deterministic: as in `render_frame_backward`.
 
     Returns:
-        Raw gradients [N, 16] for a deformation field, with zeros for Gaussians that have a
-            non-finite gradient; None unless `needs_raw`.
+        Raw gradients [N, 16] for a deformation field, with zeros for Gaussians that have a non-finite gradient; None
+        unless `needs_raw`.
 
     Raises:
         InvalidInput: for wrong shapes, dtypes or devices.

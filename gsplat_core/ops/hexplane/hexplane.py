@@ -37,9 +37,7 @@ def hexplane_space(coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor) -> T
 
 
 def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor, zt: Tensor) -> Tensor:
-    """Multiply `space` [N, C] by samples of three lines [U, C], for inference (not
-    differentiable).
-    """
+    """Multiply `space` [N, C] by samples of three lines [U, C], for inference (not differentiable)."""
     _check(coordinates, (xt, yt, zt), 2)
     if space.shape != (coordinates.shape[0], xt.shape[1]):
         raise InvalidInput(f"space must be [{coordinates.shape[0]}, {xt.shape[1]}], got {list(space.shape)}")

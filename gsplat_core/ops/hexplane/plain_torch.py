@@ -53,9 +53,7 @@ def hexplane_features(
 
 
 def hexplane_space(coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor) -> Tensor:
-    """Return the time-independent part of `hexplane_features`: the product [N, C] of
-    space planes.
-    """
+    """Return the time-independent part of `hexplane_features`: the product [N, C] of space planes."""
     x, y, z = coordinates[:, 0], coordinates[:, 1], coordinates[:, 2]
     return sample_plane(xy, x, y) * sample_plane(xz, x, z) * sample_plane(yz, y, z)
 

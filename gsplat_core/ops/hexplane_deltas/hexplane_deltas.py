@@ -30,25 +30,23 @@ def hexplane_deltas(
     Not differentiable. The field is that of Cao & Johnson 2023.
 
     Args:
-        spaces: per level the product of the space planes [N, C] (`hexplane_space`), all float32 or
-            all float16. float16 halves the memory traffic and rounds features and network to half
-            precision; sums stay float32.
+        spaces: per level the product of the space planes [N, C] (`hexplane_space`), all float32 or all float16. float16
+            halves the memory traffic and rounds features and network to half precision; sums stay float32.
         coordinates: positions in [-1, 1], float32 [N, 4]; the fourth column is not read.
         time: one float32 on the device, clamped to [-1, 1].
         time_planes: xt, yt, zt of every level, float32 [V, U, C].
-        weights: weight matrices of the trunk's layers and the head as in `torch.nn.Linear`, with
-            one width and 11 outputs.
+        weights: weight matrices of the trunk's layers and the head as in `torch.nn.Linear`, with one width and 11
+            outputs.
         biases: biases of the same layers.
-        order: int32 [N]; row i of `spaces` and `coordinates` belongs to Gaussian order[i].
-            Spatially sorted rows are faster.
+        order: int32 [N]; row i of `spaces` and `coordinates` belongs to Gaussian order[i]. Spatially sorted rows are
+            faster.
 
     Returns:
         Deltas [N, 16] in the layout of `scene.layout`.
 
     Raises:
         InvalidInput: if the tensors are not on a CUDA device or have an unsupported dtype.
-        RuntimeError: if shapes do not match, or the layers exceed the kernel's limits
-            (`takes_layers`).
+        RuntimeError: if shapes do not match, or the layers exceed the kernel's limits (`takes_layers`).
     """
     if coordinates.device.type != "cuda":
         raise InvalidInput(

@@ -30,9 +30,7 @@ class TrainingState(NamedTuple):
     deltas: Tensor
     """[N, 16] in the layout of `scene.layout`."""
     coordinates: Tensor
-    """[N, 4]: x, y, z in [-1, 1], and 1. Gaussians with a non-finite position have zeros and are
-    skipped.
-    """
+    """[N, 4]: x, y, z in [-1, 1], and 1. Gaussians with a non-finite position have zeros and are skipped."""
     lines: Tensor
     """Features of the time planes at the step's timestamp, interpolated along time: lines [U, C] with U samples in
     space and C channels, concatenated.
@@ -57,9 +55,7 @@ class FieldGradient(NamedTuple):
     """[2, 3 * levels * N, C]: gradients of the samples of the space planes (xy, xz, yz of every level) and of the lines of their major
     axes (y, x, z), sorted by the cell of the plane."""
     fractions: Tensor
-    """Interpolation fractions along the major and minor axis, [3 * levels * N, 2], in the same
-    order.
-    """
+    """Interpolation fractions along the major and minor axis, [3 * levels * N, 2], in the same order."""
     dense_sums: Tensor
     """Sums of dense cells' rows for the four cell corners, by runs of 32 sorted rows.
 
@@ -110,16 +106,14 @@ def hexplane_train(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> TrainingState:
-    """Evaluate the HexPlane field (Cao & Johnson 2023) at `time`, saving values for the backward
-    pass.
+    """Evaluate the HexPlane field (Cao & Johnson 2023) at `time`, saving values for the backward pass.
 
     Args:
         means: canonical positions [N, 3], float32; clamped to the box.
         box: [2, 3], lower and upper corner of the positions.
         time: normalised time in [-1, 1], one element.
         planes: xy, xz, yz, xt, yt, zt of every level, [V, U, C], C a multiple of 16.
-        weights: weight matrices of the trunk's layers and the head (`takes_layers` gives valid
-            sizes).
+        weights: weight matrices of the trunk's layers and the head (`takes_layers` gives valid sizes).
         biases: biases of the same layers.
 
     Returns:
@@ -177,8 +171,7 @@ def hexplane_planes_adam_(
     adam: AdamOnDevice,
     penalties: Penalties = Penalties(),
 ) -> None:
-    """Take one Adam step over all planes in place; gradients and penalties are computed in the same
-    pass.
+    """Take one Adam step over all planes in place; gradients and penalties are computed in the same pass.
 
     Values with a non-finite gradient, and their moments, stay unchanged.
 

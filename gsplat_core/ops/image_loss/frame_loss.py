@@ -17,9 +17,7 @@ class FrameLoss(NamedTuple):
     loss: Tensor
     """Scalar."""
     terms: Tensor
-    """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth
-    L1.
-    """
+    """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth L1."""
     grad_image: Tensor
     """dL/dimage [H, W, 4]."""
     grad_alphas: Tensor
@@ -36,12 +34,10 @@ def frame_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> FrameLoss:
-    """Compute `image_loss` for the colours and expected depth of a training frame, without host
-    sync.
+    """Compute `image_loss` for the colours and expected depth of a training frame, without host sync.
 
-    The inputs are those returned by `render_frame` in FrameMode.TRAINING. The expected depth is the
-    last channel divided by max(alpha, 1e-10). The function is not differentiable; the gradients are
-    part of the result.
+    The inputs are those returned by `render_frame` in FrameMode.TRAINING. The expected depth is the last channel
+    divided by max(alpha, 1e-10). The function is not differentiable; the gradients are part of the result.
 
     Args:
         image: float32 [H, W, 4] on CUDA: red, green, blue, and sum of weight times z.
@@ -57,8 +53,8 @@ def frame_loss(
         Loss, its terms, and the gradients dL/dimage and dL/dalphas.
 
     Raises:
-        InvalidInput: for wrong shapes, dtypes, devices or weights;
-            `gsplat_core.reference.frame_loss` accepts any device and float64.
+        InvalidInput: for wrong shapes, dtypes, devices or weights; `gsplat_core.reference.frame_loss` accepts any
+            device and float64.
     """
     if image.ndim != 3 or image.shape[2] != 4 or image.dtype != torch.float32 or not image.is_cuda:
         raise InvalidInput(

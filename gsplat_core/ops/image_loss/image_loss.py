@@ -34,8 +34,8 @@ def image_loss(
     window of sigma 1.5, zero padding) is computed on the masked images. The depth term uses tissue
     pixels where both depths are known (> 0). A term without any pixel is 0 and has zero gradient.
 
-    A training step uses `grad_image` and `grad_depth` directly and needs no autograd graph;
-    `loss.backward()` gives the same gradients.
+    A training step uses `grad_image` and `grad_depth` directly and needs no autograd graph; `loss.backward()` gives the
+    same gradients.
 
     Args:
         image: float32 [H, W, C] in 0..1.
@@ -53,8 +53,7 @@ def image_loss(
         Loss, its terms, and the gradients of image and depth.
 
     Raises:
-        InvalidInput: for wrong shapes, dtypes or weights; `gsplat_core.reference.image_loss`
-            accepts float64.
+        InvalidInput: for wrong shapes, dtypes or weights; `gsplat_core.reference.image_loss` accepts float64.
     """
     if image.ndim != 3 or image.shape != target.shape or not 1 <= image.shape[2] <= MAX_CHANNELS:
         raise InvalidInput(

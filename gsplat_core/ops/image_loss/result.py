@@ -13,8 +13,7 @@ class ImageLoss(NamedTuple):
     loss: Tensor
     """Scalar; differentiable in image and depth."""
     terms: Tensor
-    """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth
-    L1.
+    """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth L1.
 
     Not differentiable.
     """

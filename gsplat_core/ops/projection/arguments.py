@@ -12,9 +12,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 MAX_EXTENT_SIGMAS = 3.33
-"""Distance in standard deviations at which an opaque Gaussian falls below the 1/255
-alpha cut-off.
-"""
+"""Distance in standard deviations at which an opaque Gaussian falls below the 1/255 alpha cut-off."""
 ALPHA_CUTOFF = 1.0 / 255.0
 COMPENSATION_FLOOR = 0.005
 """Default lower limit of the antialiasing compensation (Yu et al. 2024, Mip-Splatting code)."""

@@ -42,12 +42,10 @@ def fully_fused_projection(
     *,
     compensation_floor: float = COMPENSATION_FLOOR,
 ) -> DenseProjection | PackedProjection:
-    """Project 3D Gaussians to 2D image Gaussians by EWA splatting (Zwicker et al. 2001), as gsplat
-    1.5.3.
+    """Project 3D Gaussians to 2D image Gaussians by EWA splatting (Zwicker et al. 2001), as gsplat 1.5.3.
 
-    A Gaussian with a NaN, an infinity, or a value whose square exceeds float32 is culled and gets
-    zero gradients. Differentiable in means, covars, quats, scales and viewmats. Sums over Gaussians
-    run in a fixed order.
+    A Gaussian with a NaN, an infinity, or a value whose square exceeds float32 is culled and gets zero gradients.
+    Differentiable in means, covars, quats, scales and viewmats. Sums over Gaussians run in a fixed order.
 
     Args:
         means: float32 [..., N, 3]; `...` are any batch dimensions, common to all inputs.
@@ -64,18 +62,16 @@ def fully_fused_projection(
         radius_clip: a Gaussian with both radii at or below this many pixels is culled.
         packed: return one row per visible pair of camera and Gaussian.
         sparse_grad: not supported.
-        calc_compensations: also return the opacity compensation max(compensation_floor, sqrt(det Σ
-            / det (Σ + blur))) (Yu et al. 2024).
-        camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or
-            "fisheye" (equidistant).
-        opacities: [..., N]; limits the radii to min(3.33, sqrt(2 ln(255 o))) standard deviations
-            and culls Gaussians that cannot reach an alpha of 1/255.
-        compensation_floor: lower limit of the compensation, without gradient where active; 0.005 in
-            gsplat 1.6, 0 in 1.5.3.
+        calc_compensations: also return the opacity compensation max(compensation_floor, sqrt(det Σ / det (Σ + blur)))
+            (Yu et al. 2024).
+        camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or "fisheye" (equidistant).
+        opacities: [..., N]; limits the radii to min(3.33, sqrt(2 ln(255 o))) standard deviations and culls Gaussians
+            that cannot reach an alpha of 1/255.
+        compensation_floor: lower limit of the compensation, without gradient where active; 0.005 in gsplat 1.6, 0 in
+            1.5.3.
 
     Returns:
-        `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or
-            `PackedProjection`.
+        `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or `PackedProjection`.
 
     Raises:
         InvalidInput: for wrong shapes, dtypes or devices; `gsplat_core.reference` accepts float64.

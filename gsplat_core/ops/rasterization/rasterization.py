@@ -1,8 +1,7 @@
 """`rasterization()` on CUDA in one native call per pass: project, colour, sort and blend.
 
-Follows Kerbl et al. 2023. Two autograd nodes expose the intermediate `means2d`: `_Project`
-(Gaussians to splats) and `_Blend` (splats to the picture). `_Project` makes the single forward call
-of both.
+Follows Kerbl et al. 2023. Two autograd nodes expose the intermediate `means2d`: `_Project` (Gaussians to splats) and
+`_Blend` (splats to the picture). `_Project` makes the single forward call of both.
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ class Options(NamedTuple):
 class Ranges(NamedTuple):
     """Numeric options in the op's argument order.
 
-    They are the blur in pixels², clipping planes in the scene's unit, and smallest radius in
-    pixels.
+    They are the blur in pixels², clipping planes in the scene's unit, and smallest radius in pixels.
     """
 
     eps2d: float
@@ -83,9 +81,7 @@ class Inputs(NamedTuple):
     viewmats: Tensor
     Ks: Tensor
     centers: Tensor | None
-    """Camera centres [..., C, 3] if their gradient is needed; otherwise computed from
-    the matrices.
-    """
+    """Camera centres [..., C, 3] if their gradient is needed; otherwise computed from the matrices."""
     backgrounds: Tensor | None
     """[..., C, channels]."""
 

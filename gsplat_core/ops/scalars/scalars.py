@@ -17,8 +17,7 @@ MOST_SCALARS = 64
 def store_scalars_(to: Tensor, values: Sequence[float]) -> None:
     """Write host values into a device tensor without synchronisation.
 
-    On CUDA the values are passed as launch arguments on the current stream, so no host buffer is
-    needed.
+    On CUDA the values are passed as launch arguments on the current stream, so no host buffer is needed.
 
     Args:
         to: float32, contiguous.

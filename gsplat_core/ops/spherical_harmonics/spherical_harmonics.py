@@ -15,14 +15,13 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
     """Evaluate spherical harmonics in given directions, as gsplat 1.5.3.
 
-    Returns the plain sum, without the offset of 0.5 that makes it a colour. Differentiable in dirs
-    and coeffs.
+    Returns the plain sum, without the offset of 0.5 that makes it a colour. Differentiable in dirs and coeffs.
 
     Args:
         degrees_to_use: degree, 0 to 4.
         dirs: float32 [..., 3], of any non-zero length.
-        coeffs: float32 [..., K, 3] with K >= (degrees_to_use + 1)². Leading dimensions may
-            broadcast to those of dirs, which avoids a copy per camera.
+        coeffs: float32 [..., K, 3] with K >= (degrees_to_use + 1)². Leading dimensions may broadcast to those of dirs,
+            which avoids a copy per camera.
         masks: bool [...]; where false, the result and its gradients are 0 and nothing is computed.
 
     Returns:

@@ -25,9 +25,7 @@ class Matches(NamedTuple):
     """Disparity of each pixel of the left picture."""
 
     sixteenths: Tensor
-    """int32 [H, W]: x in the left picture minus x in the right one, in 1/16 px; `UNKNOWN` if
-    unmatched.
-    """
+    """int32 [H, W]: x in the left picture minus x in the right one, in 1/16 px; `UNKNOWN` if unmatched."""
     one_surface: Tensor
     """bool [H, W]: no disparity jump or hole nearby."""
 

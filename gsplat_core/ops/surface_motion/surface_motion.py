@@ -1,7 +1,6 @@
 """3D motion of surface points from optical flow, compiled, for the CPU.
 
-`gsplat_core.training.motion.image_motion` implements it in plain torch for any floating dtype and
-device.
+`gsplat_core.training.motion.image_motion` implements it in plain torch for any floating dtype and device.
 """
 
 from __future__ import annotations

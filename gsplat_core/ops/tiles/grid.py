@@ -6,9 +6,7 @@ from typing import NamedTuple
 
 
 class TileGrid(NamedTuple):
-    """Grid of square tiles covering an image; the fields are in the argument order of
-    `isect_tiles`.
-    """
+    """Grid of square tiles covering an image; the fields are in the argument order of `isect_tiles`."""
 
     tile_size: int
     """Side of a tile in pixels."""

@@ -47,9 +47,8 @@ def isect_tiles(
         n_images: number of images of packed splats.
         image_ids: image [nnz] of each packed splat.
         gaussian_ids: accepted for compatibility with gsplat; not used.
-        conics: [..., N, 3]. With opacities, only tiles in which alpha reaches 1/255 within the
-            rectangle of pixel centres are listed. Otherwise all tiles of the box mean ± radius are
-            listed, as in gsplat.
+        conics: [..., N, 3]. With opacities, only tiles in which alpha reaches 1/255 within the rectangle of pixel
+            centres are listed. Otherwise all tiles of the box mean ± radius are listed, as in gsplat.
         opacities: [..., N].
 
     Returns:
@@ -101,17 +100,16 @@ def bin_splats(
 
     Args:
         grid: tiles of the image.
-        capacity: length of the lists, 0 to 2^31 - 1. None makes them exactly as long as needed, for
-            which the host synchronises on CUDA. A number fixes the length on any device without
-            synchronisation, so a CUDA graph can capture the call. Unused entries are -1 and precede
-            the first tile's list, so no offset refers to them. If `needed` exceeds the capacity,
-            the lists contain the nearest splats of all images whose tiles fit completely, and the
-            caller must repeat the call with a larger capacity.
+        capacity: length of the lists, 0 to 2^31 - 1. None makes them exactly as long as needed, for which the host
+            synchronises on CUDA. A number fixes the length on any device without synchronisation, so a CUDA graph can
+            capture the call. Unused entries are -1 and precede the first tile's list, so no offset refers to them. If
+            `needed` exceeds the capacity, the lists contain the nearest splats of all images whose tiles fit
+            completely, and the caller must repeat the call with a larger capacity.
 
     Returns:
-        tiles_per_gauss int32 [..., N], flatten_ids int32 [M] or [capacity], and isect_offsets int32
-            [..., tile_height, tile_width]. With a capacity also `needed`, int64 [1] on the splats'
-            device: the total number of entries. Compositing accepts both kinds of lists.
+        tiles_per_gauss int32 [..., N], flatten_ids int32 [M] or [capacity], and isect_offsets int32 [..., tile_height,
+        tile_width]. With a capacity also `needed`, int64 [1] on the splats' device: the total number of entries.
+        Compositing accepts both kinds of lists.
 
     Raises:
         InvalidInput: for wrong shapes, dtypes, devices or capacity.

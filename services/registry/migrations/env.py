@@ -1,5 +1,4 @@
-"""Alembic environment. Runs migrations on the connection and in the transaction of
-`Database.migrate`."""
+"""Alembic environment. Runs migrations on the connection and in the transaction of `Database.migrate`."""
 
 from __future__ import annotations
 

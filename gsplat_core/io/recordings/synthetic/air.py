@@ -20,9 +20,7 @@ DRIFT_MM_S = (11.0, -7.0)
 PUFF_PERIOD_S = 2.9
 """Period in seconds with which the smoke density varies."""
 SMOKE_MM = 74.0
-"""Path length in mm over which smoke of strength 1 and mean density transmits exp(-1)
-of the light.
-"""
+"""Path length in mm over which smoke of strength 1 and mean density transmits exp(-1) of the light."""
 SMOKE_COLOUR = (0.42, 0.41, 0.44)
 EXPOSURE_PERIODS_S = (1.9, 3.1)
 EXPOSURE_STOPS = (0.45, 0.25)
@@ -82,9 +80,7 @@ class Air:
         return np.asarray(np.float32(self.exposure_at(time_s)) * radiance, np.float32)
 
     def _transmitted(self, camera: Camera, ray_x: Array, ray_y: Array, depth: Array, time_s: float) -> Array:
-        """Return the transmitted share of light [H, W], from the density at the middle
-        of each ray.
-        """
+        """Return the transmitted share of light [H, W], from the density at the middle of each ray."""
         half = np.float32(0.5) * depth
         local = np.stack([ray_x * half, ray_y * half, half], axis=-1)
         r, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]

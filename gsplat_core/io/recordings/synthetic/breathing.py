@@ -19,9 +19,7 @@ class Breathing:
     start: float
     """Phase at time 0, before the asymmetry is applied."""
     ratio: float = 1.0
-    """Expiration to inspiration ratio: duration of the falling half over that of the
-    rising half.
-    """
+    """Expiration to inspiration ratio: duration of the falling half over that of the rising half."""
     wander: float = 0.0
     """Largest relative deviation of the rate."""
     wander_phases: tuple[float, float] = (0.0, 0.0)
@@ -34,9 +32,7 @@ class Breathing:
         return float(uniform) if self.ratio == 1 else unequal(float(uniform), self.ratio)
 
     def _ahead_s(self, time_s: float) -> float:
-        """Return the time lead per unit of `wander`: the integral of a deviation
-        between -1 and 1.
-        """
+        """Return the time lead per unit of `wander`: the integral of a deviation between -1 and 1."""
         waves = (
             period / (2 * np.pi) * (np.sin(2 * np.pi * time_s / period + phase) - np.sin(phase))
             for period, phase in zip(WANDER_PERIODS_S, self.wander_phases, strict=True)

@@ -1,8 +1,7 @@
 """Colon-like scene: a folded tube viewed along its axis, bright nearby, dark at the closed end.
 
-At rest the wall is an ellipsoid of revolution around the origin with rings of folds; z is its long
-axis. The material point (u, v) is on the ray (u, v, TEXTURE_MM) from the origin, so the wall has no
-seam and no pole.
+At rest the wall is an ellipsoid of revolution around the origin with rings of folds; z is its long axis. The material
+point (u, v) is on the ray (u, v, TEXTURE_MM) from the origin, so the wall has no seam and no pole.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Writer of `recording.json` and `views.json`, which document the files of a synthetic
-recording.
-"""
+"""Writer of `recording.json` and `views.json`, which document the files of a synthetic recording."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Light source of the scope: two fibres at its tip, in the coordinates of the rendering camera.
 
-Irradiance falls with the squared distance to a fibre, with the cosine between surface normal and
-light direction, and with the angle from the beam axis. No other light exists, so near tissue is
-bright and far tissue dark.
+Irradiance falls with the squared distance to a fibre, with the cosine between surface normal and light direction, and
+with the angle from the beam axis. No other light exists, so near tissue is bright and far tissue dark.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Ray caster for tissue and tool lit from the scope's tip: image, depth and tool mask.
 
-Each ray is intersected with the deformed tissue by Newton's method on the material coordinates (u,
-v), so depth is exact and not that of a mesh. A pixel (column i, row j) has its centre at (i + 0.5,
-j + 0.5).
+Each ray is intersected with the deformed tissue by Newton's method on the material coordinates (u, v), so depth is
+exact and not that of a mesh. A pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -31,9 +30,7 @@ class Eye:
     image: NDArray[np.uint8]
     """sRGB [H, W, 3]."""
     depth: Array
-    """Depth z in mm [H, W] of the first surface, tool or tissue, on the ray of each
-    pixel centre.
-    """
+    """Depth z in mm [H, W] of the first surface, tool or tissue, on the ray of each pixel centre."""
     tool: NDArray[np.bool_]
     """bool [H, W]; pixels at least partly covered by the tool."""
     tissue_depth: Array

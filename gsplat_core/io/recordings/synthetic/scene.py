@@ -29,9 +29,7 @@ SCENES: dict[str, type[Tissue]] = {"open": Tissue, "colon": Colon}
 
 @dataclass(frozen=True)
 class Sway:
-    """Trajectory of a moving scope: a sine along each axis and a sinusoidal roll, all 0
-    at time 0.
-    """
+    """Trajectory of a moving scope: a sine along each axis and a sinusoidal roll, all 0 at time 0."""
 
     periods_s: tuple[float, float, float, float] = (4.1, 5.3, 6.7, 4.7)
     """Periods in seconds of the motion along x, y and z, and of the roll."""
@@ -41,8 +39,7 @@ class Sway:
 
     @classmethod
     def seeded(cls, rng: np.random.Generator) -> Sway:
-        """Draw another trajectory: 0.7 to 1.5 times the usual periods, 0.6 to 1.3 times the
-        amplitudes.
+        """Draw another trajectory: 0.7 to 1.5 times the usual periods, 0.6 to 1.3 times the amplitudes.
 
         Phases are random.
         """
@@ -112,9 +109,7 @@ class SyntheticScene:
         return self.camera.with_pose(_pose(rotation, centre))
 
     def left_to(self, view: View) -> NDArray[np.float64]:
-        """Return the rigid transform [4, 4] from the left camera to another camera of the same
-        scope.
-        """
+        """Return the rigid transform [4, 4] from the left camera to another camera of the same scope."""
         if view == "left":
             return np.eye(4)
         if view == "right":

@@ -58,16 +58,14 @@ def synthesize(
     extras: Extras = CLEAR,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write a synthetic recording with exact ground truth into the folder `out` and return the
-    folder.
+    """Write a synthetic recording with exact ground truth into the folder `out` and return the folder.
 
-    Equal arguments give equal bytes. The folder appears once complete. A folder written by an
-    earlier call is replaced; any other non-empty folder is refused. `progress(done, frames)` is
-    called after each frame.
+    Equal arguments give equal bytes. The folder appears once complete. A folder written by an earlier call is replaced;
+    any other non-empty folder is refused. `progress(done, frames)` is called after each frame.
 
     Raises:
-        InvalidSetting: if an argument is out of range, or `out` has foreign content, is a link or
-            is the root of a disk.
+        InvalidSetting: if an argument is out of range, or `out` has foreign content, is a link or is the root of a
+            disk.
     """
     check_arguments(frames, width_px, height_px, fps, seed, camera)
     target = Path(out)

@@ -1,7 +1,6 @@
 """Protection of existing folders from being overwritten by a synthetic recording.
 
-Accepted targets are new folders, empty folders, and folders that contain only files of an earlier
-`synthesize` call.
+Accepted targets are new folders, empty folders, and folders that contain only files of an earlier `synthesize` call.
 """
 
 from __future__ import annotations

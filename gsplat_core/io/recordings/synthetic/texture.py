@@ -1,7 +1,6 @@
 """Colour of tissue: multi-octave noise, islands of fat, branching vessels, fine relief, wetness.
 
-The texture is defined in millimetres of the undeformed sheet, so finer texels show the same tissue
-in more detail.
+The texture is defined in millimetres of the undeformed sheet, so finer texels show the same tissue in more detail.
 """
 
 from __future__ import annotations
@@ -65,9 +64,7 @@ class TissueTexture:
         return np.asarray(reflectance, np.float32), np.asarray(slope, np.float32)
 
     def _noise(self, rng: np.random.Generator, cells_mm: tuple[float, ...], gain: float) -> Array:
-        """Sum value noises of the cell sizes, each weaker by `gain`; mean 0, standard deviation
-        about 1.
-        """
+        """Sum value noises of the cell sizes, each weaker by `gain`; mean 0, standard deviation about 1."""
         total = np.zeros((self.size, self.size), np.float32)
         power, weight = 0.0, 1.0
         for cell_mm in cells_mm:

@@ -1,8 +1,7 @@
 """Deforming tissue: a smooth sheet of material points (u, v) with motion and colour.
 
-Texture is looked up by (u, v), the point's position on the undeformed sheet, so it moves with the
-tissue. Lengths are in millimetres and times in seconds. World axes are those of the camera at rest
-(x right, y down, z away).
+Texture is looked up by (u, v), the point's position on the undeformed sheet, so it moves with the tissue. Lengths are
+in millimetres and times in seconds. World axes are those of the camera at rest (x right, y down, z away).
 """
 
 from __future__ import annotations
@@ -26,9 +25,7 @@ TUG_RADIUS_MM = 12.0
 
 @dataclass(frozen=True)
 class Tug:
-    """Local displacement by a tool: `pull` at the material point `grasp` with a
-    Gaussian falloff.
-    """
+    """Local displacement by a tool: `pull` at the material point `grasp` with a Gaussian falloff."""
 
     grasp: tuple[float, float]
     pull: tuple[float, float, float]
@@ -47,8 +44,7 @@ class SurfacePoints:
 
 
 class Tissue:
-    """One patient's sheet of tissue at the bottom of an open cavity: shape, breathing, pulse,
-    colour.
+    """One patient's sheet of tissue at the bottom of an open cavity: shape, breathing, pulse, colour.
 
     Deterministic for a given random generator. Subclasses override the shape at rest.
     """
@@ -82,16 +78,13 @@ class Tissue:
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
         """Return start values of Newton's method for the ray intersections.
 
-        The rays from `origin` [3] along `directions` [H, W, 3] are intersected with the plane at
-        the mean distance.
+        The rays from `origin` [3] along `directions` [H, W, 3] are intersected with the plane at the mean distance.
         """
         s = (np.float32(TISSUE_DISTANCE_MM) - origin[2]) / directions[..., 2]
         return origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
 
     def _at_rest(self, u: Array, v: Array) -> SurfacePoints:
-        """Return undeformed positions of the material points (u, v) and their derivatives by u and
-        v.
-        """
+        """Return undeformed positions of the material points (u, v) and their derivatives by u and v."""
         one, zero = np.ones_like(u), np.zeros_like(u)
         bowl = np.float32(-0.0022)
         tilt_u, tilt_v = (np.float32(tilt) for tilt in self._tilt)
@@ -105,9 +98,7 @@ class Tissue:
         return SurfacePoints((u, v, z), (one, zero, z_u), (zero, one, z_v))
 
     def points(self, u: Array, v: Array, time_s: float, tug: Tug) -> SurfacePoints:
-        """Return positions of the material points (u, v) at a time and their derivatives by u and
-        v.
-        """
+        """Return positions of the material points (u, v) at a time and their derivatives by u and v."""
         rest = self._at_rest(u, v)
         (x, y, z), (x_u, y_u, z_u), (x_v, y_v, z_v) = rest.position, rest.along_u, rest.along_v
 

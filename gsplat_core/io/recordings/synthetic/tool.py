@@ -74,9 +74,7 @@ class ToolMotion:
         return Tug(self._grasp(cycle), (float(pull[0]), float(pull[1]), float(pull[2])))
 
     def parts(self, tissue: Tissue, time_s: float) -> list[Part]:
-        """Return the tool's capsules in world mm. During a tug the tip holds the grasped material
-        point.
-        """
+        """Return the tool's capsules in world mm. During a tug the tip holds the grasped material point."""
         cycle, phase = self._phase(time_s)
         tug = self.tug(time_s)
         held = tissue.position(tug.grasp, time_s, tug)
@@ -148,8 +146,7 @@ def distance(parts: list[Part], points: Array) -> tuple[Array, NDArray[np.int8]]
 def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm: Array, pixel_rad: float) -> ToolHits:
     """Sphere-trace unit rays [N, 3] from one origin up to a limit for each (Hart 1996).
 
-    J. C. Hart, "Sphere tracing", The Visual Computer 12 (1996). `pixel_rad` is the angle of a
-    pixel, used for coverage.
+    J. C. Hart, "Sphere tracing", The Visual Computer 12 (1996). `pixel_rad` is the angle of a pixel, used for coverage.
     """
     count = len(rays)
     if not parts:
@@ -194,9 +191,7 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
 
 
 def may_meet(parts: list[Part], start: Array, rays: Array) -> NDArray[np.intp]:
-    """Select the rays that pass near the tool: those that hit one of a chain of
-    bounding spheres.
-    """
+    """Select the rays that pass near the tool: those that hit one of a chain of bounding spheres."""
     shaft = parts[-1]
     axis = (shaft.a - shaft.b) / np.linalg.norm(shaft.a - shaft.b)
     tip = max(float((part.b - shaft.a) @ axis) for part in parts)
