@@ -46,34 +46,22 @@ BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 HOOK = """
-import importlib.abc, importlib.machinery, importlib.util, json, marshal, mmap, os, sys
+import builtins, json, marshal, mmap
+from importlib.machinery import SourceFileLoader
 
-class Marking(importlib.machinery.SourceFileLoader):
-    def get_code(self, fullname):
-        with open(CODES[self.path], "rb") as file:
-            return marshal.load(file)
-
-    def exec_module(self, module):
-        module.__dict__["__marks__"] = MARKS
-        super().exec_module(module)
-
-class Finder(importlib.abc.MetaPathFinder):
-    def find_spec(self, fullname, path, target=None):
-        if fullname.split(".")[0] not in {packages!r}:
-            return None
-        base = os.path.join({root!r}, *fullname.split("."))
-        for place, search in ((os.path.join(base, "__init__.py"), [base]), (base + ".py", None)):
-            if place in CODES:
-                loader = Marking(fullname, place)
-                return importlib.util.spec_from_file_location(fullname, place, loader=loader, submodule_search_locations=search)
-        return None
+def get_code(loader, name, usual=SourceFileLoader.get_code):
+    if loader.path not in CODES:
+        return usual(loader, name)
+    with open(CODES[loader.path], "rb") as file:
+        return marshal.load(file)
 
 with open({codes!r}) as file:
     CODES = json.load(file)
 with open({marks!r}, "r+b") as file:
-    MARKS = mmap.mmap(file.fileno(), 0)
-sys.meta_path.insert(0, Finder())
+    builtins.__marks__ = mmap.mmap(file.fileno(), 0)
+SourceFileLoader.get_code = get_code
 """
+"""Code that lets this process load marked modules, by name or by path."""
 
 
 def number_of(text: str) -> int:
@@ -244,7 +232,7 @@ class Marked:
             folder = Path(name)
             marks = folder / "marks"
             marks.write_bytes(bytes(len(self.keys)))
-            hook = HOOK.format(root=str(ROOT), packages=PACKAGES, codes=str(self.codes), marks=str(marks))
+            hook = HOOK.format(codes=str(self.codes), marks=str(marks))
             with marks.open("r+b") as opened:
                 recorder = Recorder(mmap.mmap(opened.fileno(), 0))
             fork = pytest_fork(files, folder, recorder, hook, LIMIT_S, lambda: write(recorder))
@@ -255,7 +243,8 @@ class Marked:
 def outdated(folders: Sequence[str]) -> list[list[str]]:
     """Return the test files of some folders without a record of their present text, in groups of one folder each."""
     groups: dict[Path, list[str]] = defaultdict(list)
-    for path in (path for folder in folders for path in sorted((ROOT / folder).rglob("test_*.py"))):
+    named = (ROOT / name for name in folders)
+    for path in (path for each in named for path in (sorted(each.rglob("test_*.py")) if each.is_dir() else [each])):
         file = str(path.relative_to(ROOT))
         try:
             with np.load(record_path(file)) as stored:
@@ -378,7 +367,7 @@ def bring_up_to_date(jobs: int, folders: Sequence[str] = ("tests",)) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", default=["tests"])
+    parser.add_argument("folders", nargs="*", default=["tests"], help="folders or files of tests")
     parser.add_argument("--fresh", action="store_true", help="forget earlier records")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     options = parser.parse_args()

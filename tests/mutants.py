@@ -76,20 +76,17 @@ UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_
 """Calls with no effect except a log line, which are not mutated."""
 
 HOOK = """
-import importlib.abc, importlib.machinery, importlib.util, os, sys
+from importlib.machinery import SourceFileLoader
 
-class Mutant(importlib.abc.MetaPathFinder):
-    name, path, origin = {replaced}
+def get_code(loader, name, usual=SourceFileLoader.get_code):
+    if loader.path != {origin!r}:
+        return usual(loader, name)
+    with open({mutant!r}, encoding="utf-8") as file:
+        return compile(file.read(), loader.path, "exec", dont_inherit=True)
 
-    def find_spec(self, fullname, path, target=None):
-        if fullname != self.name:
-            return None
-        locations = [os.path.dirname(self.origin)] if self.origin.endswith("__init__.py") else None
-        loader = importlib.machinery.SourceFileLoader(fullname, self.path)
-        return importlib.util.spec_from_file_location(fullname, self.path, loader=loader, submodule_search_locations=locations)
-
-sys.meta_path.insert(0, Mutant())
+SourceFileLoader.get_code = get_code
 """
+"""Code that lets this process load the mutant in place of its module, by name or by path."""
 
 
 @dataclass(frozen=True)
@@ -431,7 +428,7 @@ def hook_of(mutant: Mutant, folder: Path) -> str:
     """Write the module and return code that lets Python import it in place of the product's."""
     source = folder / "mutant.py"
     source.write_text(ast.unparse(mutant.tree), encoding="utf-8")
-    return HOOK.format(replaced=(module_name(mutant.path), str(source), str(ROOT / mutant.path)))
+    return HOOK.format(mutant=str(source), origin=str(ROOT / mutant.path))
 
 
 def folders() -> list[Path]:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 import os
 import stat
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 import services
+from services.jobs import runners, work
+from services.jobs.results import Task
 from services.private_files import KEPT, FolderNotPrivate, make_state_private
 
 SERVICES = Path(services.__file__).parent
@@ -37,12 +42,39 @@ def open_to_others(folder: Path) -> set[str]:
     return {str(path) for path in [folder, *folder.rglob("*")] if path.lstat().st_mode & 0o077}
 
 
-@pytest.mark.parametrize("path", [*programs(), SERVICES / "cli" / "serve.py"], ids=lambda path: path.stem)
-def test_every_process_begins_with_a_umask_of_its_own(path):
-    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
-    main = next(node for node in functions if node.name in ("main", "serve_command"))
-    first = next(node for node in main.body if not isinstance(getattr(node, "value", None), ast.Constant))
-    assert ast.unparse(first) == "keep_files_private()", "its first statement"
+ENTRIES = [
+    *((".".join(path.relative_to(SERVICES.parent).with_suffix("").parts), "main") for path in programs()),
+    ("services.cli.serve", "serve_command"),
+    ("services.cli.serve", "backup_command"),
+    ("services.cli.serve", "restore_command"),
+]
+
+
+@pytest.mark.parametrize(("module", "function"), ENTRIES)
+def test_every_process_begins_with_a_umask_of_its_own(monkeypatch, module, function):
+    """Nothing else happens before: no argument is looked at."""
+
+    class Begun(BaseException):
+        pass
+
+    def begin():
+        raise Begun
+
+    program = importlib.import_module(module)
+    monkeypatch.setattr(program, "keep_files_private", begin)
+    entry = getattr(program, function)
+    needed = [each for each in inspect.signature(entry).parameters.values() if each.default is each.empty]
+    with pytest.raises(Begun):
+        entry(*(None for each in needed if each.kind is not each.KEYWORD_ONLY), **{
+            each.name: None for each in needed if each.kind is each.KEYWORD_ONLY
+        })  # fmt: skip
+
+
+def test_an_attempt_on_ray_begins_with_a_umask_of_its_own(monkeypatch, tmp_path, open_umask):
+    masks = []
+    monkeypatch.setattr(work, "work", lambda task: masks.append(os.umask(0o022)))
+    runners._attempt(asdict(Task("job", "recording", str(tmp_path))))
+    assert masks == [0o077]
 
 
 def test_the_programs_are_found():

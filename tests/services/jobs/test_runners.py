@@ -1,0 +1,232 @@
+"""Attempts as forked processes: their surroundings, their ends, and what the body of a job reports."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidSetting
+from operators.applications.progress import Progress
+from services.jobs import work
+from services.jobs.records import JobProgress, JobState
+from services.jobs.results import Task
+from services.jobs.runners import Forks
+
+
+@pytest.fixture
+def forks() -> Iterator[Forks]:
+    runner = Forks()
+    yield runner
+    runner.close()
+
+
+@pytest.fixture
+def body(monkeypatch) -> Callable[[Callable[[Task], None]], None]:
+    """Replace the body of jobs in the forked processes."""
+    return lambda function: monkeypatch.setattr(work, "work", function)
+
+
+def task(folder: Path, name: str = "a", **fields) -> Task:
+    (folder / name).mkdir(exist_ok=True)
+    return Task(name, str(folder / "recordings" / "one"), str(folder / name), **fields)
+
+
+def ends(forks: Forks, count: int) -> Mapping[str, str]:
+    found: dict[str, str] = {}
+    deadline = time.monotonic() + 60
+    while len(found) < count and time.monotonic() < deadline:
+        found |= forks.ended()
+        time.sleep(0.01)
+    return found
+
+
+def test_an_attempt_has_a_session_a_log_and_a_priority_of_its_own(forks, body, tmp_path):
+    def told(task: Task) -> None:
+        os.write(1, b"to the log\n")
+        os.write(2, b"errors too\n")
+        about = {
+            "leads": os.getsid(0) == os.getpid(),
+            "nice": os.nice(0),
+            "core": resource.getrlimit(resource.RLIMIT_CORE),
+            "input": os.read(0, 1).decode(),
+            "signals": [signal.getsignal(number) == signal.SIG_DFL for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)],
+        }  # fmt: skip
+        (Path(task.folder) / "about").write_text(json.dumps(about))
+
+    body(told)
+    forks.start(task(tmp_path, niceness=3))
+    assert ends(forks, 1) == {"a": "exit code 0"} and forks.ended() == {}
+    about = json.loads((tmp_path / "a" / "about").read_text())
+    nice = min(19, os.nice(0) + 3)
+    assert about == {"leads": True, "nice": nice, "core": [0, 0], "input": "", "signals": [True] * 3}
+    log = tmp_path / "a" / "log"
+    assert log.read_text() == "to the log\nerrors too\n" and stat.S_IMODE(log.stat().st_mode) == 0o600
+
+
+def test_an_attempt_that_raises_ends_with_a_trace_in_its_log(forks, body, tmp_path):
+    def failing(task: Task) -> None:
+        sys.stderr = os.fdopen(2, "w")  # pytest's own goes elsewhere
+        raise KeyboardInterrupt("no such thing")
+
+    body(failing)
+    forks.start(task(tmp_path))
+    assert ends(forks, 1) == {"a": "exit code 1"}
+    assert "KeyboardInterrupt: no such thing" in (tmp_path / "a" / "log").read_text()
+
+
+def test_one_attempt_is_killed_and_another_goes_on(forks, body, tmp_path):
+    def waiting(task: Task) -> None:
+        while not (Path(task.folder) / "go").exists():
+            time.sleep(0.01)
+
+    body(waiting)
+    for name in ("a", "b"):
+        forks.start(task(tmp_path, name))
+    forks.kill("a")
+    forks.kill("nothing")
+    assert ends(forks, 1) == {"a": "killed by SIGKILL"}
+    (tmp_path / "b" / "go").touch()
+    assert ends(forks, 1) == {"b": "exit code 0"}
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+def noted(path: Path) -> int:
+    """Wait for the process id that an attempt writes."""
+    deadline = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return int(path.read_text())
+
+
+def endless(task: Task) -> None:
+    part = Path(task.folder) / "part"
+    part.write_text(str(os.getpid()))
+    part.rename(Path(task.folder) / "pid")
+    signal.pause()
+
+
+def test_attempts_end_when_the_runner_closes(body, tmp_path):
+    body(endless)
+    forks = Forks()
+    forks.start(task(tmp_path))
+    pid = noted(tmp_path / "a" / "pid")
+    assert is_running(pid)
+    forks.close()
+    assert not is_running(pid)
+
+
+def test_attempts_end_when_their_pool_dies(body, tmp_path):
+    body(endless)
+    pool = os.fork()
+    if pool == 0:
+        Forks().start(task(tmp_path))
+        signal.pause()
+    pid = noted(tmp_path / "a" / "pid")
+    os.kill(pool, signal.SIGKILL)
+    os.waitpid(pool, 0)
+    deadline = time.monotonic() + 60
+    while is_running(pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not is_running(pid)
+
+
+@pytest.fixture
+def replayed(monkeypatch):
+    """Replace the replay and its reports in this process. Returns the settings of each replay."""
+    seen = []
+
+    def become(run: Callable[[Callable[[Progress], None]], None]) -> list:
+        def replay(settings, tell, report):
+            seen.append(settings)
+            run(tell)
+
+        monkeypatch.setattr(work, "replay", replay)
+        monkeypatch.setattr(work, "require_shown", lambda outcome: None)
+        return seen
+
+    threads = torch.get_num_threads()
+    yield become
+    torch.set_num_threads(threads)
+
+
+def test_a_finished_job_reports_its_last_frame_and_keeps_the_last_prediction(replayed, tmp_path):
+    def run(tell):
+        tell(Progress("replay", 1, 3, psnr_tissue_db=30.0, previous_frame_db=28.0, next_frame_db=27.0))
+        tell(Progress("replay", 3, 3, psnr_tissue_db=33.0, previous_frame_db=29.0))
+
+    settings = replayed(run)
+    work.work(job := task(tmp_path, options={"eyes": "both"}, threads=2))
+    assert torch.get_num_threads() == 2
+    assert (str(settings[0].recording), settings[0].out, settings[0].eyes) == (job.source, job.out, "both")
+    assert job.outcome() == (JobState.DONE, None)
+    assert job.progress() == JobProgress(3, 3, 33.0, 29.0, 27.0)
+
+
+def test_progress_is_written_a_few_times_a_second(replayed, tmp_path, monkeypatch):
+    now, written = [100.0], []
+    monkeypatch.setattr(work.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(Task, "say_progress", lambda self, reached: written.append(reached.frames_done))
+
+    def run(tell):
+        for done in range(1, 11):
+            tell(Progress("replay", done, 10))
+            now[0] += 0.09
+
+    replayed(run)
+    work.work(task(tmp_path))
+    assert written == [1, 4, 7, 10]
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (InvalidSetting("steps is 0; it must be positive"), "steps is 0; it must be positive"),
+        (ValueError("x"), "a bug in this program (ValueError); the log has the rest"),
+    ],
+)
+def test_a_failed_job_has_its_reason(replayed, tmp_path, capsys, error, reason):
+    def run(tell):
+        raise error
+
+    replayed(run)
+    work.work(job := task(tmp_path))
+    state, said = job.outcome()
+    assert state == JobState.FAILED and reason.lower() in said.lower()
+    assert type(error).__name__ in capsys.readouterr().err
+
+
+def test_a_reason_does_not_name_folders_of_the_server(replayed, tmp_path):
+    def run(tell):
+        raise InvalidSetting(f"{tmp_path}/recordings/one is damaged; upload it again")
+
+    replayed(run)
+    work.work(job := task(tmp_path))
+    assert job.outcome() == (JobState.FAILED, "one is damaged; upload it again")
+
+
+def test_a_model_is_packed_in_place_of_its_folder(replayed, tmp_path, monkeypatch):
+    def run(tell):
+        (job.out / "model").mkdir(parents=True)
+
+    job = task(tmp_path, pack_model=True)
+    replayed(run)
+    monkeypatch.setattr(work, "pack", lambda folder, file: file.write_text(folder.name))
+    work.work(job)
+    assert [path.name for path in job.out.iterdir()] == ["model.isplat"]
+    assert (job.out / "model.isplat").read_text() == "model"
