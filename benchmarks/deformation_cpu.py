@@ -48,7 +48,7 @@ def basis_times(gaussians: Gaussians, repeats: int) -> dict[str, Any]:
         "bumps": field.bumps,
         "parameters": sum(p.numel() for p in field.parameters()),
         "new_time": milliseconds(at, repeats),
-        "new_time_plain_torch": milliseconds(lambda t: reference.basis_field(*plain, field.tau(t)), 3),
+        "new_time_plain_torch": milliseconds(lambda t: reference.basis_field(*plain, field.frame_time(t)), 3),
         "backward_and_adam": milliseconds(lambda t: field.adam_step(t, gradient, BasisRates()), repeats),
     }
 

@@ -2,7 +2,7 @@
 
     python benchmarks/gpu_offline.py RECORDING... [--device cuda] [--fields basis hexplane] [--seconds 15]
     python benchmarks/gpu_offline.py RECORDING --device cpu --scale 0.25 --steps 500
-    python benchmarks/gpu_offline.py RECORDING --set smoothing=0 --set smoothing=2,bump_spacing_s=0.05
+    python benchmarks/gpu_offline.py RECORDING --set smoothing=0 --set smoothing=2,motion_spacing_s=0.05
 
 Calls `Reconstructor.fit` as `intrasplat reconstruct` does, with `ReconstructorConfig.offline` and the protocol's held-out frames. `--steps` is the number of optimiser
 steps. `--seconds` derives it from a short run before. Each `--set` is a run with other values of `ReconstructorConfig`. One JSON line per evaluation:

@@ -66,7 +66,7 @@ def milliseconds(work: Callable[[float], object], repetitions: int, warm_up: int
 def new_field(kind: str, gaussians: Gaussians) -> DeformationField:
     """Return the measured field."""
     if kind == "basis":
-        return BasisField(gaussians.count, WINDOW_S, spacing_s=ReconstructorConfig().bump_spacing_s)
+        return BasisField(gaussians.count, WINDOW_S, spacing_s=ReconstructorConfig().motion_spacing_s)
     return HexPlaneField(gaussians, WINDOW_S, channels=16, resolution=(64, 64, 64, 25), levels=(1,), width=64, depth=2)
 
 

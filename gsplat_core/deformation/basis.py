@@ -34,7 +34,8 @@ from gsplat_core.deformation.regularisers import least_squares_weights, towards_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
-from gsplat_core.scene.gaussians import BASIS_CHANNELS, POSITION, ROTATION, Gaussians
+from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS
+from gsplat_core.scene.gaussians import POSITION, ROTATION, Gaussians
 from gsplat_core.transfers import copy_each
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
@@ -94,7 +95,7 @@ class BasisSlot:
             mine.stop()
             return
         mine.write(source.velocity[:count], source.from_s, source.horizon_s)
-        mine.set_clock(self.field.tau, self.field.spacing_s)
+        mine.set_clock(self.field.frame_time, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
         """Select the region of each tensor to write, and reset the previously used rest
@@ -133,8 +134,8 @@ class BasisField(BumpTensors):
     plus one spacing at each end. A bump more than 4 widths away contributes nothing and gets no
     gradient.
 
-    Two ways of training exist. `forward` is differentiable for any optimiser. `deltas`, `displaced`
-    and `adam_step` fuse the gradient with a lazy Adam step that touches only active bumps.
+    Two ways of training exist. `forward` is differentiable for any optimiser. `deltas` and
+    `adam_step` fuse the gradient with a lazy Adam step that touches only active bumps.
     """
 
     kind = "basis"
@@ -167,22 +168,18 @@ class BasisField(BumpTensors):
         """
         past = self.continuation
         bumps_s = time_s if past is None else min(time_s, past.from_s)
-        deltas = cast(Tensor, self._ops.basis_field(*self._parameters_of(self.count), self.tau(bumps_s)))
+        deltas = cast(Tensor, self._ops.basis_field(*self._parameters_of(self.count), self.frame_time(bumps_s)))
         added = None if past is None else past.added(time_s, self.count)
         return deltas if added is None else deltas + added[:, :BASIS_CHANNELS]
 
-    def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
-        """Return the Gaussians with `deltas` [N, 13] added; differentiable in both."""
-        if gaussians.count != deltas.shape[0]:
-            raise InvalidInput(
-                f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; call"
-                " select or append when Gaussians are removed or added"
-            )
-        return displaced(gaussians, deltas)
-
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """Deform Gaussians to `time_s`, clamped to the window."""
-        return self.displaced(gaussians, self.deltas(time_s))
+        if gaussians.count != self.count:
+            raise InvalidInput(
+                f"the field holds bumps for {self.count} Gaussians, got {gaussians.count}; call"
+                " select or append when Gaussians are removed or added"
+            )
+        return displaced(gaussians, self.deltas(time_s))
 
     def adam_step(self, time_s: float, gradient: Tensor, rates: BasisRates) -> None:
         """Take a lazy Adam step of the bumps active at `time_s`; other bumps are unchanged.
@@ -196,7 +193,7 @@ class BasisField(BumpTensors):
             rates: learning rates.
         """
         each = (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths)
-        self.adam_step_at(self.tau(time_s), gradient, each)
+        self.adam_step_at(self.frame_time(time_s), gradient, each)
 
     def adam_step_at(
         self,
@@ -212,7 +209,7 @@ class BasisField(BumpTensors):
         every replay.
 
         Args:
-            tau: time as returned by `self.tau`, float or float32 [1].
+            tau: time as returned by `self.frame_time`, float or float32 [1].
             gradient: dL/d(deltas) [N, 13], or the frame path's [N, 16].
             rates: the six rates of `BasisLearningRates` in order, floats or float32 [6].
             betas: Adam's decay rates.
@@ -243,10 +240,6 @@ class BasisField(BumpTensors):
     def slot(self, rows: int) -> FieldSlot:
         """Create a slot for `rows` Gaussians."""
         return BasisSlot(self, rows)
-
-    def frame_time(self, time_s: float) -> float:
-        """Return the argument of `frame_deltas` for a time in seconds: its `tau`."""
-        return self.tau(time_s)
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
         """Return a function from tau, float32 [1], to deltas [N, 16], without autograd.
@@ -284,7 +277,7 @@ class BasisField(BumpTensors):
         """Extrapolate after the newest frame; see `Continuable.continue_with`."""
         continuation = Continuation(int(self.weights.shape[0]), self.weights.device)
         continuation.write(velocity, from_s, horizon_s)
-        continuation.set_clock(self.tau, self.spacing_s)
+        continuation.set_clock(self.frame_time, self.spacing_s)
         self.continuation = continuation
 
     def move_to(self, time_s: float, deltas: Tensor) -> None:
@@ -292,13 +285,13 @@ class BasisField(BumpTensors):
 
         This is the minimum-norm change that yields the wanted deltas.
         """
-        self.move_to_at(self.tau(time_s), deltas)
+        self.move_to_at(self.frame_time(time_s), deltas)
 
     def move_to_at(self, tau: float | Tensor, deltas: Tensor) -> None:
         """Apply `move_to` at a normalised time.
 
         Args:
-            tau: time as returned by `self.tau`, float or float32 [1] on the field's device.
+            tau: time as returned by `self.frame_time`, float or float32 [1] on the field's device.
             deltas: [N, 13], or [N, 16] with ignored columns; also for all rows including reserved
                 ones.
         """
@@ -315,7 +308,7 @@ class BasisField(BumpTensors):
 
         The result is bounded by `OVERSHOOT`.
         """
-        solution = least_squares_weights([self.tau(time_s) for time_s in times_s], self.bumps)
+        solution = least_squares_weights([self.frame_time(time_s) for time_s in times_s], self.bumps)
         weights = torch.einsum("bt,ntc->nbc", solution.to(offsets), offsets)
         low, high = offsets.amin(dim=1, keepdim=True), offsets.amax(dim=1, keepdim=True)
         beyond = OVERSHOOT * (high - low)
@@ -324,7 +317,7 @@ class BasisField(BumpTensors):
 
     def add_colours(self, time_s: float, change: Tensor) -> None:
         """Change colour weights in proportion to the bump heights; see `Capabilities.add_colours`."""
-        self.add_colours_at(self.tau(time_s), change)
+        self.add_colours_at(self.frame_time(time_s), change)
 
     def add_colours_at(self, tau: float | Tensor, change: Tensor) -> None:
         """Apply `add_colours` at a normalised time `tau`, float or float32 [1] on the field's

@@ -14,8 +14,8 @@ from torch import Tensor
 from gsplat_core.deformation.continuation import ContinuedField
 from gsplat_core.deformation.field import checked_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
-from gsplat_core.scene.gaussians import BASIS_CHANNELS, Gaussians
+from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS, BUMP_REACH
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import RowMoves
 
 
@@ -213,7 +213,7 @@ class BumpTensors(ContinuedField):
         """Layout of the columns in the tensors."""
         return self._columns
 
-    def tau(self, time_s: float) -> float:
+    def frame_time(self, time_s: float) -> float:
         """Convert a time, clamped to the window, to bump spacings since the first column."""
         return (self.clamp_time(time_s) - self._columns.origin_s) / self._columns.spacing_s
 

@@ -78,15 +78,11 @@ class Continuation(torch.nn.Module):
         self._written, self.from_s, self.horizon_s = 0, math.inf, 0.0
         store_scalars_(self.clock, [torch.finfo(torch.float32).max, 0.0, 0.0])
 
-    def past_s(self, time_s: float) -> float:
-        """Return the elapsed extrapolation at `time_s`, in seconds."""
-        return min(max(time_s - self.from_s, 0.0), self.horizon_s)
-
     def added(self, time_s: float, count: int) -> Tensor | None:
         """Return the extrapolated part [count, 16] of the deltas at `time_s`; None before the
         start.
         """
-        past_s = self.past_s(time_s)
+        past_s = min(time_s - self.from_s, self.horizon_s)
         return self.velocity[:count] * past_s if past_s > 0 else None
 
     def captured(self, deltas: DeltasAt) -> DeltasAt:

@@ -22,7 +22,7 @@ from gsplat_core.deformation.regularisers import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane import plain_torch
-from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
+from gsplat_core.ops.hexplane.plain_torch import HEAD_COLUMNS, HEAD_GROUPS, PLANE_AXES
 from gsplat_core.ops.hexplane_deltas.hexplane_deltas import hexplane_deltas, takes_layers
 from gsplat_core.ops.hexplane_training.hexplane_training import (
     AdamOnDevice,
@@ -33,7 +33,7 @@ from gsplat_core.ops.hexplane_training.hexplane_training import (
     hexplane_train_backward,
     network_adam_,
 )
-from gsplat_core.scene.gaussians import HEAD_COLUMNS, HEAD_GROUPS, Gaussians, width_of
+from gsplat_core.scene.gaussians import Gaussians, width_of
 from gsplat_core.value_ranges import IntegerIn, ListOf
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
@@ -142,11 +142,9 @@ class HexPlaneField(DeformationField):
         start, end = self.time_window_s
         return 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
 
-    def features(self, means: Tensor, time_s: float) -> Tensor:
-        """Return the features [N, levels * channels]: products over the planes, levels
-        concatenated.
-        """
-        return torch.cat(self._features(self.coordinates(means, time_s)), dim=1)
+    def features(self, coordinates: Tensor) -> list[Tensor]:
+        """Return the product over the planes of each level [N, channels]."""
+        return [self._ops.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)]
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """Deform Gaussians to `time_s`, clamped to the window."""
@@ -154,7 +152,7 @@ class HexPlaneField(DeformationField):
         # The torch implementation keeps the intermediates that autograd needs.
         ops = plain_torch if torch.is_grad_enabled() else self._ops
         return self._displaced(
-            gaussians, ops.hexplane_decode(self._features(coordinates), coordinates, [], *self._network())
+            gaussians, ops.hexplane_decode(self.features(coordinates), coordinates, [], *self._network())
         )
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
@@ -200,7 +198,7 @@ class HexPlaneField(DeformationField):
 
         Returns:
             Function from a float32 tensor [1] on the field's device, as computed by `frame_time`,
-                to deltas [N, 16] in the layout of `scene.layout`.
+                to deltas [N, 16] in the layout of `scene.gaussians`.
         """
         is_cuda = self.box.device.type == "cuda" and self._ops is compiled
         with torch.no_grad():
@@ -305,9 +303,6 @@ class HexPlaneField(DeformationField):
         at = float((t + 1) / 2 * (rows - 1))
         row = min(int(at), rows - 2)
         return [torch.lerp(plane[row], plane[row + 1], at - row) for plane in planes]
-
-    def _features(self, coordinates: Tensor) -> list[Tensor]:
-        return [self._ops.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)]
 
     def _network(self) -> tuple[list[Tensor], list[Tensor]]:
         """Weights and biases of trunk and head, layer by layer."""

@@ -1,6 +1,6 @@
 """Snapshots of a scene in training, published without allocation or host synchronisation.
 
-On a GPU, the publisher owns a few slots: tensors at fixed addresses with spare capacity for Gaussians and bumps. Each
+On a GPU, the publisher owns a few slots: tensors at fixed addresses with spare capacity for Gaussians and the field. Each
 snapshot is copied into a free slot on the current stream. A renderer that captured a CUDA graph for a slot replays it
 for every later snapshot in that slot. A slot becomes free when its snapshot has no references left. Pending GPU reads
 are awaited on the stream before the slot is overwritten.
@@ -220,11 +220,6 @@ class SnapshotSlots:
         """Number of slots allocated so far."""
         return len(self._slots)
 
-    @staticmethod
-    def can_hold(field: DeformationField | None) -> bool:
-        """Return True if this kind of field can be stored in a slot."""
-        return field is None or field.capabilities.slot is not None
-
     def publish(
         self,
         gaussians: Gaussians,
@@ -244,7 +239,7 @@ class SnapshotSlots:
         Raises:
             InvalidInput: if all slots are in use, or the field cannot be stored in a slot.
         """
-        if not self.can_hold(field):
+        if field is not None and field.capabilities.slot is None:
             raise InvalidInput(f"a {type(field).__name__} cannot lie in a slot; publish it as a Model")
         slot = self._free_slot()
         slot.write(gaussians, field)

@@ -26,7 +26,7 @@ def render_frame(
     Args:
         gaussians: raw parameters: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3], logit_opacities [N],
             sh [N, B, 3] with B a square.
-        deltas: [N, 16], added to the raw parameters in the layout of `scene.layout`, or None.
+        deltas: [N, 16], added to the raw parameters in the layout of `scene.gaussians`, or None.
         view: camera; its tensors have the Gaussians' dtype.
         expected_depth: normalise the fourth channel to the weighted mean of z; otherwise it is the weighted sum.
 

@@ -187,12 +187,3 @@ OPACITY = slice(13, 14)
 def width_of(*groups: slice) -> int:
     """Return the total number of columns of the groups."""
     return sum(group.stop - group.start for group in groups)
-
-
-BASIS_GROUPS = (POSITION, ROTATION, LOG_SCALE, COLOUR)
-"""Parameters deformed by the basis-function field: the first `BASIS_CHANNELS` columns."""
-BASIS_CHANNELS = width_of(*BASIS_GROUPS)
-HEAD_GROUPS = (POSITION, LOG_SCALE, ROTATION, OPACITY)
-"""Output order of the HexPlane field's network, with log-scales before rotation as in G-SHARP."""
-HEAD_COLUMNS = tuple(column for group in HEAD_GROUPS for column in range(group.start, group.stop))
-"""Raw column of each output of that network."""

@@ -75,7 +75,7 @@ class ReconstructorConfig:
     """Optimiser steps for the first frame of a scene."""
     window_frames: int = 30
     """Number of recent frames that are trained on again to prevent forgetting."""
-    bump_spacing_s: float = 0.2
+    motion_spacing_s: float = 0.2
     """Shortest time in seconds in which motion can change its course."""
     squared_error: bool = False
     """Compare colours by squared error, which PSNR measures, instead of L1."""
@@ -131,7 +131,7 @@ class ReconstructorConfig:
             raise InvalidSetting(
                 f"max_gaussians is {self.max_gaussians}, below the {self.gaussians} gaussians to start with"
             )
-        for name in ("bump_spacing_s", "default_depth_mm"):
+        for name in ("motion_spacing_s", "default_depth_mm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
         if self.history_s is not None and not 0 < self.history_s < math.inf:
@@ -154,7 +154,7 @@ class ReconstructorConfig:
             field=field,
             gaussians=60_000,
             max_gaussians=80_000,
-            bump_spacing_s=FIELDS[field].offline_spacing_s,
+            motion_spacing_s=FIELDS[field].offline_spacing_s,
             squared_error=True,
             depth_of_recording="parallax",
         )

@@ -40,9 +40,9 @@ class Reconstructor:
     """Owner of the model that is being learned.
 
     Online: call `observe` for each frame in order, and `publish` for a model to display. Offline:
-    call `fit`. The result is deterministic for equal frames, settings and seed. With the basis
-    field it is also independent of the number of threads. The HexPlane's network uses torch's
-    matrix products, which round differently with other numbers of threads.
+    call `fit`. The result is deterministic for equal frames, settings and seed. It is
+    also independent of the number of threads, unless the field uses torch's matrix products, which
+    round differently with other numbers of threads.
 
     For a stream that does not wait, give `live`. All steps of `observe` then train on the newest
     frame. After `publish`, call `grow` and `rehearse` until the next frame.
@@ -345,7 +345,7 @@ class Reconstructor:
             gaussians, field = newest_state(step, prior, self._learned_s)
             facts = {**self._facts(), "time_window_s": (self._learned_s, self._last_time_s)}
             return Model(gaussians=gaussians, field=field, **facts)
-        if step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(step.field):
+        if step is None or self.device.type != "cuda" or step.capabilities.slot is None:
             return self.snapshot()
         self._version += 1
         with continued(step, prior, self._learned_s):
@@ -375,14 +375,14 @@ class Reconstructor:
             if self._step is not None:
                 self._motion.restart()
                 return
-        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
+        wanted = NewField(gaussians, observation.time_s, end_s, self.config.motion_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers are initialised randomly
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)
         if end_s is None:
             self._motion.begin(field)
-        is_captured = self.device.type == "cuda" and SnapshotSlots.can_hold(field)
+        is_captured = self.device.type == "cuda" and field.capabilities.slot is not None
         self._covering.begin(self.camera if is_captured else None, self.device, self._fixed_rows)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:

@@ -108,7 +108,7 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
     # Offline training ends with all Gaussians. Online, Gaussians are added for new tissue, of which
     # a fixed scope shows little.
     gaussians = config.max_gaussians if offline else config.gaussians
-    field = FIELDS[config.field].training_bytes(gaussians, frames / source.fps / config.bump_spacing_s)
+    field = FIELDS[config.field].training_bytes(gaussians, frames / source.fps / config.motion_spacing_s)
     model = PARAMETER_BYTES * gaussians * _CANONICAL + field
     return FIXED_BYTES + pixels * (PIXEL_BYTES + WINDOW_PIXEL_BYTES * kept) + model
 

@@ -134,7 +134,7 @@ class LiveSettings(LiveOptions):
             gaussians=wanted,
             max_gaussians=2 * wanted,
             window_frames=LIVE_WINDOW_FRAMES[device],
-            bump_spacing_s=LIVE_BUMP_SPACING_S[device],
+            motion_spacing_s=LIVE_BUMP_SPACING_S[device],
             history_s=LIVE_HISTORY_S[device],
             preallocate=True,
             motion_prior="flow",

@@ -10,8 +10,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.gaussians import BASIS_GROUPS, COLOUR, RAW_COLUMNS, width_of
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS, ROTATION, width_of
 
+BASIS_GROUPS = (POSITION, ROTATION, LOG_SCALE, COLOUR)
+"""Deformed parameters: the first `BASIS_CHANNELS` columns of the raw row."""
+BASIS_CHANNELS = width_of(*BASIS_GROUPS)
 BUMP_REACH = 4.0
 """Truncation radius of a bump in widths; its height there is exp(-16) = 1e-7."""
 

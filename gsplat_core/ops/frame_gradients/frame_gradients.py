@@ -29,7 +29,7 @@ class RawGradients(NamedTuple):
     """Gradients of one frame's raw Gaussians, all zero if the frame's lists overflowed."""
 
     raw: Tensor
-    """Gradient [N, 16] in the layout of `scene.layout`; equals the gradient of the deltas."""
+    """Gradient [N, 16] in the layout of `scene.gaussians`; equals the gradient of the deltas."""
     sh: Tensor
     """Gradient of `sh` [N, B, 3]; empty for B = 1, where `raw[:, COLOUR]` contains it."""
 

@@ -11,7 +11,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.gaussians import COLOUR, HEAD_GROUPS, OPACITY, RAW_COLUMNS, width_of
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION, width_of
+
+HEAD_GROUPS = (POSITION, LOG_SCALE, ROTATION, OPACITY)
+"""Output order of the field's network, with log-scales before rotation as in G-SHARP."""
+HEAD_COLUMNS = tuple(column for group in HEAD_GROUPS for column in range(group.start, group.stop))
+"""Raw column of each output of the network."""
 
 
 def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
@@ -127,7 +132,7 @@ def hexplane_deltas(
         decode: replacement for `hexplane_decode`.
 
     Returns:
-        Deltas [N, 16] in the layout of `scene.layout`.
+        Deltas [N, 16] in the layout of `scene.gaussians`.
     """
     # No host synchronisation or copy, so that a CUDA graph can capture the call.
     lines = []

@@ -42,7 +42,7 @@ def hexplane_deltas(
             faster.
 
     Returns:
-        Deltas [N, 16] in the layout of `scene.layout`.
+        Deltas [N, 16] in the layout of `scene.gaussians`.
 
     Raises:
         InvalidInput: if the tensors are not on a CUDA device or have an unsupported dtype.

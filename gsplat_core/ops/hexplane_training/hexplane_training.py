@@ -28,7 +28,7 @@ class TrainingState(NamedTuple):
     """Values of the forward pass saved for the backward pass."""
 
     deltas: Tensor
-    """[N, 16] in the layout of `scene.layout`."""
+    """[N, 16] in the layout of `scene.gaussians`."""
     coordinates: Tensor
     """[N, 4]: x, y, z in [-1, 1], and 1. Gaussians with a non-finite position have zeros and are skipped."""
     lines: Tensor

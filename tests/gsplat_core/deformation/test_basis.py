@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField, BasisRates
+from gsplat_core.deformation.field import displaced
 from gsplat_core.errors import InvalidInput
 
 RATES = BasisRates()
@@ -22,8 +23,8 @@ def random_field(count, window=(0.0, 4.0), **layout):
 def test_bumps_cover_the_window_and_one_spacing_more():
     field = BasisField(3, (10.0, 15.0), bumps=13)
     assert field.spacing_s == 0.5
-    assert field.tau(10.0) == pytest.approx(1.0)
-    assert field.tau(15.0) == pytest.approx(11.0)
+    assert field.frame_time(10.0) == pytest.approx(1.0)
+    assert field.frame_time(15.0) == pytest.approx(11.0)
     assert torch.equal(field.centers[0], torch.arange(13.0))
     assert torch.equal(field.log_widths, torch.zeros(3, 13))
     by_spacing = BasisField(3, (10.0, 15.0), spacing_s=0.5)
@@ -40,10 +41,9 @@ def test_equal_weights_make_an_even_motion_inside_the_window():
 
 def test_each_group_of_channels_moves_its_own_part(make_gaussians):
     gaussians = make_gaussians(2, sh_degree=1)
-    field = BasisField(2, (0.0, 1.0))
     deltas = torch.zeros(2, 13)
     deltas[:, :3], deltas[:, 3:7], deltas[:, 7:10], deltas[:, 10:] = 1.0, 2.0, 3.0, 4.0
-    moved = field.displaced(gaussians, deltas)
+    moved = displaced(gaussians, deltas)
     assert torch.equal(moved.means, gaussians.means + 1)
     assert torch.equal(moved.quats, gaussians.quats + 2)
     assert torch.equal(moved.log_scales, gaussians.log_scales + 3)
@@ -84,7 +84,7 @@ def test_a_long_stream_keeps_its_size_and_precision():
     assert max(sizes) <= 2.0 / 0.2 + 3 + 6
     # Columns are still where they were laid out, to the last bit that float32 has at the column's number.
     assert torch.equal(field.centers[0], torch.arange(float(field.bumps)))
-    assert 0 <= field.tau(3999.0) <= 8
+    assert 0 <= field.frame_time(3999.0) <= 8
 
 
 def test_new_bumps_hold_the_last_motion_when_asked():

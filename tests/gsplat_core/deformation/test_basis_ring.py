@@ -106,8 +106,8 @@ def test_no_tensor_moves_and_centres_stay_exact_in_a_stream_of_ten_thousand_colu
         newest = time_s
     assert addresses(field) == at
     assert torch.equal(field.columns.in_order(field.centers.data)[0], torch.arange(float(field.bumps)))
-    assert 0 <= field.tau(newest) <= field.bumps
-    assert field.columns.origin_s + field.tau(newest) * SPACING_S == pytest.approx(newest, abs=1e-9)
+    assert 0 <= field.frame_time(newest) <= field.bumps
+    assert field.columns.origin_s + field.frame_time(newest) * SPACING_S == pytest.approx(newest, abs=1e-9)
 
 
 def test_trained_centres_lose_no_bit_when_the_origin_moves_on():
@@ -204,14 +204,14 @@ def test_all_reserved_rows_can_be_deformed_and_trained_at_once():
     class Rows:
         count = 9
 
-    at = field.frame_deltas(Rows())(torch.tensor([field.tau(0.1)]))
+    at = field.frame_deltas(Rows())(torch.tensor([field.frame_time(0.1)]))
     assert torch.equal(at[:4, :13], field.deltas(0.1)) and (at[4:] == 0).all()
     gradient = torch.zeros(9, 16)
     gradient[:4] = 1.0
     expected = online(4)
     watch(expected, 0.1, 0.0)
     expected.adam_step(0.1, torch.ones(4, 13), RATES)
-    field.adam_step_at(field.tau(0.1), gradient, list(vars(RATES).values()))
+    field.adam_step_at(field.frame_time(0.1), gradient, list(vars(RATES).values()))
     assert torch.equal(field.deltas(0.1), expected.deltas(0.1))
     assert (field.weights[4:] == 0).all()
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 import gsplat_core
+from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS
+from gsplat_core.ops.hexplane.plain_torch import HEAD_COLUMNS
 from gsplat_core.scene import gaussians
 
 HEADER = Path(gsplat_core.__file__).parent / "native" / "raw_layout.h"
@@ -29,8 +31,8 @@ def test_the_kernels_header_has_the_same_columns(constants):
         "kRawColor": gaussians.COLOUR.start,
         "kRawOpacity": gaussians.OPACITY.start,
         "kRawUsed": gaussians.OPACITY.stop,
-        "kRawBasisChannels": gaussians.BASIS_CHANNELS,
-        "kHeadOutputs": len(gaussians.HEAD_COLUMNS),
+        "kRawBasisChannels": BASIS_CHANNELS,
+        "kHeadOutputs": len(HEAD_COLUMNS),
     }
 
 
@@ -42,7 +44,7 @@ def test_groups_follow_each_other_without_gap_or_overlap():
 
 
 def test_the_hexplane_head_has_log_scales_before_the_rotation():
-    assert gaussians.HEAD_COLUMNS == (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
+    assert HEAD_COLUMNS == (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
 
 
 def test_kernels_spell_no_column_of_the_layout_themselves():

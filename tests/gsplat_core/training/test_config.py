@@ -25,8 +25,8 @@ from gsplat_core.training.config import (
         ("steps_per_frame", 0),
         ("first_frame_steps", -1),
         ("window_frames", 0),
-        ("bump_spacing_s", 0.0),
-        ("bump_spacing_s", float("nan")),
+        ("motion_spacing_s", 0.0),
+        ("motion_spacing_s", float("nan")),
         ("ssim_weight", -0.1),
         ("ssim_weight", 1.1),
         ("depth_weight", float("inf")),
@@ -76,7 +76,7 @@ def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_m
     assert offline.field == field
     assert offline.gaussians > online.gaussians
     assert offline.max_gaussians > offline.gaussians
-    assert offline.bump_spacing_s < online.bump_spacing_s
+    assert offline.motion_spacing_s < online.motion_spacing_s
     assert offline.squared_error
     assert not online.squared_error
 
@@ -127,7 +127,7 @@ def test_settings_at_their_limits_are_taken(settings):
 
 @pytest.mark.parametrize(
     ("name", "value"), [("sh_degree", -1), ("history_s", 0.0), ("history_s", float("inf")),
-                        ("default_depth_mm", 0.0), ("bump_spacing_s", float("inf")), ("eyes", "right"), ("motion_detail", "some")],
+                        ("default_depth_mm", 0.0), ("motion_spacing_s", float("inf")), ("eyes", "right"), ("motion_detail", "some")],
 )  # fmt: skip
 def test_settings_just_beyond_their_limits_are_refused(name, value):
     with pytest.raises(InvalidSetting, match=name):
@@ -141,13 +141,13 @@ def test_defaults_are_those_of_the_published_figures():
     assert made == {
         "field": "auto", "gaussians": 30_000, "max_gaussians": 60_000, "sh_degree": 0, "steps_per_frame": 10,
         "first_frame_steps": 60, "window_frames": 30,
-        "bump_spacing_s": 0.2, "squared_error": False, "history_s": None, "preallocate": False, "ssim_weight": 0.0,
+        "motion_spacing_s": 0.2, "squared_error": False, "history_s": None, "preallocate": False, "ssim_weight": 0.0,
         "depth_weight": 0.1, "default_depth_mm": 60.0, "eyes": "left", "motion_prior": "bumps", "motion_detail": "full",
         "start_from_motion": False, "depth_from_motion": False, "depth_of_recording": None,
     }  # fmt: skip
     assert rates == {"means_px": 0.03, "quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh": 5e-3,
                      "right_share": 0.1, "field": None}  # fmt: skip
     offline = ReconstructorConfig.offline()
-    assert (offline.gaussians, offline.max_gaussians, offline.bump_spacing_s) == (60_000, 80_000, 0.05)
-    assert ReconstructorConfig.offline("hexplane").bump_spacing_s == pytest.approx(1 / 15)
+    assert (offline.gaussians, offline.max_gaussians, offline.motion_spacing_s) == (60_000, 80_000, 0.05)
+    assert ReconstructorConfig.offline("hexplane").motion_spacing_s == pytest.approx(1 / 15)
     assert offline.depth_of_recording == "parallax"

@@ -94,7 +94,7 @@ def test_cells_are_unfilled_where_tissue_entered_that_the_scene_does_not_have():
 @pytest.mark.parametrize(("pixels_a_frame", "frames"), [(1, 60), (4, 60)])
 def test_a_camera_that_moves_on_does_not_drag_the_scene_along(device, pixels_a_frame, frames):
     config = ReconstructorConfig(
-        gaussians=300, max_gaussians=6000, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True,
+        gaussians=300, max_gaussians=6000, window_frames=20, motion_spacing_s=0.1, history_s=1.0, preallocate=True,
         default_depth_mm=DEPTH_MM,
     )  # fmt: skip
     made = Reconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)

@@ -42,7 +42,7 @@ def frame_at(seq, column, time_s=None, **fields):
 
 def reconstructor(rows, device="cpu"):
     config = ReconstructorConfig(
-        gaussians=300, max_gaussians=rows, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True,
+        gaussians=300, max_gaussians=rows, window_frames=20, motion_spacing_s=0.1, history_s=1.0, preallocate=True,
         default_depth_mm=DEPTH_MM,
     )  # fmt: skip
     # Rates for a few steps a frame: those of a live run are made for dozens.

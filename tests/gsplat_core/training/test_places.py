@@ -124,7 +124,7 @@ def test_likeness_of_too_little_is_none():
 
 def reconstructor(device="cpu"):
     config = ReconstructorConfig(
-        gaussians=500, max_gaussians=1000, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True
+        gaussians=500, max_gaussians=1000, window_frames=20, motion_spacing_s=0.1, history_s=1.0, preallocate=True
     )
     # Rates for a few steps a frame: those of a live run are made for dozens.
     return Reconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)

@@ -34,7 +34,7 @@ def still_frames(count: int, wrong_in: tuple[int, ...], factor: float) -> list[F
 
 def fitted(frames: list[Frame], steps: int = 60) -> Reconstructor:
     config = ReconstructorConfig(
-        field="basis", gaussians=700, max_gaussians=900, squared_error=True, bump_spacing_s=0.05, eyes="both"
+        field="basis", gaussians=700, max_gaussians=900, squared_error=True, motion_spacing_s=0.05, eyes="both"
     )
     learning = Reconstructor(config, LEFT)
     learning.fit(frames, steps)

@@ -20,7 +20,7 @@ from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.upkeep import MOST_SPLIT, RELAX_EVERY, RENEW_EVERY, SURFACE_STEPS, THINNEST_PX, Upkeep
 
 CONFIG = ReconstructorConfig(
-    gaussians=300, max_gaussians=600, window_frames=10, bump_spacing_s=0.1, history_s=1.0, preallocate=True
+    gaussians=300, max_gaussians=600, window_frames=10, motion_spacing_s=0.1, history_s=1.0, preallocate=True
 )
 SPACING_PX = math.sqrt(48 * 40 / 300)
 
@@ -169,7 +169,7 @@ def test_a_stream_that_has_gone_on_for_days_learns_what_one_that_begins_learns(m
     """Bit for bit: 100 hours and all frame times, bump spacings and the history are multiples of 1/32 s, which float64 adds without rounding."""
     monkeypatch.setattr("gsplat_core.training.upkeep.RELAX_EVERY", 16)
     monkeypatch.setattr("gsplat_core.training.upkeep.RENEW_EVERY", 32)
-    config = dataclasses.replace(CONFIG, bump_spacing_s=0.125, history_s=0.5)
+    config = dataclasses.replace(CONFIG, motion_spacing_s=0.125, history_s=0.5)
     images = []
     for start_ns in (0, 360_000 * 10**9):
         made = Reconstructor(config, camera, live=LiveTraining())
