@@ -164,13 +164,6 @@ class Fragment:
         graph = self._graph
         return () if graph is None else graph.edge_stats()
 
-    def compute_counts(self) -> dict[str, int]:
-        """Return the number of compute calls by operator in the current or last run.
-        Thread-safe.
-        """
-        graph = self._graph
-        return {} if graph is None else {task.name: task.computes for task in graph.tasks}
-
     def faults(self) -> tuple[Fault, ...]:
         """Return the last 1000 faults of the current or last run. Thread-safe."""
         graph = self._graph

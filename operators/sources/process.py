@@ -152,7 +152,7 @@ def parsed(data: bytes) -> dict[str, Any]:
     """Decode a control message. Raises InvalidMessage."""
     try:
         content = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidMessage(f"{data[:40]!r} is not JSON: {error}") from error
     if not isinstance(content, dict) or not isinstance(content.get("kind"), str):
         raise InvalidMessage(f"{data[:40]!r} is not a message")

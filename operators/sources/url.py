@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 
@@ -271,7 +271,7 @@ def url_source(scheme: str, rest: str, options: SourceOptions) -> ConnectedSourc
     """
     address = UrlAddress.parse(scheme, rest)
     place = Place(address.url, address.options(), open_s=address.open_s, read_s=address.stall_s)
-    return ConnectedSource(place, address.name, replace(options, process=False))
+    return ConnectedSource(place, address.name, options)
 
 
 rtsp_source = partial(url_source, "rtsp")

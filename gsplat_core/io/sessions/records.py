@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.files import PartialFile
@@ -267,8 +267,6 @@ MAX_BYTES = 1 << 20
 
 class SessionInfo(Record):
     """Content of `session.json`."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 
     format: Literal["intrasplat-session"] = "intrasplat-session"
     version: Literal[1] = 1

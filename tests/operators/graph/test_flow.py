@@ -19,7 +19,7 @@ def test_chain_delivers_everything_in_order(kit, runner):
     assert sink.values == [2 * i for i in range(50)]
     assert sink.seqs == list(range(50))
     assert result.reason is StopReason.FINISHED and result.error is None and app.result is result
-    assert result.computes == {"source": 50, "double": 50, "sink": 50} == app.compute_counts()
+    assert result.computes == {"source": 50, "double": 50, "sink": 50}
     assert [(edge.sent, edge.received, edge.queued, edge.dropped) for edge in result.edges] == [(50, 50, 0, {})] * 2
 
 

@@ -16,7 +16,7 @@ from operators.sources.source import SourceDescription
 CAMERA = Camera.from_focal(30.0, 3, 2)
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"3", b"{}", b'{"kind": 3}'])
+@pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"3", b"{}", b'{"kind": 3}', b"[" * 200_000])
 def test_bytes_that_are_no_message_are_refused(data):
     with pytest.raises(InvalidMessage):
         parsed(data)

@@ -19,7 +19,7 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from services.bus.pictures import split, subscribe
+from services.bus.pictures import picture_from, subscribe
 from services.bus.runtime import ProcessIdentity, RuntimeFolder
 from services.settings import StreamSettings
 from services.supervisor.launcher import ByLauncher, Direct
@@ -53,7 +53,7 @@ class Headers:
 
     async def _listen(self) -> None:
         while True:
-            self.seen.append(split(await self._socket.recv_multipart(copy=False))[0])
+            self.seen.append(dict(picture_from(await self._socket.recv_multipart(copy=False)).header))
 
     async def close(self) -> None:
         self._task.cancel()
