@@ -243,7 +243,9 @@ class Marked:
 def outdated(folders: Sequence[str]) -> list[list[str]]:
     """Return the test files of some folders without a record of their present text, in groups of one folder each."""
     groups: dict[Path, list[str]] = defaultdict(list)
-    named = (ROOT / name for name in folders)
+    named = [ROOT / name for name in folders]
+    if missing := [str(each) for each in named if not each.exists()]:
+        sys.exit(f"{', '.join(missing)}: no such folder or file of tests")
     for path in (path for each in named for path in (sorted(each.rglob("test_*.py")) if each.is_dir() else [each])):
         file = str(path.relative_to(ROOT))
         try:

@@ -91,3 +91,11 @@ def test_a_refit_leaves_out_the_pull() -> None:
     again = fitted_undisturbed(tracks, first)
     before, after = (np.sqrt((distance_errors(each, points, poses) ** 2).mean()) for each in (first, again))
     assert after < 0.75 * before
+
+
+def test_points_beyond_the_picture_belong_to_its_outermost_cells() -> None:
+    random = np.random.default_rng(1)
+    rays = random.uniform(-1.5, 1.5, (1, 300, 2))
+    tracks = GridTracks(rays, np.ones((1, 300), bool), np.eye(4)[None], np.zeros(1), 280.0, (0.57, 0.45))
+    together = together_px(np.broadcast_to([3.0, -4.0], (1, 300, 2)), tracks)
+    np.testing.assert_allclose(together, 5.0, rtol=1e-6)

@@ -77,3 +77,22 @@ def test_more_waves_start_at_nothing_and_leave_the_others():
     both = with_waves(one, waves(times_s, (BREATHING_HZ, HEART_HZ)))
     torch.testing.assert_close(both.off(), one.off())
     assert not both.amplitudes[:, :, 2:].any()
+
+
+def test_the_cost_is_the_negative_logarithm_of_the_likelihood_and_the_priors():
+    """Relief has a standard deviation of 0.3 of the median depth, motion that of its field, a ray 0.002 with Cauchy's scale."""
+    bundle, _ = breathing(5.0)
+    generator = torch.Generator().manual_seed(0)
+    swings = 0.01 * torch.randn(bundle.amplitudes.shape, generator=generator, dtype=torch.float64)
+    moving = replace(bundle, amplitudes=swings)
+    moving = replace(moving, rays=moving.rays + moving.off())  # explained exactly
+    assert float(moving.off().abs().max()) < 1e-12
+    depth = moving.rest[:, 2]
+    relief = ((depth - depth.median()) ** 2).sum() / (2 * 0.3**2)
+    vectors = swings.reshape(len(swings), -1)
+    motion = sum(each @ moving.field.stiffness @ each for each in vectors.unbind(1)) / 2
+    assert adjust(moving, 0.004, 0)[1] == pytest.approx(float(relief + motion), rel=1e-9)
+    rays = moving.rays.clone()
+    rays[7] += torch.tensor([0.003, -0.004], dtype=torch.float64)
+    off = 0.5 * (0.004 / 0.002) ** 2 * torch.log1p(torch.tensor((0.005 / 0.004) ** 2, dtype=torch.float64))
+    assert adjust(replace(moving, rays=rays), 0.004, 0)[1] == pytest.approx(float(relief + motion + off), rel=1e-9)

@@ -13,7 +13,7 @@ from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.tracks import FeatureTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
-from gsplat_core.poses.odometry import Trajectory, trajectory_of
+from gsplat_core.poses.odometry import LEAST_SEEN, Trajectory, followed_part, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
@@ -47,6 +47,18 @@ def test_the_way_of_a_moving_scope_is_found(rigid, found):
     assert found.error_px < 0.4 < found.still_error_px and found.explained > 0.9
     assert found.lost == () and found.path > 1
     assert np.array_equal(found.poses[0], np.eye(4))
+
+
+def test_the_error_of_a_static_scope_is_the_spread_of_the_tracks(rigid, found):
+    """In pixels, from the tracked points themselves; by the scope's motion it is many times the reprojection error."""
+    tracks = FeatureTracks()
+    for frame in rigid:
+        tracks.follow(frame.image, followed_part(frame))
+    seen = tracks.observations(LEAST_SEEN)
+    middles = np.stack([np.median(seen.pixels[seen.point == number], axis=0) for number in range(seen.point.max() + 1)])
+    spread = np.median(np.linalg.norm(seen.pixels - middles[seen.point], axis=1))
+    assert found.still_error_px == pytest.approx(spread, rel=0.1)
+    assert found.explained == pytest.approx(1 - (found.error_px / found.still_error_px) ** 2)
 
 
 def test_the_first_frames_tissue_is_at_the_stated_distance(found):

@@ -115,6 +115,19 @@ def test_a_name_that_is_no_text_refuses_itself_alone(tmp_path, name):
     assert [os.fsencode(name) for name, _ in unusable] == [name]
 
 
+def test_folders_and_videos_are_recordings_unless_they_are_hidden(tmp_path):
+    for name in ("a", ".b", "A folder"):
+        (tmp_path / name).mkdir()
+    for name in ("c.mp4", "D.MKV", ".e.mp4", "notes.txt", ".f"):
+        (tmp_path / name).touch()
+    found, unusable = recordings_in(tmp_path)
+    assert [path.name for path in found] == ["A folder", "D.MKV", "a", "c.mp4"] and unusable == []
+    with pytest.raises(InvalidSetting, match="no videos and no folders"):
+        recordings_in(tmp_path / "a")
+    with pytest.raises(InvalidSetting, match="is no folder"):
+        recordings_in(tmp_path / "c.mp4")
+
+
 @pytest.mark.parametrize("depth", ["auto", *(name for name in DEPTHS if name != "onnx")])
 def test_jobs_take_every_registered_depth(depth):
     assert JobOptions(depth=depth).depth == CallerJobOptions(depth=depth).depth == depth

@@ -17,7 +17,8 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from operators.applications.progress import Progress
-from services.jobs import work
+from services.jobs import runners, work
+from services.jobs.pool import new_runner
 from services.jobs.records import JobProgress, JobState
 from services.jobs.results import Task
 from services.jobs.runners import Forks
@@ -230,3 +231,13 @@ def test_a_model_is_packed_in_place_of_its_folder(replayed, tmp_path, monkeypatc
     work.work(job)
     assert [path.name for path in job.out.iterdir()] == ["model.isplat"]
     assert (job.out / "model.isplat").read_text() == "model"
+
+
+def test_jobs_run_on_ray_only_where_it_is_named(monkeypatch):
+    monkeypatch.setattr(runners, "OnRay", lambda address: f"Ray at {address}")
+    assert new_runner("head:6379") == "Ray at head:6379"
+    loaded = []
+    monkeypatch.setattr(runners, "load", lambda: loaded.append(True))
+    forks = new_runner(None)
+    assert isinstance(forks, Forks) and loaded == [True]
+    forks.close()
