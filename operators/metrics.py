@@ -304,7 +304,7 @@ class MetricsOp(Operator):
         if not self.on_screen:
             spec.input("rendered", type=RenderedFrame)
             spec.input("predicted", type=Prediction, optional=True)
-            spec.output("scored", type=ScoredFrame)
+            spec.output("scored", type=ScoredFrame, optional=True)
             return
         for name, kind in (("frame", Frame), ("shown", ShownPicture), ("predicted", Prediction)):
             optional = name == "predicted"
