@@ -9,12 +9,19 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.structure import circles, imports, parsed
+
 ROOT = Path(__file__).resolve().parent.parent
 MAY_IMPORT = {
     "gsplat_core": {"gsplat_core"},
     "operators": {"gsplat_core", "operators"},
     "services": {"gsplat_core", "operators", "services"},
 }
+
+
+@pytest.mark.parametrize("package", ["operators", "services"])
+def test_no_modules_import_each_other_not_even_in_functions_or_for_type_checkers(package):
+    assert circles(imports(parsed(ROOT, [package]), everything=True)) == []
 
 
 REFERENCE = "gsplat_core.reference"
