@@ -238,18 +238,20 @@ class ZeroMqSource(StreamSource):
         assert self._socket is not None and self._monitor is not None
         found = dict(self._poller.poll(look_ms))
         now_s = time.monotonic()
-        if self._monitor in found and recv_monitor_message(self._monitor)["event"] == zmq.EVENT_DISCONNECTED:
-            self._lost_s = now_s
-            self.lost(f"the connection to {self._name} is lost; it is being made again")
+        if self._monitor in found:
+            if recv_monitor_message(self._monitor)["event"] == zmq.EVENT_DISCONNECTED:
+                self._lost_s = now_s
+                self.lost(f"the connection to {self._name} is lost; it is being made again")
+            else:
+                self._lost_s = math.inf
         if self._socket not in found:
-            if now_s - self._lost_s > NEW_SOCKET_S:  # never true while it is infinite
+            if now_s - self._lost_s > NEW_SOCKET_S:  # false while connected, when it is infinite
                 # A socket does not reconnect to a sender that broke the protocol, for example with
                 # an oversized message.
                 self._disconnect()
                 self._connect()
             return None
-        self._lost_s = math.inf
-        message = self._socket.recv(copy=False)
+        message = self._socket.recv(copy=False)  # may have been queued before the connection was lost
         now_ns = time.monotonic_ns()
         if self._socket.getsockopt(zmq.RCVMORE):  # a frame is a single part
             while self._socket.getsockopt(zmq.RCVMORE):
@@ -276,7 +278,9 @@ class ZeroMqSource(StreamSource):
         self._lost_s = math.inf
         self._context, socket = connected(zmq.SUB, self._endpoint, bind=False, options=options)
         self._socket: zmq.Socket | None = socket
-        self._monitor: zmq.Socket | None = socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        self._monitor: zmq.Socket | None = socket.get_monitor_socket(
+            zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED
+        )
         self._poller: zmq.Poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
         self._poller.register(self._monitor, zmq.POLLIN)
