@@ -14,7 +14,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,7 +25,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import format_of
 from gsplat_core.io.files import read_regular
 from services.cli.exit_codes import OK
-from services.cli.options import ExportedFileArgument, JsonOption
+from services.cli.options import ExportedFileArgument, JsonOption, takes_run_options
 from services.cli.terminal import KEY_COLUMNS, Columns, printable, table
 
 if TYPE_CHECKING:
@@ -54,17 +54,26 @@ MOST_KEY_BYTES = 4096
 DEFAULT_URL = "http://127.0.0.1:8000"
 
 
-def with_client(url: str, key_file: Path | None, ca: Path | None, act: Callable[[Any], Any]) -> Any:
-    from pydantic import ValidationError
+@dataclass(frozen=True)
+class Service:
+    """Address and credentials of the service."""
 
-    from services.client import Client
-    from services.client.requests import not_from_us
+    url: UrlOption = DEFAULT_URL
+    key_file: KeyFileOption = None
+    ca: CaOption = None
 
-    with Client(url, _key(key_file), verify=str(ca) if ca else True) as client:
-        try:
-            return act(client)
-        except (ValidationError, KeyError) as error:  # valid JSON, but no answer of the API
-            raise not_from_us(url, "has unexpected content") from error
+    def __call__(self, act: Callable[[Any], Any]) -> Any:
+        """Call `act` with a client of the service and return its result."""
+        from pydantic import ValidationError
+
+        from services.client import Client
+        from services.client.requests import not_from_us
+
+        with Client(self.url, _key(self.key_file), verify=str(self.ca) if self.ca else True) as client:
+            try:
+                return act(client)
+            except (ValidationError, KeyError) as error:  # valid JSON, but no answer of the API
+                raise not_from_us(self.url, "has unexpected content") from error
 
 
 def _key(file: Path | None) -> str:
@@ -106,7 +115,25 @@ def check_download(file: Path, overwrite: bool) -> None:
 
 
 ctl = typer.Typer(help="Control a running service (`intrasplat serve`).", no_args_is_help=True)
+delete = typer.Typer(help="Delete a resource after confirmation.", no_args_is_help=True)
+keys = typer.Typer(help="API keys of the service.", no_args_is_help=True)
+
+
+def command(name: str, group: typer.Typer = ctl) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Register a command. The fields of its parameter `service` become command line options."""
+    return lambda function: group.command(name)(takes_run_options(function, "service"))
+
+
 ModelName = Annotated[str, typer.Argument(metavar="MODEL", show_default=False)]
+OptionsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="<name=value>",
+        help="Option of the engine, as of `intrasplat replay` and `live`; repeat for several.",
+        show_default=False,
+    ),
+]
 StreamName = Annotated[str, typer.Argument(metavar="STREAM", show_default=False)]
 STREAM: Columns = {
     "name": "STREAM", "state": "STATE", "show": "SHOWS", "capture_hz": "CAMERA/S", "shown_hz": "SHOWN/S", "age_ms": "AGE MS",
@@ -119,31 +146,25 @@ VERSION: Columns = {
 MODEL: Columns = {"name": "MODEL", "active": "ACTIVE VERSION"}
 
 
-@ctl.command("streams")
-def streams(
-    url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
-) -> int:
+@command("streams")
+def streams(service: Service = Service(), json: JsonOption = False) -> int:
     """List the streams."""
-    return print_found(with_client(url, key_file, ca, lambda client: client.streams()), STREAM, json, stream_row)
+    return print_found(service(lambda client: client.streams()), STREAM, json, stream_row)
 
 
-@ctl.command("start")
-def start(name: StreamName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
+@command("start")
+def start(name: StreamName, service: Service = Service()) -> int:
     """Start a stream."""
-    return print_found(
-        [with_client(url, key_file, ca, lambda client: client.start_stream(name))], STREAM, False, stream_row
-    )
+    return print_found([service(lambda client: client.start_stream(name))], STREAM, False, stream_row)
 
 
-@ctl.command("stop")
-def stop(name: StreamName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
+@command("stop")
+def stop(name: StreamName, service: Service = Service()) -> int:
     """Stop a stream."""
-    return print_found(
-        [with_client(url, key_file, ca, lambda client: client.stop_stream(name))], STREAM, False, stream_row
-    )
+    return print_found([service(lambda client: client.stop_stream(name))], STREAM, False, stream_row)
 
 
-@ctl.command("create")
+@command("create")
 def create(
     name: StreamName,
     source: Annotated[
@@ -152,9 +173,7 @@ def create(
     show: Annotated[str, typer.Option(help="`live`, or `model NAME`.")] = "live",
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "auto",
     option: OptionsOption = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Create a stream and start it."""
     options = assigned(option or ())
@@ -162,31 +181,27 @@ def create(
     def act(client: Any) -> Any:
         return client.create_stream(name, source, show=show, device=device, options=options)
 
-    made = with_client(url, key_file, ca, act)
+    made = service(act)
     return print_found([made], STREAM, False, stream_row)
 
 
-@ctl.command("models")
+@command("models")
 def models(
     name: Annotated[str | None, typer.Argument(metavar="[MODEL]", show_default=False)] = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     json: JsonOption = False,
 ) -> int:
     """List the models, or the versions of one model."""
     if name is None:
-        return print_found(with_client(url, key_file, ca, lambda client: client.models()), MODEL, json)
-    return print_found(with_client(url, key_file, ca, lambda client: client.versions(name)), VERSION, json)
+        return print_found(service(lambda client: client.models()), MODEL, json)
+    return print_found(service(lambda client: client.versions(name)), VERSION, json)
 
 
-@ctl.command("upload")
+@command("upload")
 def upload(
     name: ModelName,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File made by `intrasplat pack`.", show_default=False)],
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Upload a model's next version and wait for its check."""
 
@@ -194,20 +209,18 @@ def upload(
         made = client.upload(name, file)
         return client.checked(name, made.version)
 
-    found = with_client(url, key_file, ca, act)
+    found = service(act)
     print_found([found], VERSION, False)
     if found.state == "rejected":
         raise InvalidSetting(f"{name}/{found.version} was rejected: {found.reason}")
     return OK
 
 
-@ctl.command("activate")
+@command("activate")
 def activate(
     name: ModelName,
     version: Annotated[int, typer.Argument(min=1, show_default=False)],
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Activate a version in place of the active one."""
 
@@ -215,13 +228,13 @@ def activate(
         active = {model.name: model.active for model in client.models()}
         return client.activate(name, version, active.get(name))
 
-    return print_found([with_client(url, key_file, ca, act)], VERSION, False)
+    return print_found([service(act)], VERSION, False)
 
 
-@ctl.command("rollback")
-def rollback(name: ModelName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
+@command("rollback")
+def rollback(name: ModelName, service: Service = Service()) -> int:
     """Activate the previous version again."""
-    return print_found([with_client(url, key_file, ca, lambda client: client.rollback(name))], VERSION, False)
+    return print_found([service(lambda client: client.rollback(name))], VERSION, False)
 
 
 SNAPSHOT: Columns = {
@@ -246,16 +259,14 @@ def _format(file: Path, given: str | None) -> str:
     return given or format_of(file).name
 
 
-@ctl.command("snapshot")
+@command("snapshot")
 def snapshot(
     stream: StreamName,
     model: Annotated[
         str | None,
         typer.Option(help="Store the snapshot as the next version of this model.", show_default="keep it as a file"),
     ] = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     json: JsonOption = False,
 ) -> int:
     """Take a snapshot of a stream's live model."""
@@ -264,22 +275,20 @@ def snapshot(
         taken = client.take_snapshot(stream, model)
         return taken if taken.version is None else client.checked(taken.version.name, taken.version.version)
 
-    return print_found([with_client(url, key_file, ca, act)], SNAPSHOT if model is None else VERSION, json)
+    return print_found([service(act)], SNAPSHOT if model is None else VERSION, json)
 
 
-@ctl.command("snapshots")
+@command("snapshots")
 def snapshots(
     stream: StreamName,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     json: JsonOption = False,
 ) -> int:
     """List the stored snapshots of a stream."""
-    return print_found(with_client(url, key_file, ca, lambda client: client.snapshots(stream)), SNAPSHOT, json)
+    return print_found(service(lambda client: client.snapshots(stream)), SNAPSHOT, json)
 
 
-@ctl.command("export")
+@command("export")
 def export(
     name: ModelName,
     version: Annotated[int, typer.Argument(min=1, show_default=False)],
@@ -287,9 +296,7 @@ def export(
     format: FormatOption = None,
     time: TimeOption = None,
     times: TimesOption = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     overwrite: OverwriteOption = False,
 ) -> int:
     """Export a version of a model to a file for other programs."""
@@ -299,12 +306,12 @@ def export(
     def act(client: Any) -> int:
         return client.export_version(name, version, wanted, file, overwrite=overwrite, time_s=time, times=times)
 
-    with_client(url, key_file, ca, act)
+    service(act)
     typer.echo(str(file))
     return OK
 
 
-@ctl.command("fetch")
+@command("fetch")
 def fetch(
     stream: StreamName,
     snapshot_id: Annotated[str, typer.Argument(metavar="SNAPSHOT", show_default=False)],
@@ -312,9 +319,7 @@ def fetch(
     format: FormatOption = None,
     time: TimeOption = None,
     times: TimesOption = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     overwrite: OverwriteOption = False,
 ) -> int:
     """Export a snapshot to a file: .isplat, or a format of other programs."""
@@ -324,23 +329,21 @@ def fetch(
     def act(client: Any) -> int:
         return client.export_snapshot(stream, snapshot_id, wanted, file, overwrite=overwrite, time_s=time, times=times)
 
-    with_client(url, key_file, ca, act)
+    service(act)
     typer.echo(str(file))
     return OK
 
 
-@ctl.command("camera")
+@command("camera")
 def camera(
     stream: StreamName,
     azimuth: Annotated[float, typer.Option(help="Rotation to the right, in degrees.")] = 0.0,
     elevation: Annotated[float, typer.Option(help="Rotation upwards, in degrees.")] = 0.0,
     zoom: Annotated[float, typer.Option(help="Magnification.")] = 1.0,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Move the virtual camera of a stream, the viewpoint of the picture `orbit`."""
-    with_client(url, key_file, ca, lambda client: client.turn_camera(stream, azimuth, elevation, zoom))
+    service(lambda client: client.turn_camera(stream, azimuth, elevation, zoom))
     return OK
 
 
@@ -354,34 +357,23 @@ REPLAY: Columns = {
 }  # fmt: skip
 KEPT: Columns = {"name": "MODEL", "version": "VERSION", "state": "STATE"}
 RecordingName = Annotated[str, typer.Argument(metavar="RECORDING", show_default=False)]
-OptionsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--option",
-        metavar="<name=value>",
-        help="Option of the engine, as of `intrasplat replay` and `live`; repeat for several.",
-        show_default=False,
-    ),
-]
 ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="Id from `ctl replays`.", show_default=False)]
 
 
-def recordings(
-    url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
-) -> int:
+@command("recordings")
+def recordings(service: Service = Service(), json: JsonOption = False) -> int:
     """List the uploaded recordings."""
-    return print_found(with_client(url, key_file, ca, lambda client: client.recordings()), RECORDING, json)
+    return print_found(service(lambda client: client.recordings()), RECORDING, json)
 
 
+@command("add-recording")
 def add_recording(
     name: RecordingName,
     path: Annotated[
         Path,
         typer.Argument(metavar="PATH", help="A video, a zip archive, or a recording's folder.", show_default=False),
     ],
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Upload a recording and wait for its check. A folder is packed first."""
 
@@ -390,33 +382,31 @@ def add_recording(
             client.upload_recording(name, file)
         return client.checked_recording(name)
 
-    found = with_client(url, key_file, ca, act)
+    found = service(act)
     print_found([found], RECORDING, False)
     if found.state == "rejected":
         raise InvalidSetting(f"{name} was rejected: {found.reason}")
     return OK
 
 
+@command("replays")
 def replays(
     batch: Annotated[str | None, typer.Option(help="List only replays of this batch.", show_default=False)] = None,
     count: Annotated[int, typer.Option(min=1, max=500, help="Number of replays, newest first.")] = 20,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     json: JsonOption = False,
 ) -> int:
     """List the newest replays."""
-    found = with_client(url, key_file, ca, lambda client: client.replays(count=count, batch=batch))
+    found = service(lambda client: client.replays(count=count, batch=batch))
     return print_found(found, REPLAY, json)
 
 
+@command("replay")
 def replay(
     names: Annotated[list[str], typer.Argument(metavar="RECORDING...", show_default=False)],
     option: OptionsOption = None,
     wait: Annotated[bool, typer.Option("--wait", help="Wait until the replay has ended.")] = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Start a replay of each given recording."""
     options = assigned(option or ())
@@ -425,7 +415,7 @@ def replay(
         made = client.start_replays(names, options)
         return [client.ended_replay(one) if wait else client.replay(one) for one in made.ids]
 
-    found = with_client(url, key_file, ca, act)
+    found = service(act)
     print_found(found, REPLAY, False)
     failed = [one for one in found if wait and one.state != "done"]
     if failed:
@@ -433,39 +423,38 @@ def replay(
     return OK
 
 
-def cancel(job_id: ReplayId, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
+@command("cancel")
+def cancel(job_id: ReplayId, service: Service = Service()) -> int:
     """Cancel a replay that has not ended."""
-    return print_found([with_client(url, key_file, ca, lambda client: client.cancel_replay(job_id))], REPLAY, False)
+    return print_found([service(lambda client: client.cancel_replay(job_id))], REPLAY, False)
 
 
+@command("result")
 def result(
     job_id: ReplayId,
     name: Annotated[
         str, typer.Argument(metavar="FILE", help="Name of the result file, such as report.html.", show_default=False)
     ],
     out: Annotated[Path | None, typer.Option(help="Output file.", show_default="its name, in this folder")] = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
     overwrite: OverwriteOption = False,
 ) -> int:
     """Download a result file of a replay: report.html, report.json, frames.jsonl, reconstruction.mp4, model.isplat."""
     target = out or Path(Path(name).name)
     check_download(target, overwrite)
-    with_client(url, key_file, ca, lambda client: client.result(job_id, name, target, overwrite=overwrite))
+    service(lambda client: client.result(job_id, name, target, overwrite=overwrite))
     typer.echo(str(target))
     return OK
 
 
+@command("keep")
 def keep(
     job_id: ReplayId,
     model: ModelName,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Store a replay's model in the registry, as the next version of a model."""
-    found = with_client(url, key_file, ca, lambda client: client.keep_model(job_id, model))
+    found = service(lambda client: client.keep_model(job_id, model))
     return print_found([found], KEPT, False)
 
 
@@ -543,8 +532,6 @@ WATCHED: Columns = {
 CLEAR = "\x1b[H\x1b[2J"
 SPAN = re.compile(r"(\d{1,6})([smhd])", re.ASCII)
 UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
-delete = typer.Typer(help="Delete a resource after confirmation.", no_args_is_help=True)
-keys = typer.Typer(help="API keys of the service.", no_args_is_help=True)
 
 
 def check_sure(what: str, yes: bool) -> None:
@@ -562,9 +549,7 @@ def check_sure(what: str, yes: bool) -> None:
 
 
 def _deleted(
-    url: str,
-    key_file: Any,
-    ca: Any,
+    service: Service,
     yes: bool,
     what: str,
     find: Callable[[Client], object],
@@ -577,79 +562,65 @@ def _deleted(
         check_sure(what, yes)
         act(client)
 
-    with_client(url, key_file, ca, look_and_act)
+    service(look_and_act)
     typer.echo(f"deleted {what}")
     return OK
 
 
-@delete.command("stream")
+@command("stream", delete)
 def delete_stream(
     name: StreamName,
     yes: YesOption = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Stop and delete a stream. Its live reconstruction is lost unless a snapshot was taken."""
-    return _deleted(
-        url, key_file, ca, yes, f"the stream {name}", lambda client: client.stream(name), lambda client: client.delete_stream(name)
+    return _deleted(service, yes, f"the stream {name}", lambda client: client.stream(name), lambda client: client.delete_stream(name)
     )  # fmt: skip
 
 
-@delete.command("version")
+@command("version", delete)
 def delete_version(
     model: ModelName,
     version: Annotated[int, typer.Argument(min=1, show_default=False)],
     yes: YesOption = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Delete a version of a model. The active version cannot be deleted."""
-    return _deleted(
-        url, key_file, ca, yes, f"version {version} of the model {model}",
+    return _deleted(service, yes, f"version {version} of the model {model}",
         lambda client: client.version(model, version), lambda client: client.delete_version(model, version),
     )  # fmt: skip
 
 
-@delete.command("recording")
+@command("recording", delete)
 def delete_recording(
     name: RecordingName,
     yes: YesOption = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Delete a recording that no replay uses."""
-    return _deleted(
-        url, key_file, ca, yes, f"the recording {name}",
+    return _deleted(service, yes, f"the recording {name}",
         lambda client: client.recording(name), lambda client: client.delete_recording(name),
     )  # fmt: skip
 
 
-@delete.command("replay")
+@command("replay", delete)
 def delete_replay(
     job_id: ReplayId,
     yes: YesOption = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Delete an ended replay with its results."""
-    return _deleted(
-        url, key_file, ca, yes, f"the replay {job_id} and its results",
+    return _deleted(service, yes, f"the replay {job_id} and its results",
         lambda client: client.replay(job_id), lambda client: client.delete_replay(job_id),
     )  # fmt: skip
 
 
-@delete.command("snapshot")
+@command("snapshot", delete)
 def delete_snapshot(
     stream: StreamName,
     snapshot_id: Annotated[str, typer.Argument(metavar="SNAPSHOT", show_default=False)],
     yes: YesOption = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Delete a snapshot of a stream."""
 
@@ -657,48 +628,39 @@ def delete_snapshot(
         if all(each.id != snapshot_id for each in client.snapshots(stream)):
             raise InvalidSetting(f"{stream} has no snapshot {snapshot_id!r:.60}; `ctl snapshots {stream}` lists them")
 
-    return _deleted(
-        url, key_file, ca, yes, f"the snapshot {snapshot_id} of {stream}",
+    return _deleted(service, yes, f"the snapshot {snapshot_id} of {stream}",
         find, lambda client: client.delete_snapshot(stream, snapshot_id),
     )  # fmt: skip
 
 
-@keys.command("list")
-def keys_list(
-    url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
-) -> int:
+@command("list", keys)
+def keys_list(service: Service = Service(), json: JsonOption = False) -> int:
     """List the keys, without their secrets."""
-    return print_found(with_client(url, key_file, ca, lambda client: client.keys()), KEY_COLUMNS, json)
+    return print_found(service(lambda client: client.keys()), KEY_COLUMNS, json)
 
 
-@keys.command("add")
+@command("add", keys)
 def keys_add(
     name: KeyName,
     role: RoleOption = "viewer",
     expires_days: ExpiresOption = None,
     stream: KeyStreamOption = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Create a key and print its token, which is not stored and cannot be shown again."""
     from services.cli.serve import expiry_in
 
     expires_at = expiry_in(expires_days)
-    made = with_client(
-        url, key_file, ca, lambda client: client.make_key(name, role, expires_at=expires_at, streams=stream or None)
-    )
+    made = service(lambda client: client.make_key(name, role, expires_at=expires_at, streams=stream or None))
     typer.echo(printable(made.key))
     return OK
 
 
-@keys.command("revoke")
+@command("revoke", keys)
 def keys_revoke(
     key_id: Annotated[str, typer.Argument(metavar="ID", help="Id from `ctl keys list`.", show_default=False)],
     yes: YesOption = False,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Revoke a key. It is refused from the next request on."""
 
@@ -706,9 +668,10 @@ def keys_revoke(
         if all(each.id != key_id for each in client.keys()):  # noqa: SIM118
             raise InvalidSetting(f"there is no key {key_id!r:.60}; `ctl keys list` shows them")
 
-    return _deleted(url, key_file, ca, yes, f"the key {key_id}", find, lambda client: client.revoke_key(key_id))
+    return _deleted(service, yes, f"the key {key_id}", find, lambda client: client.revoke_key(key_id))
 
 
+@command("audit")
 def audit(
     event: Annotated[
         str | None,
@@ -729,9 +692,7 @@ def audit(
     format: Annotated[
         str, typer.Option(help="table, or all matching entries as jsonl or csv, oldest first.")
     ] = "table",
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Show audit log entries, oldest first."""
     wanted: dict[str, Any] = {
@@ -747,9 +708,9 @@ def audit(
             for line in client.export_audit(format, **wanted):
                 typer.echo(line)
 
-        with_client(url, key_file, ca, save)
+        service(save)
         return OK
-    with_client(url, key_file, ca, lambda client: _show_audit(client, wanted, count, follow))
+    service(lambda client: _show_audit(client, wanted, count, follow))
     return OK
 
 
@@ -804,11 +765,10 @@ def moment(text: str | None) -> datetime | None:
         ) from error
 
 
-def health(
-    url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
-) -> int:
+@command("health")
+def health(service: Service = Service(), json: JsonOption = False) -> int:
     """Show each readiness check of the service. Exit code 2 if it is not ready."""
-    ready = with_client(url, key_file, ca, lambda client: client.ready())
+    ready = service(lambda client: client.ready())
     if json:
         typer.echo(ready.model_dump_json(indent=2))
     else:
@@ -819,22 +779,20 @@ def health(
     return OK
 
 
-def whoami(
-    url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
-) -> int:
+@command("whoami")
+def whoami(service: Service = Service(), json: JsonOption = False) -> int:
     """Show name, role and limits of the key in use."""
-    return print_found([with_client(url, key_file, ca, lambda client: client.myself())], MYSELF, json)
+    return print_found([service(lambda client: client.myself())], MYSELF, json)
 
 
+@command("watch")
 def watch(
     stream: Annotated[str | None, typer.Argument(metavar="[STREAM]", show_default=False)] = None,
     every: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds between two refreshes.")] = 2.0,
     looks: Annotated[
         int | None, typer.Option(min=1, help="Number of refreshes, then exit.", show_default="go on")
     ] = None,
-    url: UrlOption = DEFAULT_URL,
-    key_file: KeyFileOption = None,
-    ca: CaOption = None,
+    service: Service = Service(),
 ) -> int:
     """Show the streams periodically: state, rates, age, restarts and displays. Ends with Ctrl-C."""
     from services.client import ClientError
@@ -854,7 +812,7 @@ def watch(
                 return
             time.sleep(every)
 
-    with_client(url, key_file, ca, look)
+    service(look)
     return OK
 
 
@@ -890,10 +848,5 @@ def _figure(value: Any) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-for _name, _command in (
-    ("recordings", recordings), ("add-recording", add_recording), ("replays", replays), ("replay", replay), ("cancel", cancel),
-    ("result", result), ("keep", keep), ("audit", audit), ("watch", watch), ("health", health), ("whoami", whoami),
-):  # fmt: skip
-    ctl.command(_name)(_command)
 ctl.add_typer(delete, name="delete")
 ctl.add_typer(keys, name="keys")

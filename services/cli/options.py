@@ -199,14 +199,13 @@ def takes_options(kind: type[Section], command: Command) -> Callable[[Callable[.
     return lambda function: _with_parameters(function, annotations, defaults, made)
 
 
-def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
-    """Decorate a command whose parameter `options` is a dataclass: each field becomes a command line option."""
-    kind: Any = get_type_hints(command, include_extras=True)["options"]
+def takes_run_options(command: Callable[..., int], parameter: str = "options") -> Callable[..., int]:
+    """Decorate a command with a parameter whose type is a dataclass: each field becomes a command line option."""
+    kind: Any = get_type_hints(command, include_extras=True)[parameter]
     hints = get_type_hints(kind, include_extras=True)
     annotations = {field.name: hints[field.name] for field in fields(kind)}
-    return _with_parameters(
-        command, annotations, {field.name: field.default for field in fields(kind)}, lambda values: kind(**values)
-    )
+    defaults = {field.name: field.default for field in fields(kind)}
+    return _with_parameters(command, annotations, defaults, lambda values: kind(**values), parameter)
 
 
 def _default(each: Declared) -> Any:
@@ -236,19 +235,20 @@ def _with_parameters(
     annotations: Mapping[str, Any],
     defaults: Mapping[str, Any],
     made: Callable[[Mapping[str, Any]], Any],
+    replaced: str = "options",
 ) -> Callable[..., int]:
-    """Return the command with the parameters `annotations` in place of its parameter `options`, which `made` makes of
-    their values."""
+    """Return the command with the parameters `annotations` in place of its parameter `replaced`, which `made` creates
+    from their values."""
 
     @functools.wraps(command)
     def call(**values: Any) -> int:
-        options = made({name: values.pop(name) for name in annotations})
-        return command(options=options, **values)
+        value = made({name: values.pop(name) for name in annotations})
+        return command(**{replaced: value}, **values)
 
     hints = {**get_type_hints(command, include_extras=True), **annotations}
     both = []
     for parameter in inspect.signature(command).parameters.values():
-        if parameter.name != "options":
+        if parameter.name != replaced:
             both.append(parameter)
             continue
         both += [
