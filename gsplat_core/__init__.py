@@ -1,8 +1,7 @@
-"""Splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file
-formats.
+"""Splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file formats.
 
-Names are imported lazily. Importing the package alone loads neither torch nor the compiled library,
-so `gsplat_core.reference` works without a built library.
+Names are imported lazily. Importing the package alone loads neither torch nor the compiled library, so
+`gsplat_core.reference` works without a built library.
 """
 
 from __future__ import annotations

@@ -40,9 +40,7 @@ def require_same_kind(**tensors: Tensor | None) -> None:
 
 
 def require_float32(op: str, **tensors: Tensor | None) -> None:
-    """Raise InvalidInput unless all tensors are float32 on one device with compiled kernels for
-    `op`.
-    """
+    """Raise InvalidInput unless all tensors are float32 on one device with compiled kernels for `op`."""
     given = {name: tensor for name, tensor in tensors.items() if tensor is not None}
     first = next(iter(given.values()), None)
     for name, tensor in given.items():

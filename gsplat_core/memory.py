@@ -56,8 +56,7 @@ def _text(path: Path) -> str:
 def return_freed_memory() -> None:
     """Return freed heap pages to the operating system (glibc's `malloc_trim`); a no-op elsewhere.
 
-    Takes milliseconds. Without it, the resident size of a long-running process grows through heap
-    fragmentation.
+    Takes milliseconds. Without it, the resident size of a long-running process grows through heap fragmentation.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:

@@ -1,9 +1,8 @@
 """Limit on the number of threads that torch uses for operations called from one Python thread.
 
-LAPACK, BLAS and torch's reductions split long sums among threads, so rounding depends on the thread
-count. The solution of a system with 200 unknowns, or the mean of 40,000 pixels, differs in its last
-bits between one and two threads. Geometry runs such operations within `one_thread` to be
-reproducible.
+LAPACK, BLAS and torch's reductions split long sums among threads, so rounding depends on the thread count. The solution
+of a system with 200 unknowns, or the mean of 40,000 pixels, differs in its last bits between one and two threads.
+Geometry runs such operations within `one_thread` to be reproducible.
 """
 
 from __future__ import annotations
@@ -30,11 +29,9 @@ def use_one_thread() -> None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch operations of the calling thread to one core within a block or decorated
-    function.
+    """Limit torch operations of the calling thread to one core within a block or decorated function.
 
-    Results then do not depend on the number of cores. Nested use costs nothing. The outermost use
-    takes about 0.1 ms.
+    Results then do not depend on the number of cores. Nested use costs nothing. The outermost use takes about 0.1 ms.
     """
     before = torch.get_num_threads()
     if before == 1:

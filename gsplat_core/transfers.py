@@ -13,9 +13,8 @@ from torch import Tensor
 def tensor_of(array: NDArray, device: torch.device | str = "cpu") -> Tensor:
     """Return the array as a tensor on `device`.
 
-    On the CPU the tensor shares the array's memory if torch permits. The copy to a GPU is staged
-    through page-locked memory and enqueued on the current stream. The array may be changed
-    immediately after the call.
+    On the CPU the tensor shares the array's memory if torch permits. The copy to a GPU is staged through page-locked
+    memory and enqueued on the current stream. The array may be changed immediately after the call.
     """
     array = np.ascontiguousarray(array)
     device = torch.device(device)
@@ -45,9 +44,7 @@ class StagedCopies:
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
-        """Stream on which copies run; it must wait for the stream that computes the
-        copied tensor.
-        """
+        """Stream on which copies run; it must wait for the stream that computes the copied tensor."""
         self._staged = torch.empty(self.PIECE_BYTES, dtype=torch.uint8, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
@@ -87,9 +84,7 @@ class HostCopy:
             self._values = tensor
 
     def numpy(self) -> NDArray[Any]:
-        """Return the values as an array after waiting for the copy; a CPU tensor shares
-        its memory.
-        """
+        """Return the values as an array after waiting for the copy; a CPU tensor shares its memory."""
         if self._arrived is not None:
             self._arrived.synchronize()
         return self._values.numpy()

@@ -77,9 +77,7 @@ def shortened(value: object, most: int = 80) -> str:
 
 
 def check_seen_at(time_s: float, window_s: tuple[float, float]) -> None:
-    """Raise InvalidSetting for a time outside the model's observed window (start, end),
-    in seconds.
-    """
+    """Raise InvalidSetting for a time outside the model's observed window (start, end), in seconds."""
     start_s, end_s = window_s
     if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
         raise InvalidSetting(

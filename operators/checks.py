@@ -33,9 +33,7 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class StageCounts:
-    """Statistics of a stage in one run. Each stage has its own class, so that an outcome holds all
-    of them.
-    """
+    """Statistics of a stage in one run. Each stage has its own class, so that an outcome holds all of them."""
 
     frames: int
     """Number of frames the stage ran on."""
@@ -80,9 +78,7 @@ class Stage(ABC):
         return self.annotate(frame)
 
     def withhold(self, frame: Frame, reason: str) -> Frame:
-        """Return the frame marked as excluded from training, and count the reason. An earlier
-        reason is kept.
-        """
+        """Return the frame marked as excluded from training, and count the reason. An earlier reason is kept."""
         self.found[reason] += 1
         return frame if frame.withheld is not None else frame.with_fields(withheld=reason)
 
@@ -107,8 +103,7 @@ class StageOp(Operator):
         frame: `Frame` with more fields.
 
     Params:
-        stages: stages in order of execution. They have state and must not be shared between
-            operators.
+        stages: stages in order of execution. They have state and must not be shared between operators.
     """
 
     def __init__(self, fragment: Any, *args: Any, stages: Sequence[Stage], **kwargs: Any) -> None:
@@ -136,9 +131,7 @@ class StageOp(Operator):
 
 
 def tissue_of(frame: Frame) -> NDArray[np.uint8] | None:
-    """Return the mask of tissue whose pixels count, uint8 [H, W], 0 = excluded; None if all pixels
-    do.
-    """
+    """Return the mask of tissue whose pixels count, uint8 [H, W], 0 = excluded; None if all pixels do."""
     if frame.mask is None or frame.loss_mask is None:
         return frame.mask if frame.loss_mask is None else frame.loss_mask
     return np.minimum(frame.mask, frame.loss_mask)
@@ -164,9 +157,7 @@ class OrdinaryFrames:
 
 
 class OrdinaryStream:
-    """State shared by two operators in sequence: the current frame's class and the stages due on
-    it.
-    """
+    """State shared by two operators in sequence: the current frame's class and the stages due on it."""
 
     def __init__(self) -> None:
         self.pictures = OrdinaryPictures()
@@ -202,8 +193,8 @@ class OrdinaryStream:
 class PictureStagesOp(StageOp):
     """Runs its first stage on each frame, and the other stages on unusual frames or in turn.
 
-    On an ordinary frame a skipped stage carries its previous result over. When a stage finds
-    something unusual, all later stages run on the frame, and all stages run on the next one.
+    On an ordinary frame a skipped stage carries its previous result over. When a stage finds something unusual, all
+    later stages run on the frame, and all stages run on the next one.
 
     Inputs:
         frame: `Frame`.
@@ -212,8 +203,7 @@ class PictureStagesOp(StageOp):
         frame: `Frame` with more fields.
 
     Params:
-        stages: stages that need the picture alone; the first compares each picture with the
-            previous one.
+        stages: stages that need the picture alone; the first compares each picture with the previous one.
         stream: state shared with the following `TissueStagesOp`.
     """
 
@@ -223,9 +213,7 @@ class PictureStagesOp(StageOp):
         self.stream = stream
         self._members = stream.join(len(stages) - 1)
         self._settled = False
-        """True if the previous frame allows the next to be ordinary: it was unchanged and did not
-        begin a scene.
-        """
+        """True if the previous frame allows the next to be ordinary: it was unchanged and did not begin a scene."""
         self._counts = [0, 0]
         super().__init__(fragment, *args, stages=stages, **kwargs)
 
@@ -254,9 +242,7 @@ class PictureStagesOp(StageOp):
 
 
 def _settled(frame: Frame, came: Frame) -> bool:
-    """Return True if the stages changed only the masks, and did not withhold the frame or begin a
-    scene.
-    """
+    """Return True if the stages changed only the masks, and did not withhold the frame or begin a scene."""
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
     return unchanged and frame.new_scene is None and frame.unusable is None
 
@@ -307,11 +293,9 @@ class SequenceCounts(StageCounts):
 
 
 class SequenceStage(Stage):
-    """Withholds pictures that are black, uniform, noise, repeated, torn or late, and removes clock
-    jumps.
+    """Withholds pictures that are black, uniform, noise, repeated, torn or late, and removes clock jumps.
 
-    It must run first. After a clock jump `Frame.pts_ns` is shifted. A late frame gets the newest
-    timestamp.
+    It must run first. After a clock jump `Frame.pts_ns` is shifted. A late frame gets the newest timestamp.
     """
 
     counts_type = SequenceCounts
@@ -343,8 +327,7 @@ class MaskAndDepthCounts(StageCounts):
 class MaskAndDepthStage(Stage):
     """Withholds frames whose tool mask shows no tissue or was lost, and removes invalid depth.
 
-    It must run after the stage that sets `Frame.mask`. A frame without valid depth is trained on
-    without it.
+    It must run after the stage that sets `Frame.mask`. A frame without valid depth is trained on without it.
     """
 
     counts_type = MaskAndDepthCounts
@@ -370,8 +353,7 @@ class InterlacingCounts(StageCounts):
 class InterlacingStage(Stage):
     """Removes combing artefacts from interlaced video of both eyes, which changes `Frame.image`.
 
-    Progressive video is passed unchanged. The stage must run before stages that measure sharpness
-    and before training.
+    Progressive video is passed unchanged. The stage must run before stages that measure sharpness and before training.
     """
 
     counts_type = InterlacingCounts
@@ -396,9 +378,7 @@ class FieldOfViewCounts(StageCounts):
 
 
 class FieldOfViewStage(Stage):
-    """Excludes pixels outside of the field of view from the loss. Withheld and damaged frames keep
-    the previous field.
-    """
+    """Excludes pixels outside of the field of view from the loss. Withheld and damaged frames keep the previous field."""
 
     counts_type = FieldOfViewCounts
 
@@ -423,9 +403,7 @@ class StripCounts(StageCounts):
 
 
 class StripStage(Stage):
-    """Excludes status bars and text at the borders from the loss. Withheld and damaged frames keep
-    the previous mask.
-    """
+    """Excludes status bars and text at the borders from the loss. Withheld and damaged frames keep the previous mask."""
 
     counts_type = StripCounts
 
@@ -450,9 +428,7 @@ class HighlightCounts(StageCounts):
 
 
 class HighlightStage(Stage):
-    """Excludes specular highlights from rehearsal: a frame's own training fits them, later
-    rehearsal does not.
-    """
+    """Excludes specular highlights from rehearsal: a frame's own training fits them, later rehearsal does not."""
 
     counts_type = HighlightCounts
 
@@ -469,9 +445,7 @@ class HighlightStage(Stage):
 
 @dataclass(frozen=True)
 class ExposureCounts(StageCounts):
-    """Frames whose exposure differs from that of their scene, and frames in which it was
-    changing.
-    """
+    """Frames whose exposure differs from that of their scene, and frames in which it was changing."""
 
 
 class ExposureStage(Stage):
@@ -530,16 +504,12 @@ IN_DOUBT = "cut in doubt"
 
 @dataclass(frozen=True)
 class CutCounts(StageCounts):
-    """New scenes by reason (cut, returned, resized, frame rate), and frames withheld as possible
-    cuts.
-    """
+    """New scenes by reason (cut, returned, resized, frame rate), and frames withheld as possible cuts."""
 
 
 @dataclass(frozen=True)
 class SceneCounts(StageCounts):
-    """Number of frames that were given a scene number; `CutCounts` has the reasons for new
-    scenes.
-    """
+    """Number of frames that were given a scene number; `CutCounts` has the reasons for new scenes."""
 
 
 class SceneNumberStage(Stage):

@@ -25,9 +25,7 @@ class ShownComparison:
     first_different: int | None
     """Sequence number of the first frame whose picture differs; None if all match."""
     not_shown: int
-    """Replayed pictures without a recorded counterpart: the session dropped their frames before
-    display.
-    """
+    """Replayed pictures without a recorded counterpart: the session dropped their frames before display."""
 
 
 class CompareShownOp(Operator):

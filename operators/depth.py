@@ -38,9 +38,7 @@ class FoundDepth:
     metric: bool
     """True if the depth of every frame has the calibration's unit rather than an unknown scale."""
     doubts: Mapping[str, int]
-    """Number of frames for which depth estimation was attempted and rejected, by reason (a
-    sentence).
-    """
+    """Number of frames for which depth estimation was attempted and rejected, by reason (a sentence)."""
     passed_over: int = 0
     """Frames dropped by live depth estimation because a newer frame arrived first."""
 
@@ -84,8 +82,7 @@ class DepthCounts:
         Args:
             outcome: the outcome of the run.
             choice: the setting `depth`, quoted in the notes.
-            finder: the estimator, for its remarks and rejections; None if the run never started
-                one.
+            finder: the estimator, for its remarks and rejections; None if the run never started one.
         """
         total = sum(self._frames.values())
         doubts = finder.doubts.counted() if finder else {}
@@ -107,8 +104,7 @@ class DepthCounts:
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
-    """Return a note for a run whose frames carry no usable recorded depth; None if the recorded
-    depth is used.
+    """Return a note for a run whose frames carry no usable recorded depth; None if the recorded depth is used.
 
     Args:
         choice: the setting `depth`.
@@ -133,9 +129,7 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
 
 
 FEW_CORES = 4
-"""Largest number of cores at which depth estimation is throttled, because training uses them
-all.
-"""
+"""Largest number of cores at which depth estimation is throttled, because training uses them all."""
 SHARE_OF_FEW = 0.25
 """Share of one core's time for depth estimation on a throttled machine."""
 
@@ -153,8 +147,7 @@ class BackgroundDepth:
         Args:
             choice: the setting `depth`.
             camera: camera of the frames.
-            share: largest share of one core's time, in (0, 1]; None selects it by the number of
-                cores.
+            share: largest share of one core's time, in (0, 1]; None selects it by the number of cores.
             device: device of estimators that are not limited to the CPU.
 
         Raises:
@@ -204,17 +197,13 @@ class BackgroundDepth:
             self._changed.notify_all()
 
     def take(self) -> tuple[Frame, LateDepth] | None:
-        """Return and clear the newest result: the frame with its depth, and the training data made
-        from it.
-        """
+        """Return and clear the newest result: the frame with its depth, and the training data made from it."""
         with self._changed:
             found, self._found = self._found, None
         return found
 
     def _run(self, finder: DepthFinder) -> None:
-        """Estimate depth of pending frames until `stop`, sleeping between frames to keep the time
-        share.
-        """
+        """Estimate depth of pending frames until `stop`, sleeping between frames to keep the time share."""
         step_back()
         if self._share < 1:
             use_one_thread()
@@ -261,18 +250,15 @@ class BackgroundDepth:
 
 
 def share_of(cores: int) -> float:
-    """Return the largest share of one core's time for depth estimation in a process with `cores`
-    cores.
-    """
+    """Return the largest share of one core's time for depth estimation in a process with `cores` cores."""
     return SHARE_OF_FEW if cores <= FEW_CORES else 1.0
 
 
 class DepthOp(Operator):
-    """Attaches to each frame the depth that `choice` selects. Frames without a result pass without
-    depth.
+    """Attaches to each frame the depth that `choice` selects. Frames without a result pass without depth.
 
-    With `in_background`, frames are passed on immediately, with their recorded depth or without
-    depth. `UntilDisplay` offers the frames that it trains on to `background` and takes the results.
+    With `in_background`, frames are passed on immediately, with their recorded depth or without depth. `UntilDisplay`
+    offers the frames that it trains on to `background` and takes the results.
 
     Inputs:
         frame: `Frame`.
@@ -286,8 +272,8 @@ class DepthOp(Operator):
         in_background: estimate depth in a background thread.
         has_time: allow `auto` to use estimators slower than the camera's frame rate.
         device: device of estimators that are not limited to the CPU.
-        held_out: returns True for evaluation frames, which keep their recorded depth but are never
-            passed to an estimator.
+        held_out: returns True for evaluation frames, which keep their recorded depth but are never passed to an
+            estimator.
     """
 
     def __init__(

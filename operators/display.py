@@ -21,9 +21,7 @@ from operators.sources.source import SourceState
 LOOK_NS = 50_000_000
 """Period of the state check while no picture arrives, in nanoseconds."""
 REPEAT_NS = 200_000_000
-"""Period after which a picture that is not live is emitted again with its current age, in
-nanoseconds.
-"""
+"""Period after which a picture that is not live is emitted again with its current age, in nanoseconds."""
 LEAST_LABELLED_PX = 160
 """Minimum height in pixels of a live picture that is labelled with its state and age; a picture that is not live always is.
 The label has a minimum size to be legible, and would cover much of a smaller picture.
@@ -77,8 +75,7 @@ class LiveDisplayResult:
 
 
 class DisplayOp(Operator):
-    """Emits each picture as soon as it arrives, and repeats the last one with its state and age if
-    none arrives.
+    """Emits each picture as soon as it arrives, and repeats the last one with its state and age if none arrives.
 
     Inputs:
         rendered: `RenderedFrame`; the oldest are dropped if the queue is full.
@@ -114,9 +111,7 @@ class DisplayOp(Operator):
         self._reset()
 
     def prepare_thread(self) -> None:
-        """Load OpenCV's font in this thread. The first use in a thread takes longer than a frame
-        interval.
-        """
+        """Load OpenCV's font in this thread. The first use in a thread takes longer than a frame interval."""
         cv2.getTextSize("LIVE", cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
 
     def _reset(self) -> None:
@@ -191,9 +186,7 @@ class DisplayOp(Operator):
 
 
 def _content_ns(rendered: RenderedFrame, now_ns: int) -> int:
-    """Return the arrival time of the newest frame whose content the picture shows; `now_ns` if
-    unknown.
-    """
+    """Return the arrival time of the newest frame whose content the picture shows; `now_ns` if unknown."""
     content = rendered.content or rendered.frame
     return now_ns if content.arrived_ns is None else content.arrived_ns
 

@@ -54,9 +54,7 @@ class QueueFull(GraphError):
 
 
 class MetadataConflict(GraphError):
-    """Two messages of one `compute` call carry different values of a metadata key
-    (`MetadataPolicy.RAISE`).
-    """
+    """Two messages of one `compute` call carry different values of a metadata key (`MetadataPolicy.RAISE`)."""
 
 
 class OperatorFailed(GraphError):
@@ -76,9 +74,7 @@ class OperatorFailed(GraphError):
 
 
 class OperatorStuck(GraphError):
-    """Operators that did not return from `compute` in time; their threads keep running. Names in
-    `operators`.
-    """
+    """Operators that did not return from `compute` in time; their threads keep running. Names in `operators`."""
 
     def __init__(self, operators: Iterable[str], timeout_s: float) -> None:
         self.operators = tuple(operators)
@@ -86,9 +82,7 @@ class OperatorStuck(GraphError):
 
 
 class GraphDeadlock(GraphError):
-    """No operator can run although the graph is not finished. `waiting` maps each operator to its
-    unmet condition.
-    """
+    """No operator can run although the graph is not finished. `waiting` maps each operator to its unmet condition."""
 
     def __init__(self, waiting: Mapping[str, str]) -> None:
         lines = "; ".join(f"{name} waits for {what}" for name, what in waiting.items())
@@ -149,15 +143,11 @@ class MemoryTooSmall(RunError, UserError):
 
 
 class NothingShown(RunError, UserError):
-    """A run ended normally without displaying a frame: the source was empty or every frame was
-    withheld.
-    """
+    """A run ended normally without displaying a frame: the source was empty or every frame was withheld."""
 
 
 class RunFailed(RunError):
-    """A run ended early; the cause is `__cause__`. `result` is the outcome so far, already
-    saved.
-    """
+    """A run ended early; the cause is `__cause__`. `result` is the outcome so far, already saved."""
 
     def __init__(self, what: str, result: object) -> None:
         super().__init__(what)

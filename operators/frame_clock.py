@@ -29,9 +29,7 @@ FIRST_MS = 20.0
 FIRST_AT_MOST_STEPS = 60
 """Maximum number of optimiser steps for the first frame of a scene."""
 CATCH_UP_SHARE = 0.8
-"""Largest share of the frame interval that minimal processing may take for queued frames to be
-caught up with.
-"""
+"""Largest share of the frame interval that minimal processing may take for queued frames to be caught up with."""
 CATCH_UP_INTERVALS = 4.0
 """Default for `ClockSettings.catch_up_intervals`."""
 
@@ -46,8 +44,7 @@ class ClockSettings:
     """
     auto_share: float | None = None
     auto_most_ms: float | None = None
-    """Automatic deadline as a share of the frame interval, and its upper limit in milliseconds.
-    None: device default.
+    """Automatic deadline as a share of the frame interval, and its upper limit in milliseconds. None: device default.
     """
     least_share: float | None = None
     """Share of the frame interval guaranteed for training with an automatic deadline, even past the
@@ -56,13 +53,9 @@ class ClockSettings:
     at_least_steps: int | None = None
     """Minimum number of optimiser steps per frame, even past the deadline. None: device default."""
     fewest_steps: int | None = None
-    """Minimum number of steps for a frame with further frames queued behind it. None:
-    `at_least_steps`.
-    """
+    """Minimum number of steps for a frame with further frames queued behind it. None: `at_least_steps`."""
     catch_up_intervals: float | None = None
-    """Longest wait of a frame before it is dropped for newer ones, in frame intervals. None: device
-    default.
-    """
+    """Longest wait of a frame before it is dropped for newer ones, in frame intervals. None: device default."""
     at_most_steps: int = 80
     """Maximum number of optimiser steps before a frame is displayed."""
     first_at_least_steps: int | None = None
@@ -98,8 +91,7 @@ class ClockSettings:
 class FrameClock:
     """Deadlines and training budgets of live frames, from measured intervals and latencies.
 
-    The training thread calls `budget`, `may_rehearse`, `too_late` and `published`. The display
-    thread calls `shown`.
+    The training thread calls `budget`, `may_rehearse`, `too_late` and `published`. The display thread calls `shown`.
     """
 
     def __init__(self, settings: ClockSettings, fps: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
@@ -115,9 +107,7 @@ class FrameClock:
         self.interval_ns = 1e9 / fps
         """Moving average of the time between frames, in nanoseconds."""
         self.display_ns = 2e6
-        """Moving average of the latency from a published model to its displayed picture, in
-        nanoseconds.
-        """
+        """Moving average of the latency from a published model to its displayed picture, in nanoseconds."""
         self.training_ns = 0.0
         """Moving average of the time from dequeuing a frame to its published model with the minimum
         number of steps, in nanoseconds.
@@ -202,18 +192,14 @@ class FrameClock:
         self.training_ns += DISPLAY_DECAY * (needed_ns - self.training_ns)
 
     def shown(self, published_ns: int, shown_ns: int) -> None:
-        """Record a displayed picture of the model published at `published_ns`, to update the
-        display latency.
-        """
+        """Record a displayed picture of the model published at `published_ns`, to update the display latency."""
         # Limit outliers such as the first picture, which includes one-time initialisation.
         seen = min(max(0, shown_ns - published_ns), 4 * self.display_ns + 1e6)
         self.display_ns += DISPLAY_DECAY * (seen - self.display_ns)
         self._shown.set()
 
     def wait_until_shown(self) -> None:
-        """Wait up to `SHOWN_WITHIN_S` for the newest model to be displayed, so that its rendering
-        has the device alone.
-        """
+        """Wait up to `SHOWN_WITHIN_S` for the newest model to be displayed, so that its rendering has the device alone."""
         self._shown.wait(SHOWN_WITHIN_S)
 
     def _learn_interval(self, arrived_ns: int, seq: int) -> None:

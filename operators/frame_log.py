@@ -19,9 +19,7 @@ from operators.storage import StorageReserve, storage_errors
 
 FRAMES_FILE = "frames.jsonl"
 MAX_SERIES = 4096
-"""Maximum number of entries of a report's series. Longer runs are averaged in bins of equal
-size.
-"""
+"""Maximum number of entries of a report's series. Longer runs are averaged in bins of equal size."""
 Value = float | int | bool | str | None
 LogLine = dict[str, Value]
 
@@ -63,9 +61,7 @@ class FrameLog:
             self._file.write(line)
 
     def series(self, frames: int) -> tuple[tuple[LogLine, ...], int]:
-        """Return the report's series for a run of `frames` frames, and the number of frames per
-        entry.
-        """
+        """Return the report's series for a run of `frames` frames, and the number of frames per entry."""
         per_entry = frames_per_entry(frames, MAX_SERIES)
         return (tuple(series(read_frames(self.path), per_entry)) if frames else ()), per_entry
 
@@ -77,9 +73,7 @@ class FrameLog:
 
 
 def read_frames(path: Path) -> Iterator[LogLine]:
-    """Yield the entries of a log. A truncated last line is skipped. A missing file yields
-    nothing.
-    """
+    """Yield the entries of a log. A truncated last line is skipped. A missing file yields nothing."""
     try:
         lines = open_regular(path)
     except FileNotFoundError:
@@ -151,9 +145,7 @@ class _Line:
 
 
 def is_live_log(path: Path) -> bool:
-    """Return True if a run's log has display times. Raise InvalidSetting if the file is not a
-    log.
-    """
+    """Return True if a run's log has display times. Raise InvalidSetting if the file is not a log."""
     first = next(_entries(path), None)
     return first is not None and "shown_ns" in first and "arrived_ns" in first
 

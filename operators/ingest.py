@@ -22,9 +22,7 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 """Timeout of one read from the source, in seconds. A stop request is checked between reads."""
 PATIENCE_S = 1.0
-"""Longest time without a frame, in seconds, after which `compute` returns so that the graph can
-stop.
-"""
+"""Longest time without a frame, in seconds, after which `compute` returns so that the graph can stop."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +37,7 @@ class SourceResult:
     damaged: int = 0
     """Number of damaged frames. They are displayed, but neither trained on nor scored."""
     withheld: Mapping[str, int] = field(default_factory=dict)
-    """Frames that the source delivered as withheld, by reason; recorded sessions contain such
-    frames.
-    """
+    """Frames that the source delivered as withheld, by reason; recorded sessions contain such frames."""
     counts: Mapping[str, int] = field(default_factory=dict)
     """Dropped or repaired items of the source, by reason (see `docs/sources.md`)."""
     state_s: Mapping[str, float] = field(default_factory=dict)
@@ -60,8 +56,7 @@ class SourceOp(Operator):
 
     Params:
         source: opened by `start()` and closed by `stop()`.
-        stop_requested: polled before each frame; True ends the stream. Frames in flight are
-            finished.
+        stop_requested: polled before each frame; True ends the stream. Frames in flight are finished.
         seconds: maximum duration after `start()`; None for no limit.
     """
 

@@ -31,9 +31,7 @@ class Legend:
     """Value range and colours of a false-colour picture."""
 
     unit: Unit
-    """`mm`; `relative` (depth divided by the median depth, for recordings without scale); or
-    `confidence` (0..1).
-    """
+    """`mm`; `relative` (depth divided by the median depth, for recordings without scale); or `confidence` (0..1)."""
     low: float
     high: float
     stops: tuple[str, ...]
@@ -51,9 +49,7 @@ class DepthColours:
     def __init__(self) -> None:
         self._range: tuple[float, float] | None = None
         self.median: float | None = None
-        """Median depth of covered pixels, in the scene's unit; None before the first covered
-        picture.
-        """
+        """Median depth of covered pixels, in the scene's unit; None before the first covered picture."""
 
     def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
         """Update the depth range.

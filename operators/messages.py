@@ -1,6 +1,4 @@
-"""Messages on the edges of the graph other than `Frame`. Each one carries its frame and adds a
-result.
-"""
+"""Messages on the edges of the graph other than `Frame`. Each one carries its frame and adds a result."""
 
 from __future__ import annotations
 
@@ -25,9 +23,7 @@ class Reconstruction:
 
     frame: Frame
     model: Model | Snapshot
-    """Immutable: later training publishes new versions. A snapshot's slot is reused once it is no
-    longer referenced.
-    """
+    """Immutable: later training publishes new versions. A snapshot's slot is reused once it is no longer referenced."""
     trained: bool
     """False for a frame that is displayed and scored but was not trained on."""
     steps: int = 0
@@ -35,8 +31,7 @@ class Reconstruction:
     arriving_loss: HostCopy | None = None
     """Loss of the last step, possibly still in flight from the GPU; None without steps."""
     content: Frame | None = None
-    """Live runs: newest frame the model was trained on, which determines the picture's age. None
-    means `frame` itself.
+    """Live runs: newest frame the model was trained on, which determines the picture's age. None means `frame` itself.
     """
     taken_ns: int | None = None
     """Live runs: time at which training dequeued the frame, by `time.monotonic_ns`."""
@@ -99,9 +94,7 @@ class RenderedFrame:
     image: NDArray[np.uint8]
     """Reconstruction for display, uint8 RGB [H, W, 3]."""
     depth: NDArray[np.float32]
-    """Depth along z, float32 [H, W], in millimetres or the recording's unit; 0 where nothing was
-    rendered.
-    """
+    """Depth along z, float32 [H, W], in millimetres or the recording's unit; 0 where nothing was rendered."""
     alpha: NDArray[np.float32]
     """Opacity, float32 [H, W], 0..1."""
     model_version: int
@@ -133,9 +126,7 @@ class Prediction:
 
     frame: Frame
     image: NDArray[np.uint8] | None
-    """uint8 RGB [H, W, 3], rendered at the frame's time and pose; None if no prediction was
-    made.
-    """
+    """uint8 RGB [H, W, 3], rendered at the frame's time and pose; None if no prediction was made."""
 
 
 class PictureState(Enum):

@@ -1,6 +1,4 @@
-"""Gate that withholds pictures taken outside of the patient's body from all downstream
-components.
-"""
+"""Gate that withholds pictures taken outside of the patient's body from all downstream components."""
 
 from __future__ import annotations
 
@@ -31,9 +29,7 @@ class Gate(Protocol):
     """Classifier of a stream's pictures: inside or outside of the body."""
 
     def judge(self, image: NDArray[np.uint8]) -> str | None:
-        """Return None for a picture taken inside of the body, otherwise the reason. image: uint8
-        RGB [H, W, 3].
-        """
+        """Return None for a picture taken inside of the body, otherwise the reason. image: uint8 RGB [H, W, 3]."""
         ...
 
     def close(self) -> None:
@@ -53,13 +49,11 @@ class OutOfBodyFrames:
 
 
 class OutOfBodyGateOp(Operator):
-    """Replaces pictures that were not clearly taken inside of the body. Connect it directly to the
-    source.
+    """Replaces pictures that were not clearly taken inside of the body. Connect it directly to the source.
 
-    A withheld frame is black, has no right picture, depth or pose, counts as tissue everywhere, and
-    is excluded from every loss. Black is used rather than pixelation, because a moving scene can be
-    recovered from blocks that change with every frame. A picture that cannot be examined is
-    withheld.
+    A withheld frame is black, has no right picture, depth or pose, counts as tissue everywhere, and is excluded from
+    every loss. Black is used rather than pixelation, because a moving scene can be recovered from blocks that change
+    with every frame. A picture that cannot be examined is withheld.
 
     Inputs:
         frame: `Frame`.

@@ -56,9 +56,7 @@ _MOST_JSON_BYTES = 64 << 20
 
 
 def is_own_file(path: Path) -> bool:
-    """Return True if the file has the mark for its suffix. False for a missing or unreadable
-    file.
-    """
+    """Return True if the file has the mark for its suffix. False for a missing or unreadable file."""
     recognise = _KINDS.get(path.suffix.lower())
     if recognise is None:
         return False
@@ -254,9 +252,8 @@ def check_file_path(
 ) -> None:
     """Raise OutputError if a command with these inputs must not write the file `out`.
 
-    With `overwrite`, an earlier output of this program is replaced, and no other file. An input, a
-    part of one or a hard link to one is never replaced, and no file is put among a recording's
-    pictures.
+    With `overwrite`, an earlier output of this program is replaced, and no other file. An input, a part of one or a
+    hard link to one is never replaced, and no file is put among a recording's pictures.
 
     Args:
         out: the output file.
@@ -320,8 +317,7 @@ def _part_of(inputs: Sequence[Path], out: Path) -> Path | None:
 
 
 def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path], option: str = "--out") -> None:
-    """Raise OutputError if an output path is inside an input or among a recording's images, masks
-    or depth.
+    """Raise OutputError if an output path is inside an input or among a recording's images, masks or depth.
 
     Args:
         real: the resolved output path.
@@ -340,9 +336,7 @@ def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path], optio
 
 
 def _has_sidecar(folder: Path, name: str) -> bool:
-    """Return True if the sub-folder `name` of `folder` is part of a recording there (see
-    `layouts`).
-    """
+    """Return True if the sub-folder `name` of `folder` is part of a recording there (see `layouts`)."""
     if (folder / MARKER).exists() or not folder.is_dir():
         return False
     if any((folder / description).exists() for description in DESCRIPTIONS):
@@ -353,9 +347,7 @@ def _has_sidecar(folder: Path, name: str) -> bool:
 
 
 def _holds_pictures(folder: Path) -> bool:
-    """Return True if the folder contains pictures, videos or arrays that are not results of this
-    program.
-    """
+    """Return True if the folder contains pictures, videos or arrays that are not results of this program."""
     if (folder / MARKER).exists() or not folder.is_dir():
         return False
     return any(entry.suffix.lower() in _PICTURES for entry in folder.iterdir())
@@ -368,9 +360,7 @@ def _with_parents(path: Path) -> Iterator[Path]:
 
 
 def _same(first: Path, second: Path) -> bool:
-    """Return True if both paths name one file or folder, also through bind mounts or ignored
-    case.
-    """
+    """Return True if both paths name one file or folder, also through bind mounts or ignored case."""
     if first == second:
         return True
     try:
@@ -391,15 +381,11 @@ _PASSING = re.compile(r"\.(run|complete|old)-[0-9a-f]{8}")
 _CONTENTS = ".contents.json"
 _FINGERPRINT_BYTES = 1 << 16
 RECORDINGS = "recordings"
-"""Folder of recorded sessions, one sub-folder each. It is written during a run and never replaced
-by a later one.
-"""
+"""Folder of recorded sessions, one sub-folder each. It is written during a run and never replaced by a later one."""
 _RESULT = re.compile(
     r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png|evaluation\.(?:json|html)|evaluation-\w+\.jsonl"
 )
-"""Names of results. With the marker of an old version, which lists no files, all of them count as
-results of a run.
-"""
+"""Names of results. With the marker of an old version, which lists no files, all of them count as results of a run."""
 _KNOWN = re.compile(rf"(?:{_RESULT.pattern})|model/(?:model(?:\.next)?\.safetensors|manifest(?:\.next)?\.json)")
 """Paths of result files, for markers without fingerprints."""
 
@@ -524,9 +510,7 @@ def is_whole_output(folder: Path) -> bool:
 
 
 def _check_results(folder: Path, marker: dict[str, object]) -> None:
-    """Raise OutputFolderInUse if publishing would replace a file that no run of this program
-    wrote.
-    """
+    """Raise OutputFolderInUse if publishing would replace a file that no run of this program wrote."""
     ours = _results(folder)
     foreign = [entry.name for entry in folder.iterdir() if _RESULT.fullmatch(entry.name) and entry.name not in ours]
     if marker.get("arriving") is None:  # otherwise an interrupted transaction is pending, which the next run completes
@@ -597,9 +581,7 @@ def _contents(marker: dict[str, object], name: str) -> dict[str, str] | None:
 
 
 def _foreign_files(folder: Path, results: Iterable[str], contents: dict[str, str] | None) -> list[Path]:
-    """Return the files among the results that the run of `contents` did not write, or that changed
-    since.
-    """
+    """Return the files among the results that the run of `contents` did not write, or that changed since."""
     found = []
     for name in results:
         top = folder / name
@@ -618,9 +600,7 @@ def _foreign_files(folder: Path, results: Iterable[str], contents: dict[str, str
 
 
 def _results(folder: Path) -> list[str]:
-    """Return the names of existing results listed in the marker. Names with path separators are
-    ignored.
-    """
+    """Return the names of existing results listed in the marker. Names with path separators are ignored."""
     marker = _read_marker(folder) or {}
     listed = marker.get("files")
     if not isinstance(listed, list):
@@ -630,9 +610,7 @@ def _results(folder: Path) -> list[str]:
 
 
 def _switch_to(folder: Path, complete: Path, made_by: str) -> None:
-    """Replace the earlier results by those in `complete`. Resumable after an interruption at any
-    point.
-    """
+    """Replace the earlier results by those in `complete`. Resumable after an interruption at any point."""
     old = folder / (_OLD + complete.name.removeprefix(_COMPLETE))
     marker = _read_marker(folder) or {}
     arriving = [entry.name for entry in complete.iterdir() if entry.name != _CONTENTS]

@@ -1,6 +1,4 @@
-"""Camera poses of frames: recorded with the stream, or estimated frame by frame from the
-pictures.
-"""
+"""Camera poses of frames: recorded with the stream, or estimated frame by frame from the pictures."""
 
 from __future__ import annotations
 
@@ -25,9 +23,7 @@ class EstimatedPoses:
 
     frames: int
     not_placed: int
-    """Frames that kept the previous pose, because they were withheld or had too few matched
-    features.
-    """
+    """Frames that kept the previous pose, because they were withheld or had too few matched features."""
     begun: int
     """Number of map initialisations; 1 if tracking was never lost."""
     returned: int
@@ -102,9 +98,7 @@ class PoseOp(Operator):
 
 
 def check_poses(choice: str, camera: Camera) -> None:
-    """Raise InvalidSetting for an unknown choice, or for a camera that pose estimation does not
-    support.
-    """
+    """Raise InvalidSetting for an unknown choice, or for a camera that pose estimation does not support."""
     if choice not in get_args(Poses):
         raise InvalidSetting(f"poses is {choice!r}; choose {' or '.join(get_args(Poses))}")
     if choice == "estimated":

@@ -24,8 +24,7 @@ from operators.messages import DeformedScene, Prediction, Reconstruction, Render
 class DeformOp(Operator):
     """Deforms the model to its frame's timestamp and sets the camera to the frame's pose.
 
-    On a GPU the renderer's captured graph performs the deformation, so this operator only selects
-    the camera.
+    On a GPU the renderer's captured graph performs the deformation, so this operator only selects the camera.
 
     Inputs:
         reconstruction: `Reconstruction`.
@@ -49,9 +48,7 @@ class DeformOp(Operator):
 
 
 def displayed(image: torch.Tensor) -> NDArray[np.uint8]:
-    """Convert a float image [H, W, 3] in 0..1 to uint8 RGB on the host, clipped and rounded to
-    nearest.
-    """
+    """Convert a float image [H, W, 3] in 0..1 to uint8 RGB on the host, clipped and rounded to nearest."""
     return _displayed(image).numpy()
 
 

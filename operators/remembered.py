@@ -35,13 +35,12 @@ class RememberedTissue:
     def layer(self, rendered: RenderedFrame, whole: bool = False) -> NDArray[np.uint8] | None:
         """Return the mask of rendered tissue that is not visible in the content's frame.
 
-        Such tissue is behind a tool, under the recorder's on-screen display, or outside of the
-        field of view. Specular highlights count as visible.
+        Such tissue is behind a tool, under the recorder's on-screen display, or outside of the field of view. Specular
+        highlights count as visible.
 
         Args:
             rendered: the picture with its frame and opacity.
-            whole: no part of the picture is currently visible, so that all covered pixels are
-                marked.
+            whole: no part of the picture is currently visible, so that all covered pixels are marked.
 
         Returns:
             uint8 [H, W], 255 = remembered, 0 elsewhere; None if no pixel is.
@@ -73,8 +72,7 @@ class RememberedTissue:
         Args:
             picture: uint8 RGB [H, W, 3], modified.
             layer: uint8 [H, W] from `layer`, 255 = remembered.
-            tissue: uint8 [H, W], 0 = tool; draws a light outline along tool borders. None for no
-                outline.
+            tissue: uint8 [H, W], 0 = tool; draws a light outline along tool borders. None for no outline.
         """
         height, width = layer.shape
         if self._grey.shape != layer.shape:
@@ -109,9 +107,7 @@ def _box(layer: NDArray[np.uint8]) -> tuple[int, int, int, int]:
 
 
 def marked(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """Return the rendered picture with remembered tissue marked. It is a copy only if something is
-    marked.
-    """
+    """Return the rendered picture with remembered tissue marked. It is a copy only if something is marked."""
     tissue = RememberedTissue()
     layer = tissue.layer(rendered)
     if layer is None:

@@ -15,15 +15,14 @@ from operators.outcome import Contributor, OutcomeBuilder
 
 
 class SideBySideOp(Operator):
-    """Runs several chains of operators on each frame in parallel, merges their results, and runs a
-    final chain.
+    """Runs several chains of operators on each frame in parallel, merges their results, and runs a final chain.
 
-    Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at
-    its output `frame`. The result is the frame of the first chain with the fields `TAKEN_OVER` of
-    the others. If the gate withholds the frame, its result is used instead.
+    Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at its output `frame`.
+    The result is the frame of the first chain with the fields `TAKEN_OVER` of the others. If the gate withholds the
+    frame, its result is used instead.
 
-    The operators belong to no graph. This operator starts and stops them and forwards their
-    contributions to the outcome.
+    The operators belong to no graph. This operator starts and stops them and forwards their contributions to the
+    outcome.
 
     Inputs:
         frame: `Frame`.

@@ -13,9 +13,7 @@ from gsplat_core.io.files import PartialFile
 from operators.errors import OutputError, StorageFull
 
 STAGING_PREFIX = ".run-"
-"""Name prefix of the staging folder, inside the output folder, that holds results until the run
-ends.
-"""
+"""Name prefix of the staging folder, inside the output folder, that holds results until the run ends."""
 
 
 def mebibytes(count: float) -> str:
@@ -30,11 +28,10 @@ def shown(folder: Path) -> Path:
 
 @dataclass
 class StorageReserve:
-    """Keeps `reserve_bytes` free on the disk of `folder`, for the video's index, the model and the
-    report.
+    """Keeps `reserve_bytes` free on the disk of `folder`, for the video's index, the model and the report.
 
-    The free space is checked before each write, because a video encoder may ignore a full disk and
-    produce an unplayable file.
+    The free space is checked before each write, because a video encoder may ignore a full disk and produce an
+    unplayable file.
     """
 
     folder: Path

@@ -66,8 +66,7 @@ class FoundMasks:
 
 
 class RecordedToolMaskOp(Operator):
-    """Emits each frame with its recorded mask. A frame without one counts as all tissue, logged
-    once.
+    """Emits each frame with its recorded mask. A frame without one counts as all tissue, logged once.
 
     Inputs:
         frame: `Frame`.
@@ -167,9 +166,7 @@ class FoundToolMaskOp(Operator):
         op_output.emit(frame, "frame")
 
     def _believed(self, frame: Frame, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the detected mask, or an all-tissue mask if no tissue was detected for too many
-        frames.
-        """
+        """Return the detected mask, or an all-tissue mask if no tissue was detected for too many frames."""
         if frame.withheld is not None or not self.doubts:
             return mask
         # A mask with less tissue marks the whole picture as tool.

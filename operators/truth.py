@@ -30,18 +30,14 @@ INPAINT_RADIUS_PX = 5
 
 @dataclass(frozen=True)
 class BehindTools:
-    """Mean PSNR of pixels behind a tool that were visible earlier, against the true picture without
-    tools.
-    """
+    """Mean PSNR of pixels behind a tool that were visible earlier, against the true picture without tools."""
 
     psnr_db: float
     """PSNR of the reconstruction, in dB."""
     last_seen_db: float
     """Trivial baseline in dB: each pixel's most recent visible value."""
     inpainted_db: float
-    """Trivial baseline in dB: the frame's own picture inpainted from around the tool (Telea
-    2004).
-    """
+    """Trivial baseline in dB: the frame's own picture inpainted from around the tool (Telea 2004)."""
     frames: int
     """Number of scored frames."""
 
@@ -52,9 +48,7 @@ class TruthResult:
 
     behind_tools: BehindTools | None
     depth: DepthShare | None
-    """Depth of visible tissue, with the best plane (constant and tilted) of each frame as trivial
-    baselines.
-    """
+    """Depth of visible tissue, with the best plane (constant and tilted) of each frame as trivial baselines."""
     depth_behind_tools: DepthShare | None
     """Depth of tissue behind tools, with the same baselines."""
 

@@ -1,5 +1,4 @@
-"""Backup of the service's data: made while the service runs, checked completely, restored only into
-empty folders.
+"""Backup of the service's data: made while the service runs, checked completely, restored only into empty folders.
 
 BACKUP/
   backup.json                          manifest: size and SHA-256 of each file, and data not included
@@ -120,8 +119,7 @@ def make_backup(settings: ServiceSettings, target: Path) -> Backup:
 
 
 def check_backup(folder: Path) -> Backup:
-    """Check a backup: files against the manifest, database against files, and the audit log's
-    chain.
+    """Check a backup: files against the manifest, database against files, and the audit log's chain.
 
     Raises:
         BackupFailed: if the backup is damaged.
@@ -152,8 +150,7 @@ def check_backup(folder: Path) -> Backup:
 
 
 def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
-    """Check a backup and restore it into the service's folders, which must be empty. Nothing is
-    ever replaced.
+    """Check a backup and restore it into the service's folders, which must be empty. Nothing is ever replaced.
 
     Raises:
         BackupFailed: if the backup is damaged or a folder is not empty.
@@ -297,8 +294,7 @@ def _sources(places: Places) -> dict[str, Path]:
 
 
 def _copy_files(places: Places, data: Path) -> None:
-    """Copy the files not copied yet. Named files of the service never change; files deleted
-    meanwhile are skipped."""
+    """Copy the files not copied yet. Named files of the service never change; files deleted meanwhile are skipped."""
     for name, source in _sources(places).items():
         for path in _walk(source):
             relative = path.relative_to(source)

@@ -1,5 +1,4 @@
-"""Guard against clock jumps: nothing is deleted by age until the clock has been consistent for some
-time."""
+"""Guard against clock jumps: nothing is deleted by age until the clock has been consistent for some time."""
 
 from __future__ import annotations
 

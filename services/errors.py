@@ -9,8 +9,7 @@ from gsplat_core.errors import UserError
 
 
 class SettingsInvalid(UserError, ValueError):
-    """A settings file, environment variable or flag is invalid. The message names it and the
-    remedy."""
+    """A settings file, environment variable or flag is invalid. The message names it and the remedy."""
 
 
 class BusError(Exception):

@@ -41,8 +41,7 @@ def viser() -> Any:
 
 
 class ModelView:
-    """Viewer server, used as context manager. Colours have no view dependence, a limitation of
-    viser."""
+    """Viewer server, used as context manager. Colours have no view dependence, a limitation of viser."""
 
     def __init__(self, model: Model, host: str, port: int) -> None:
         """Start the server.
@@ -121,8 +120,7 @@ class ModelView:
 
 
 def _private(library: Any) -> Any:
-    """Return viser's server class without the public share URL, which any browser could otherwise
-    request."""
+    """Return viser's server class without the public share URL, which any browser could otherwise request."""
 
     class PrivateServer(library.ViserServer):
         def request_share_url(self, verbose: bool = True) -> None:
@@ -132,8 +130,7 @@ def _private(library: Any) -> Any:
 
 
 def scene_to_view(model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return rotation and translation into camera axes, and the scale that moves the scene's centre
-    to `DISTANCE`."""
+    """Return rotation and translation into camera axes, and the scale that moves the scene's centre to `DISTANCE`."""
     pose = model.camera.world_to_camera
     rotation, offset = pose[:3, :3], pose[:3, 3]
     depths = model.gaussians.means.detach().cpu().double().numpy() @ rotation[2] + offset[2]

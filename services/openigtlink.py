@@ -46,10 +46,9 @@ def pyigtl() -> Any:
 class StreamMessages:
     """Packer of one stream's messages.
 
-    Picture axes: i right, j down, k = 0, with three components (red, green, blue). A voxel is
-    `spacing_mm` wide and high, and the origin is the picture's centre. Camera coordinates (x right,
-    y down, z forward) are sent as RAS, so receivers change no sign. The patient's left and right
-    are unknown.
+    Picture axes: i right, j down, k = 0, with three components (red, green, blue). A voxel is `spacing_mm` wide and
+    high, and the origin is the picture's centre. Camera coordinates (x right, y down, z forward) are sent as RAS, so
+    receivers change no sign. The patient's left and right are unknown.
 
     Raises:
         InvalidSetting: if the name or the spacing is not valid.
@@ -86,8 +85,7 @@ class StreamMessages:
 
 
 def ijk_to_camera(width_px: int, height_px: int, spacing_mm: float) -> NDArray[np.float64]:
-    """Return the 4x4 matrix from voxel indices to camera coordinates, with the origin at the
-    picture's centre."""
+    """Return the 4x4 matrix from voxel indices to camera coordinates, with the origin at the picture's centre."""
     place = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
     place[:2, 3] = -0.5 * spacing_mm * np.array([width_px - 1, height_px - 1])
     return place
@@ -197,8 +195,7 @@ class MessageServer:
 
 
 def _has_left(client: socket.socket) -> bool:
-    """Return True if the client has closed the connection. Received data, such as requests, is
-    discarded."""
+    """Return True if the client has closed the connection. Received data, such as requests, is discarded."""
     while select.select([client], [], [], 0)[0]:
         if not client.recv(65536):
             return True

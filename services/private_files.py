@@ -1,5 +1,4 @@
-"""Private files of the service: umask for each process, and tightened permissions of existing
-files."""
+"""Private files of the service: umask for each process, and tightened permissions of existing files."""
 
 from __future__ import annotations
 
@@ -26,20 +25,18 @@ class FolderNotPrivate(UserError):
 
 
 def keep_files_private() -> None:
-    """Set the umask so that new files are private, also in child processes. Call first in each
-    `main`."""
+    """Set the umask so that new files are private, also in child processes. Call first in each `main`."""
     os.umask(UMASK)
 
 
 def make_state_private(data: Path, *further: Path | None) -> int:
-    """Create the service's folders and remove the permissions of group and others from its files.
-    Symbolic links are not followed. In the data folder only the service's own names are changed,
-    because the folder may contain other files.
+    """Create the service's folders and remove the permissions of group and others from its files. Symbolic links are
+    not followed. In the data folder only the service's own names are changed, because the folder may contain other
+    files.
 
     Args:
         data: data folder.
-        further: folders for recordings and results outside the data folder; None if they are
-            inside.
+        further: folders for recordings and results outside the data folder; None if they are inside.
 
     Returns:
         Number of files and folders with changed permissions.

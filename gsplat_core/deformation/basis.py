@@ -62,8 +62,7 @@ class BasisSlot:
         return count * bumps * (2 + int(self.field.weights.shape[2]))
 
     def overwrite(self, source: DeformationField) -> bool:
-        """Copy another field's bumps and column layout into the slot, and reset unused places to
-        inert.
+        """Copy another field's bumps and column layout into the slot, and reset unused places to inert.
 
         Returns:
             False, with nothing copied, if the field does not fit into the slot.
@@ -98,9 +97,7 @@ class BasisSlot:
         mine.set_clock(self.field.frame_time, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
-        """Select the region of each tensor to write, and reset the previously used rest
-        to inert.
-        """
+        """Select the region of each tensor to write, and reset the previously used rest to inert."""
         mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
         rows, columns = self._used
         for to, inert in zip(mine, INERT, strict=True):
@@ -129,13 +126,12 @@ Least squares alone overshoots where offsets jump.
 class BasisField(BumpTensors):
     """Field with B bumps per Gaussian and 13 channels: position, rotation, log-scale, colour.
 
-    Colour is added to the constant SH coefficient. Parameters are `centers` [N, B] and `log_widths`
-    [N, B] in bump spacings, and `weights` [N, B, 13], initially zero. The columns cover the window
-    plus one spacing at each end. A bump more than 4 widths away contributes nothing and gets no
-    gradient.
+    Colour is added to the constant SH coefficient. Parameters are `centers` [N, B] and `log_widths` [N, B] in bump
+    spacings, and `weights` [N, B, 13], initially zero. The columns cover the window plus one spacing at each end. A
+    bump more than 4 widths away contributes nothing and gets no gradient.
 
-    Two ways of training exist. `forward` is differentiable for any optimiser. `deltas` and
-    `adam_step` fuse the gradient with a lazy Adam step that touches only active bumps.
+    Two ways of training exist. `forward` is differentiable for any optimiser. `deltas` and `adam_step` fuse the
+    gradient with a lazy Adam step that touches only active bumps.
     """
 
     kind = "basis"
@@ -163,9 +159,7 @@ class BasisField(BumpTensors):
         return cls(gaussians.count, time_window_s, **architecture)
 
     def deltas(self, time_s: float) -> Tensor:
-        """Return the deltas [N, 13] at `time_s`: position, rotation, log-scale, colour;
-        differentiable.
-        """
+        """Return the deltas [N, 13] at `time_s`: position, rotation, log-scale, colour; differentiable."""
         past = self.continuation
         bumps_s = time_s if past is None else min(time_s, past.from_s)
         deltas = cast(Tensor, self._ops.basis_field(*self._parameters_of(self.count), self.frame_time(bumps_s)))
@@ -205,8 +199,7 @@ class BasisField(BumpTensors):
     ) -> None:
         """Take the step of `adam_step` at a normalised time.
 
-        `tau` and `rates` may be float32 tensors on the field's device, which a CUDA graph reads at
-        every replay.
+        `tau` and `rates` may be float32 tensors on the field's device, which a CUDA graph reads at every replay.
 
         Args:
             tau: time as returned by `self.frame_time`, float or float32 [1].
@@ -223,9 +216,7 @@ class BasisField(BumpTensors):
         )
 
     def smooth_in_time(self, amount: float) -> None:
-        """Smooth the weights of neighbouring bumps; see `Capabilities.smooth_in_time`. Not for a
-        ring.
-        """
+        """Smooth the weights of neighbouring bumps; see `Capabilities.smooth_in_time`. Not for a ring."""
         towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
 
     def share_motion(self, neighbours: Tensor, amount: float) -> None:
@@ -292,8 +283,7 @@ class BasisField(BumpTensors):
 
         Args:
             tau: time as returned by `self.frame_time`, float or float32 [1] on the field's device.
-            deltas: [N, 13], or [N, 16] with ignored columns; also for all rows including reserved
-                ones.
+            deltas: [N, 13], or [N, 16] with ignored columns; also for all rows including reserved ones.
         """
         bumps = (p.data for p in self._parameters_of(deltas.shape[0]))
         self._ops.basis_field_move_to_(*bumps, tau, deltas[:, :BASIS_CHANNELS].contiguous())
@@ -303,8 +293,7 @@ class BasisField(BumpTensors):
         return self._whole_parameters()
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> None:
-        """Fit weights of the initial bumps by least squares; see `Capabilities.follow`. Not for a
-        ring.
+        """Fit weights of the initial bumps by least squares; see `Capabilities.follow`. Not for a ring.
 
         The result is bounded by `OVERSHOOT`.
         """
@@ -320,9 +309,7 @@ class BasisField(BumpTensors):
         self.add_colours_at(self.frame_time(time_s), change)
 
     def add_colours_at(self, tau: float | Tensor, change: Tensor) -> None:
-        """Apply `add_colours` at a normalised time `tau`, float or float32 [1] on the field's
-        device.
-        """
+        """Apply `add_colours` at a normalised time `tau`, float or float32 [1] on the field's device."""
         with torch.no_grad():
             bumps = (p.data for p in self._parameters_of(change.shape[0]))
             self._ops.basis_field_add_colours_(*bumps, tau, change)
@@ -440,8 +427,7 @@ class CapturedBasisTraining:
 def new_basis_field(wanted: NewField) -> BasisField:
     """Create a basis field with bump columns every `spacing_s` seconds over the window.
 
-    Live, the columns cover the span that `BasisField.cover` keeps ahead. With a limited history
-    they form a ring.
+    Live, the columns cover the span that `BasisField.cover` keeps ahead. With a limited history they form a ring.
     """
     spacing_s = wanted.spacing_s
     span_s = COLUMNS_AHEAD * spacing_s if wanted.end_s is None else max(wanted.end_s - wanted.start_s, spacing_s)

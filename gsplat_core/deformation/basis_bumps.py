@@ -90,9 +90,7 @@ class Columns:
         return self.places - self.count
 
     def moved_on(self, added: int) -> tuple[Columns, int]:
-        """Return the columns after adding `added` at the head, and the number of
-        replaced columns.
-        """
+        """Return the columns after adding `added` at the head, and the number of replaced columns."""
         passed = max(0, self.count + added - self.places)
         origin_s = self.origin_s + passed * self.spacing_s
         oldest = (self.oldest + passed) % self.places
@@ -104,9 +102,7 @@ class Columns:
         return (self.oldest + self.count - 1) % self.places
 
     def newest_places(self, count: int) -> Iterator[tuple[slice, range]]:
-        """Yield the places of the newest `count` columns in one or two slices, with
-        column numbers.
-        """
+        """Yield the places of the newest `count` columns in one or two slices, with column numbers."""
         number = self.count - count
         while number < self.count:
             place = (self.oldest + number) % self.places
@@ -136,8 +132,7 @@ def bump_capacity(bumps: int) -> int:
 def ring_places(history_s: float, spacing_s: float) -> int:
     """Return the ring size for a history of `history_s` seconds.
 
-    It includes the bumps that reach into the history and the columns that `BasisField.cover` keeps
-    ahead.
+    It includes the bumps that reach into the history and the columns that `BasisField.cover` keeps ahead.
     """
     return math.ceil(history_s / spacing_s - 1e-6) + int(BUMP_REACH) + COLUMNS_AHEAD + 4
 
@@ -171,9 +166,7 @@ class BumpTensors(ContinuedField):
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
     ) -> None:
-        """Create columns over the window: `bumps` of them, or as many as a distance of `spacing_s`
-        needs.
-        """
+        """Create columns over the window: `bumps` of them, or as many as a distance of `spacing_s` needs."""
         super().__init__(time_window_s)
         start, end = self._time_window_s
         if spacing_s is not None:
@@ -218,9 +211,7 @@ class BumpTensors(ContinuedField):
         return (self.clamp_time(time_s) - self._columns.origin_s) / self._columns.spacing_s
 
     def deltas(self, time_s: float) -> Tensor:
-        """Return the deltas [N, 13] at `time_s`: position, rotation, log-scale, colour;
-        differentiable.
-        """
+        """Return the deltas [N, 13] at `time_s`: position, rotation, log-scale, colour; differentiable."""
         raise NotImplementedError
 
     def keep_last(self, history_s: float, fading_s: float = math.inf) -> None:
@@ -279,9 +270,7 @@ class BumpTensors(ContinuedField):
         self._time_window_s = (start, end)
 
     def cover(self, time_s: float, newest_s: float) -> None:
-        """Keep `COLUMNS_AHEAD` columns plus one ahead of `time_s`; new ones continue from
-        `newest_s`.
-        """
+        """Keep `COLUMNS_AHEAD` columns plus one ahead of `time_s`; new ones continue from `newest_s`."""
         start, end = self._time_window_s
         ahead_s = COLUMNS_AHEAD * self.spacing_s
         if time_s + ahead_s > end:
@@ -297,9 +286,7 @@ class BumpTensors(ContinuedField):
         self._spare_rows = 0
 
     def append(self, count: int, parents: Tensor | None = None) -> None:
-        """Append zero bumps for new Gaussians, or copies of the bumps of `parents`, with new Adam
-        state.
-        """
+        """Append zero bumps for new Gaussians, or copies of the bumps of `parents`, with new Adam state."""
         used = self.count
         if parents is not None and parents.shape != (count,):
             raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
@@ -351,9 +338,7 @@ class BumpTensors(ContinuedField):
         return field
 
     def detached_copy(self) -> Self:
-        """Return a copy of the Gaussians and bumps in use, in chronological order and
-        without ring.
-        """
+        """Return a copy of the Gaussians and bumps in use, in chronological order and without ring."""
         return self._copy_of(self.count)
 
     def _copy_of(self, rows: int) -> Self:

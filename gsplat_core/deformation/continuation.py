@@ -18,12 +18,10 @@ DeltasAt = Callable[[Tensor], Tensor]
 
 
 class Continuation(torch.nn.Module):
-    """Extrapolation after the newest frame: deltas(min(t, from)) + velocity * min(max(t - from, 0),
-    horizon).
+    """Extrapolation after the newest frame: deltas(min(t, from)) + velocity * min(max(t - from, 0), horizon).
 
-    `velocity` [N, 16] is the change of the deltas per second, in the columns of
-    `gsplat_core.scene.gaussians`. Writing keeps the tensors' addresses, so captured graphs read the
-    new values. The tensors are not part of a `state_dict`.
+    `velocity` [N, 16] is the change of the deltas per second, in the columns of `gsplat_core.scene.gaussians`. Writing
+    keeps the tensors' addresses, so captured graphs read the new values. The tensors are not part of a `state_dict`.
     """
 
     velocity: Tensor
@@ -67,9 +65,7 @@ class Continuation(torch.nn.Module):
         self.from_s, self.horizon_s = from_s, horizon_s
 
     def set_clock(self, tau: Callable[[float], float], seconds_per_tau: float) -> None:
-        """Store start and horizon in the field's normalised time `tau(time_s)`, for captured
-        graphs.
-        """
+        """Store start and horizon in the field's normalised time `tau(time_s)`, for captured graphs."""
         store_scalars_(self.clock, [tau(self.from_s), self.horizon_s / seconds_per_tau, seconds_per_tau])
 
     def stop(self) -> None:
@@ -79,16 +75,12 @@ class Continuation(torch.nn.Module):
         store_scalars_(self.clock, [torch.finfo(torch.float32).max, 0.0, 0.0])
 
     def added(self, time_s: float, count: int) -> Tensor | None:
-        """Return the extrapolated part [count, 16] of the deltas at `time_s`; None before the
-        start.
-        """
+        """Return the extrapolated part [count, 16] of the deltas at `time_s`; None before the start."""
         past_s = min(time_s - self.from_s, self.horizon_s)
         return self.velocity[:count] * past_s if past_s > 0 else None
 
     def captured(self, deltas: DeltasAt) -> DeltasAt:
-        """Return the field's `deltas` plus the extrapolated part, computed on the device without
-        sync.
-        """
+        """Return the field's `deltas` plus the extrapolated part, computed on the device without sync."""
 
         def at(tau: Tensor) -> Tensor:
             start, horizon, seconds = self.clock.split(1)

@@ -1,8 +1,7 @@
 """Interface of deformation fields, and the capabilities that a field may have in addition.
 
-`DeformationField` is the module that deforms canonical Gaussians to one time. Every field
-implements it. `Capabilities` lists what only some fields support; callers skip the work that needs
-a missing capability.
+`DeformationField` is the module that deforms canonical Gaussians to one time. Every field implements it. `Capabilities`
+lists what only some fields support; callers skip the work that needs a missing capability.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ class FixedRows(Protocol):
         """Remove Gaussians by applying row moves."""
 
     def restart(self, time_s: float, count: int) -> None:
-        """Reset in place to an untrained field of `count` Gaussians for a stream starting at
-        `time_s`.
+        """Reset in place to an untrained field of `count` Gaussians for a stream starting at `time_s`.
 
         Raises:
             InvalidInput: for more Gaussians than rows.
@@ -121,9 +119,7 @@ class CapturedMotion(FrameDeltas, Protocol):
 
 
 class FieldSlot(Protocol):
-    """Copy of a field at fixed addresses. Captured CUDA graphs stay valid while newer states are
-    written to it.
-    """
+    """Copy of a field at fixed addresses. Captured CUDA graphs stay valid while newer states are written to it."""
 
     @property
     def field(self) -> DeformationField:
@@ -163,9 +159,7 @@ class Capabilities:
     slot: Callable[[int], FieldSlot] | None = None
     """Function that creates a slot for a number of Gaussians, for published snapshots."""
     add_colours: Callable[[float, Tensor], None] | None = None
-    """Function that changes the degree-0 colour deltas at a time in seconds by [N, 3], and little
-    at other times.
-    """
+    """Function that changes the degree-0 colour deltas at a time in seconds by [N, 3], and little at other times."""
     follow: Callable[[slice, Sequence[float], Tensor], None] | None = None
     """Function that fits the position deltas of a slice of rows to given trajectories.
 
@@ -174,8 +168,7 @@ class Capabilities:
     smooth_in_time: Callable[[float], None] | None = None
     """Function that smooths the time-dependent parameters with those of the neighbouring times.
 
-    The argument is the weight 0..1 of the neighbours' mean. The function runs in place and outside
-    of any optimiser.
+    The argument is the weight 0..1 of the neighbours' mean. The function runs in place and outside of any optimiser.
     """
     share_motion: Callable[[Tensor, float], None] | None = None
     """Function that smooths the motion of each Gaussian with its neighbours at all times.
@@ -188,13 +181,12 @@ class Capabilities:
 class DeformationField(torch.nn.Module):
     """Base class of deformation fields.
 
-    A field covers a time window. Times outside are clamped, so the field holds the state at the
-    nearest end. An untrained field is the identity.
+    A field covers a time window. Times outside are clamped, so the field holds the state at the nearest end. An
+    untrained field is the identity.
 
-    Subclasses define `kind` and a differentiable `forward`. Learned values are float32 parameters.
-    Subclasses with constructor arguments beyond `time_window_s` override `for_gaussians` and
-    `config`. Those with parameters tied to times relative to the window override `extend`. Those
-    with optional capabilities override `capabilities`.
+    Subclasses define `kind` and a differentiable `forward`. Learned values are float32 parameters. Subclasses with
+    constructor arguments beyond `time_window_s` override `for_gaussians` and `config`. Those with parameters tied to
+    times relative to the window override `extend`. Those with optional capabilities override `capabilities`.
     """
 
     kind: ClassVar[str] = ""
@@ -217,8 +209,7 @@ class DeformationField(torch.nn.Module):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> Self:
-        """Create an untrained field from validated `config` values; the caller then loads its
-        tensors.
+        """Create an untrained field from validated `config` values; the caller then loads its tensors.
 
         Called on the "meta" device while a bundle is read, so it may use shapes but no values.
         """
@@ -300,9 +291,7 @@ class DeformationField(torch.nn.Module):
         return copy.deepcopy(self).requires_grad_(False)
 
     def check_state(self) -> None:
-        """Raise InvalidInput if loaded finite tensors of the right shapes do not form a valid
-        field.
-        """
+        """Raise InvalidInput if loaded finite tensors of the right shapes do not form a valid field."""
 
 
 def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:

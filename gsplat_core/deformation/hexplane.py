@@ -72,12 +72,11 @@ def _along_a_curve(coordinates: Tensor) -> Tensor:
 class HexPlaneField(DeformationField):
     """HexPlane field with six planes per level, a trunk MLP and one linear head of 11 channels.
 
-    `resolution` is the grid of (x, y, z, t) at level 1. Level m multiplies x, y and z by m, as in
-    4D Gaussian Splatting. Each plane has `channels` features, stored channels-last [V, U, C]. The
-    trunk has `depth` layers of `width`. Space planes start uniformly in 0.1..0.5, time planes at 1,
-    and the head at zero, so an untrained field is the identity. `box` [2, 3] bounds the canonical
-    positions. It is computed from the Gaussians when the field is created. Positions outside are
-    clamped to it.
+    `resolution` is the grid of (x, y, z, t) at level 1. Level m multiplies x, y and z by m, as in 4D Gaussian
+    Splatting. Each plane has `channels` features, stored channels-last [V, U, C]. The trunk has `depth` layers of
+    `width`. Space planes start uniformly in 0.1..0.5, time planes at 1, and the head at zero, so an untrained field is
+    the identity. `box` [2, 3] bounds the canonical positions. It is computed from the Gaussians when the field is
+    created. Positions outside are clamped to it.
     """
 
     kind = "hexplane"
@@ -136,9 +135,7 @@ class HexPlaneField(DeformationField):
         return torch.cat([space, torch.full_like(space[:, :1], self.frame_time(time_s))], dim=1)
 
     def frame_time(self, time_s: float) -> float:
-        """Map `time_s`, clamped to the time window, to the argument of `frame_deltas`
-        in [-1, 1].
-        """
+        """Map `time_s`, clamped to the time window, to the argument of `frame_deltas` in [-1, 1]."""
         start, end = self.time_window_s
         return 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
 
@@ -185,20 +182,18 @@ class HexPlaneField(DeformationField):
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
         """Return a function from a normalised time to the field's deltas, without autograd.
 
-        Features of the space planes are computed now. The returned function reflects later changes
-        of the time planes and the network only. On CUDA it does not synchronise with the host, so a
-        CUDA graph can capture the call.
+        Features of the space planes are computed now. The returned function reflects later changes of the time planes
+        and the network only. On CUDA it does not synchronise with the host, so a CUDA graph can capture the call.
 
         Args:
             gaussians: canonical Gaussians.
-            dtype: torch.float16 halves the memory of the space features and runs the network in
-                half precision. On CUDA this is twice as fast and adds an error of about 1e-3 of the
-                deltas. On other devices, and for sizes that the kernels do not support, float32 is
-                used.
+            dtype: torch.float16 halves the memory of the space features and runs the network in half precision. On CUDA
+                this is twice as fast and adds an error of about 1e-3 of the deltas. On other devices, and for sizes
+                that the kernels do not support, float32 is used.
 
         Returns:
-            Function from a float32 tensor [1] on the field's device, as computed by `frame_time`,
-                to deltas [N, 16] in the layout of `scene.gaussians`.
+            Function from a float32 tensor [1] on the field's device, as computed by `frame_time`, to deltas [N, 16] in
+            the layout of `scene.gaussians`.
         """
         is_cuda = self.box.device.type == "cuda" and self._ops is compiled
         with torch.no_grad():
@@ -324,18 +319,17 @@ class HexPlaneField(DeformationField):
 class HexPlaneTraining:
     """Trainer of a HexPlane field with fused gradients and Adam.
 
-    Each step calls `deltas`, then `update` with their gradient. Both enqueue work on the current
-    stream and read time, rates and step from device memory, so a CUDA graph can capture a step and
-    replay it with other values. Parameters and moments change in place. Equal inputs give
-    bit-identical results.
+    Each step calls `deltas`, then `update` with their gradient. Both enqueue work on the current stream and read time,
+    rates and step from device memory, so a CUDA graph can capture a step and replay it with other values. Parameters
+    and moments change in place. Equal inputs give bit-identical results.
 
     Args:
-        field: float32 field on a CUDA device. Its tensors are captured here; if they are replaced,
-            create a new trainer.
+        field: float32 field on a CUDA device. Its tensors are captured here; if they are replaced, create a new
+            trainer.
 
     Raises:
-        InvalidInput: if the field is on another device or the kernels do not support its sizes.
-            Train with autograd then.
+        InvalidInput: if the field is on another device or the kernels do not support its sizes. Train with autograd
+            then.
     """
 
     rates = 2
@@ -403,8 +397,7 @@ class HexPlaneTraining:
         """Take one Adam step for the gradient of the deltas last returned by `deltas`.
 
         Args:
-            v_raw: dL/d(deltas) [N, 16]; the gradient through the positions is added to columns 0 to
-                2.
+            v_raw: dL/d(deltas) [N, 16]; the gradient through the positions is added to columns 0 to 2.
             time: argument of the last `deltas` call.
             rates: float32 [2], learning rates of the planes and the network.
             step: int64 [1], step number from 1.

@@ -26,9 +26,7 @@ WINDOW_S = ListOf(NumberIn(-1e10, 1e10), 2, 2)
 PARAMETER_BYTES = 32
 """Bytes per trained parameter: the value, Adam's two moments, snapshots and the copy for saving."""
 OTHER_FIELD_BYTES = 256 * 2**20
-"""Memory for training a field of constant size. Measured with the default feature planes and 30,000
-Gaussians.
-"""
+"""Memory for training a field of constant size. Measured with the default feature planes and 30,000 Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,7 @@ class NewField:
     spacing_s: float
     """Shortest time in seconds within which motion must be able to change its course."""
     history_s: float | None = None
-    """Length of the past, in seconds, that stays deformable in a live session; None for
-    all of it.
-    """
+    """Length of the past, in seconds, that stays deformable in a live session; None for all of it."""
 
     @property
     def time_window_s(self) -> tuple[float, float]:
@@ -107,13 +103,11 @@ class FieldTraining(Protocol):
         """Take one optimiser step of the field.
 
         Args:
-            gradients: loss gradients of the raw tensors of the Gaussians returned by the last
-                `deform`.
+            gradients: loss gradients of the raw tensors of the Gaussians returned by the last `deform`.
             rates: learning rates from `FieldRates.scaled`.
 
         Returns:
-            Gradients of the canonical Gaussians; None or a missing name for a tensor without
-                gradient.
+            Gradients of the canonical Gaussians; None or a missing name for a tensor without gradient.
         """
 
 
@@ -123,9 +117,7 @@ class CapturedTraining(Protocol):
     rates: int
     """Number of learning rates taken by `update`."""
     reads_positions: bool
-    """True if the deltas depend on the canonical positions, whose gradient then
-    includes the field.
-    """
+    """True if the deltas depend on the canonical positions, whose gradient then includes the field."""
 
     def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
         """Arrange the learning rates of `FieldRates.scaled` in the order that `update` expects."""
@@ -147,8 +139,7 @@ class CapturedTraining(Protocol):
     def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
         """Take one optimiser step, skipped if `status` reports that splats were left out.
 
-        A field that depends on positions adds its part of the gradient to columns 0 to 2 of
-        `gradient`.
+        A field that depends on positions adds its part of the gradient to columns 0 to 2 of `gradient`.
 
         Args:
             gradient: dL/d(deltas) [N, 16].

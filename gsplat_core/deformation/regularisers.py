@@ -49,8 +49,7 @@ def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
 def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:
     """Return the matrix [B, T], float64, that maps values at `taus` to bump weights.
 
-    The bumps have width 1 and centres 0, 1, .... The fit is least squares with a penalty on
-    bending.
+    The bumps have width 1 and centres 0, 1, .... The fit is least squares with a penalty on bending.
     """
     row = torch.arange(bumps, dtype=torch.float64)[None], torch.zeros(1, bumps, dtype=torch.float64)
     each = torch.eye(bumps, dtype=torch.float64)[None]

@@ -31,9 +31,7 @@ from gsplat_core.scene.frames import Frame
 
 Plane = NDArray[np.float64]
 MOST_SPAN = 5.0
-"""Largest assumed ratio of the far end of a picture to its near end, when no reference depth fixes
-the offset.
-"""
+"""Largest assumed ratio of the far end of a picture to its near end, when no reference depth fixes the offset."""
 ENDS = (2.0, 98.0)
 """Percentiles used as the near and far ends of a picture; values beyond them may be outliers."""
 ROUNDS = 10
@@ -48,8 +46,7 @@ class Affine(NamedTuple):
     factor: float
     summand: float
     alike: float
-    """Weighted correlation of network output and reference depth, -1 to 1. It has the sign of the fitted scale.
-    """
+    """Weighted correlation of network output and reference depth, -1 to 1. It has the sign of the fitted scale."""
 
     def of(self, values: Plane) -> Plane:
         """Apply the map to values of any shape."""
@@ -63,8 +60,7 @@ def is_constant(values: Plane) -> bool:
 
 
 def with_assumed_zero(values: Plane) -> Affine:
-    """Return the offset that limits the span of values [N] to `MOST_SPAN`; zero if the span is
-    already smaller.
+    """Return the offset that limits the span of values [N] to `MOST_SPAN`; zero if the span is already smaller.
 
     Used when no reference depth is available.
     """
@@ -76,10 +72,9 @@ def with_assumed_zero(values: Plane) -> Affine:
 def fitted(values: Plane, known: Plane) -> Affine | None:
     """Fit the affine map from `values` [N] to `known` [N] robustly.
 
-    Both sides have errors, so their spreads are made equal (reduced major axis regression). Least
-    squares would flatten the relief a little at each fit, and depth that is fitted to the previous
-    frame's depth would become flat over time. Outliers are suppressed by iteratively reweighted
-    estimates with Cauchy weights.
+    Both sides have errors, so their spreads are made equal (reduced major axis regression). Least squares would flatten
+    the relief a little at each fit, and depth that is fitted to the previous frame's depth would become flat over time.
+    Outliers are suppressed by iteratively reweighted estimates with Cauchy weights.
 
     Args:
         values: float64 [N], the network's output.
@@ -113,9 +108,7 @@ def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
 
 
 def _middle(values: Plane) -> tuple[float, float]:
-    """Return the median and the median absolute deviation, or the standard deviation if the latter
-    is zero.
-    """
+    """Return the median and the median absolute deviation, or the standard deviation if the latter is zero."""
     median = float(np.median(values))
     return median, float(np.median(np.abs(values - median))) or float(values.std())
 
@@ -141,9 +134,7 @@ SMALLEST_PX = 4
 GRID_PX = 80
 """Longer side of the grid on which network outputs are compared, in cells."""
 EVERY_S = 0.3
-"""Time from one inference to the next in seconds; the last answer is reused in between unless the
-scope moves.
-"""
+"""Time from one inference to the next in seconds; the last answer is reused in between unless the scope moves."""
 ALIKE = 0.6
 """Correlation with the reference depth from which the two show the same scene."""
 LEAST_SEEN = 0.05
@@ -204,8 +195,7 @@ class LearnedDepth(Estimator):
         """Load the network.
 
         Args:
-            address: path of the model. A suffix `?values=depth` or `?values=inverse` overrides the
-                model's own setting.
+            address: path of the model. A suffix `?values=depth` or `?values=inverse` overrides the model's own setting.
 
         Raises:
             InvalidSetting: for a network that cannot be used.

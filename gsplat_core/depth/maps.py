@@ -34,8 +34,7 @@ class DepthMap:
     """Depth estimated for one picture.
 
     Raises:
-        InvalidInput: for planes that are not float32 [H, W] of one shape, or a rejected map with
-            non-zero confidence.
+        InvalidInput: for planes that are not float32 [H, W] of one shape, or a rejected map with non-zero confidence.
     """
 
     depth: NDArray[np.float32]
@@ -46,9 +45,7 @@ class DepthMap:
     metric: bool
     """True if the depth is in millimetres; otherwise it is known up to one factor."""
     doubt: str | None = None
-    """Reason why the whole map is rejected, as a sentence, or None. A rejected map has zero
-    confidence everywhere.
-    """
+    """Reason why the whole map is rejected, as a sentence, or None. A rejected map has zero confidence everywhere."""
 
     remark: str | None = None
     """Information for the user about the whole map, as a sentence, or None. Like `doubt`, its text
@@ -156,16 +153,14 @@ PAIRS = (
     (np.s_[:-1, :-1], np.s_[1:, 1:]),
     (np.s_[:-1, 1:], np.s_[1:, :-1]),
 )
-"""Slices that pair every pixel with four of its neighbours; the other four are covered by symmetry.
-"""
+"""Slices that pair every pixel with four of its neighbours; the other four are covered by symmetry."""
 
 
 def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the confidence of measured depth.
 
-    A pixel gets 0 if its depth is not finite and positive, if it is far below the median, or if
-    most of its known neighbours differ from it. Other pixels get 1, including those without known
-    neighbours.
+    A pixel gets 0 if its depth is not finite and positive, if it is far below the median, or if most of its known
+    neighbours differ from it. Other pixels get 1, including those without known neighbours.
 
     Args:
         depth: floating [H, W].
@@ -249,8 +244,7 @@ class Look:
 
     @classmethod
     def of(cls, depth: NDArray[np.float32], confidence: NDArray[np.float32] | None, camera: Camera) -> Look:
-        """Return the reduced depth map. Without a confidence, every known depth counts as
-        confident.
+        """Return the reduced depth map. Without a confidence, every known depth counts as confident.
 
         Args:
             depth: float32 [H, W], 0 = unknown.

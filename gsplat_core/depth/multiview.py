@@ -41,9 +41,7 @@ NOISE_GREY = 2.0
 contrast do not correlate.
 """
 DISAGREES = 0.5
-"""Cost of uncorrelated patches, also the upper bound, so that an occluded view cannot outvote the
-others.
-"""
+"""Cost of uncorrelated patches, also the upper bound, so that an occluded view cannot outvote the others."""
 AGREES = 0.2
 """Cost below which a view votes for a distance, corresponding to a correlation of 0.6."""
 
@@ -62,8 +60,8 @@ class View:
 def sweep(
     reference: View, others: Sequence[View], inverse_depths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Compute matching costs by zero-mean normalised cross-correlation, which is invariant to the
-    brightness changes of a moving light.
+    """Compute matching costs by zero-mean normalised cross-correlation, which is invariant to the brightness changes of
+    a moving light.
 
     Args:
         reference: picture whose depth is wanted.
@@ -71,8 +69,7 @@ def sweep(
         inverse_depths: float64 [D].
 
     Returns:
-        Mean costs float32 [H, W, D] from 0 to `DISAGREES`, and numbers of agreeing views uint8 [H,
-            W, D].
+        Mean costs float32 [H, W, D] from 0 to `DISAGREES`, and numbers of agreeing views uint8 [H, W, D].
     """
     height, width = reference.grey.shape
     cost = np.empty((len(inverse_depths), height, width), np.float32)
@@ -206,13 +203,9 @@ RELIEF = 0.5
 LARGEST_RELIEF = 4.0
 """Bound of the ratio between a point's inverse depth and that of the plane."""
 LEAST_PARALLAX_PX = 1.5
-"""Smallest median parallax in pixels, in the view with the most parallax; with less, depth is
-noise.
-"""
+"""Smallest median parallax in pixels, in the view with the most parallax; with less, depth is noise."""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
-"""A view contradicts its pose if its median residual exceeds both this many pixels and this share
-of its parallax.
-"""
+"""A view contradicts its pose if its median residual exceeds both this many pixels and this share of its parallax."""
 POSE_ERROR_PX = 0.6
 """Residual of static tissue in pixels, from errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
@@ -220,9 +213,7 @@ FEWEST_AGREEING = 0.6
 CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
 """Reason given if fewer views agree with their poses."""
 ROUNDS = 6
-"""Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving
-objects.
-"""
+"""Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving objects."""
 Array = NDArray[np.float64]
 
 
@@ -239,9 +230,8 @@ class Parallax:
     parallax_px: float
     """Median parallax in pixels in the view with the most parallax."""
     own_motion: float
-    """Median residual that no depth explains, as a share of the parallax: the tissue's own motion.
-    Motion along the parallax direction is mistaken for depth, so the relative depth error is about
-    this share, or up to twice as large.
+    """Median residual that no depth explains, as a share of the parallax: the tissue's own motion. Motion along the
+    parallax direction is mistaken for depth, so the relative depth error is about this share, or up to twice as large.
     """
 
 
@@ -295,9 +285,7 @@ def _corners(view: View) -> NDArray[np.float32]:
 def _followed(
     reference: View, view: View, corners: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the position of each corner in the other picture [n, 2], and which were found on
-    tissue [n].
-    """
+    """Return the position of each corner in the other picture [n, 2], and which were found on tissue [n]."""
     first, second = (each.grey.astype(np.uint8) for each in (reference, view))
     there, misses_px = followed(first, second, corners, window_px=15, levels=4)
     height, width = view.tissue.shape
@@ -310,9 +298,7 @@ def _followed(
 def _terms(
     corners: NDArray[np.float32], target: NDArray[np.float32], before: Camera, after: Camera
 ) -> tuple[Array, Array]:
-    """Return c and d [n, 2] of the equation w c = d for the corners' inverse depths w, in units of
-    the focal length.
-    """
+    """Return c and d [n, 2] of the equation w c = d for the corners' inverse depths w, in units of the focal length."""
     between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
     first, second = _normalised(corners, before), _normalised(target, after)
     ray = np.concatenate([first, np.ones((len(first), 1))], 1) @ between[:3, :3].T
@@ -339,9 +325,7 @@ def _plane(c: Array, d: Array, seen: NDArray[np.bool_], focal: float) -> float:
 
 
 def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: float) -> Array:
-    """Return each point's inverse depth [points] by robust least squares over all views, with the
-    plane as prior mean.
-    """
+    """Return each point's inverse depth [points] by robust least squares over all views, with the plane as prior mean."""
     prior = 1 / (RELIEF * plane) ** 2
     inverse = np.full(c.shape[1], plane)
     for _ in range(ROUNDS):
@@ -354,9 +338,7 @@ def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: fl
 
 
 def _agreement(c: Array, d: Array, focal: float, inverse: Array) -> Array:
-    """Return weights [views, points] for iteratively reweighted least squares that minimise the
-    robust L1 norm.
-    """
+    """Return weights [views, points] for iteratively reweighted least squares that minimise the robust L1 norm."""
     return np.asarray(TRACK_ERROR_PX / np.maximum(_off_px(c, d, focal, inverse), TRACK_ERROR_PX))
 
 
@@ -373,23 +355,17 @@ SHORTEST_BASELINE = 0.1
 WIDEST_TURN = 0.7
 """Smallest cosine between the optical axes of two cameras that are compared."""
 LABEL_PX = 0.75
-"""Parallax between neighbouring distances of the sweep, in pixels of the view with the most
-parallax.
-"""
+"""Parallax between neighbouring distances of the sweep, in pixels of the view with the most parallax."""
 LABELS = 24, 96
 """Fewest and most distances of a sweep."""
 MARGIN = 1.6
 """Factor by which the sweep extends the range of the corners' distances at both ends."""
 WORST_COST, BEST_COST = 0.35, 0.15
-"""Mean matching cost ((1 - ZNCC) / 2) at which the confidence is 0, and below which it is not
-reduced.
-"""
+"""Mean matching cost ((1 - ZNCC) / 2) at which the confidence is 0, and below which it is not reduced."""
 UNIQUE = 0.2
 """Relative cost margin to any other depth from which the confidence is not reduced."""
 SMALLEST_PATCH = 0.0014
-"""Smallest connected patch of confident depth, as a share of the picture; smaller ones are chance
-matches.
-"""
+"""Smallest connected patch of confident depth, as a share of the picture; smaller ones are chance matches."""
 MOST_OWN_MOTION = 0.06
 """Tissue motion as a share of the parallax from which on depth has confidence 0. The confidence is 1 up to half
 this share and decreases linearly between the two.
@@ -401,9 +377,7 @@ FILLED = 0.2
 
 
 def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
-    """Reduce a frame so that no side is longer than `longest_px`. `camera` is the frame's camera
-    with its pose.
-    """
+    """Reduce a frame so that no side is longer than `longest_px`. `camera` is the frame's camera with its pose."""
     height, width = frame.image.shape[:2]
     scale = min(1.0, longest_px / max(height, width))
     small = camera.scaled(scale)
@@ -447,9 +421,8 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
         size: height and width of the result.
 
     Returns:
-        Depth in the unit of the poses. The map is rejected if the poses contradict the pictures. If
-            the tissue itself moves too much, all confidences are low and the depth is only a rough
-            start value.
+        Depth in the unit of the poses. The map is rejected if the poses contradict the pictures. If the tissue itself
+        moves too much, all confidences are low and the depth is only a rough start value.
     """
     others = chosen_views(reference, candidates)
     if not others:
@@ -474,9 +447,7 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
 
 
 def _distances(found: Parallax) -> NDArray[np.float64]:
-    """Return evenly spaced inverse depths over the tissue's range; parallax is linear in inverse
-    depth.
-    """
+    """Return evenly spaced inverse depths over the tissue's range; parallax is linear in inverse depth."""
     low, high = np.percentile(found.inverse_depths, [2, 98])
     low, high = low / MARGIN, high * MARGIN
     span_px = found.parallax_px * (high - low) / found.plane
@@ -516,11 +487,9 @@ def _at_full_size(inverse: NDArray[np.float32], confidence: NDArray[np.float32],
 
 
 STREAM_PX = 160
-"""Longest side of the compared pictures in pixels; smaller than offline to keep up with the stream.
-"""
+"""Longest side of the compared pictures in pixels; smaller than offline to keep up with the stream."""
 MOST_KEY_FRAMES = 8
-"""Largest number of key frames. When it is exceeded, one of the two closest key frames is removed.
-"""
+"""Largest number of key frames. When it is exceeded, one of the two closest key frames is removed."""
 MOST_OFFLINE = 32
 """Number of frames of a complete recording that get depth, spread evenly."""
 LONGEST_S = 3.0
@@ -532,9 +501,8 @@ EVERY_S = 0.2
 class ParallaxDepth(Estimator):
     """Depth estimator by parallax for streams, with bounded memory and time per frame.
 
-    Depth is estimated every `EVERY_S` and not for the frames between. A depth map is returned only
-    if it agrees with the previous one (`depth_agreement`). Frames without a pose, and cameras other
-    than pinholes, get no depth.
+    Depth is estimated every `EVERY_S` and not for the frames between. A depth map is returned only if it agrees with
+    the previous one (`depth_agreement`). Frames without a pose, and cameras other than pinholes, get no depth.
     """
 
     origin = PARALLAX
@@ -579,9 +547,7 @@ class ParallaxDepth(Estimator):
         return _confirmed(*_compared(frames, cameras), cameras)
 
     def _confirmed(self, found: DepthMap, camera: Camera, now_s: float) -> DepthMap | None:
-        """Return the depth if it agrees with the previous depth map, a rejected map if not, or None
-        for the first one.
-        """
+        """Return the depth if it agrees with the previous depth map, a rejected map if not, or None for the first one."""
         is_first = self._found_s is None or not 0 <= now_s - self._found_s <= LONGEST_S
         before, self._look = self._look, Look.of(found.depth, found.confidence, camera)
         self._found_s = now_s
@@ -617,9 +583,8 @@ def _apart(one: View, other: View) -> float:
 def _confirmed(frames: list[Frame], doubts: Counter[str], cameras: Sequence[Camera]) -> RecordingDepth:
     """Keep the depth of all frames if most are confirmed by a neighbour, else of none.
 
-    One decision is made for the whole recording, because frames with and without depth would start
-    at different distances. `agree` compares two depth maps. Reasons are added to
-    `doubts`.
+    One decision is made for the whole recording, because frames with and without depth would start at different
+    distances. `agree` compares two depth maps. Reasons are added to `doubts`.
     """
     numbers = [number for number, frame in enumerate(frames) if frame.depth is not None]
     looks = [
@@ -639,9 +604,7 @@ def _confirmed(frames: list[Frame], doubts: Counter[str], cameras: Sequence[Came
 
 
 def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
-    """Estimate depth for key frames assuming static tissue. Returns all frames and the reasons for
-    rejected depth.
-    """
+    """Estimate depth for key frames assuming static tissue. Returns all frames and the reasons for rejected depth."""
     given, doubts = list(frames), Counter[str]()
     views = [view_of(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
     count = min(MOST_OFFLINE, len(frames))

@@ -44,8 +44,7 @@ def at_middles(sums: tuple[Sums, ...], x: Sums, y: Sums, level: Sums | float, re
         sums: windowed sums of `terms_of`, each [h, w].
         x, y: cell centres [h, w].
         level: regularisation of the slope, in squared units of the positions.
-        relative_level: additional regularisation as a share of the positions' variance in the
-            window.
+        relative_level: additional regularisation as a share of the positions' variance in the window.
 
     Returns:
         Values [h, w].
@@ -77,8 +76,7 @@ LEVEL = 1e-3
 
 
 def surface_through(pixels: Array, depth: Array, error: Array, size: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Interpolate a depth map. Planes are fitted to inverse depth, in which planes of the world are
-    linear.
+    """Interpolate a depth map. Planes are fitted to inverse depth, in which planes of the world are linear.
 
     Args:
         pixels: positions [N, 2] as x, y; the first pixel's centre is at 0.5.
@@ -142,8 +140,7 @@ FILL_CELL_PX = 4
 WINDOWS = (0.12, 0.03)
 """Standard deviations of the Gaussian windows, as shares of the picture's width."""
 CELLS_A_WINDOW = 4.0
-"""Standard deviation of a window in grid cells; a wide window uses large cells to limit its cost.
-"""
+"""Standard deviation of a window in grid cells; a wide window uses large cells to limit its cost."""
 LEAST_KNOWN = 0.02
 """Share of a window with known depth at which its plane gets half its weight."""
 TILT_DOUBT = 0.003
@@ -160,8 +157,7 @@ def filled_depth(depth: Plane, known: NDArray[np.bool_]) -> Plane:
         known: bool [H, W].
 
     Returns:
-        float32 [H, W] between half the nearest and twice the farthest known depth; all zero if no
-            depth is known.
+        float32 [H, W] between half the nearest and twice the farthest known depth; all zero if no depth is known.
     """
     height, width = depth.shape
     if not known.any():
@@ -231,8 +227,7 @@ pictures. It is added to the variance that the matcher estimates.
 def with_matched_surface(frame: Frame, camera: Camera) -> Frame:
     """Replace the stereo depth of a frame by a reconstructed surface.
 
-    Pixels without possible depth, such as tools and their surroundings, keep their depth and are
-    ignored by the fit.
+    Pixels without possible depth, such as tools and their surroundings, keep their depth and are ignored by the fit.
 
     Args:
         frame: frame with stereo depth and confidence.
@@ -262,8 +257,7 @@ def smooth_disparity(disparity: Plane, known: NDArray[np.bool_], variance: Plane
         variance: float32 [H, W] in pixels², positive.
 
     Returns:
-        Disparity [H, W] between half the smallest and twice the largest known value; meaningless
-            where unknown.
+        Disparity [H, W] between half the smallest and twice the largest known value; meaningless where unknown.
     """
     least = float(variance[known].min())
     weight = np.where(known, least / variance, 0).astype(np.float32)

@@ -63,8 +63,7 @@ def check_depth(choice: str) -> None:
     """Check a depth source name, and the address if there is one.
 
     Raises:
-        InvalidSetting: for an unknown name, a missing address, or an address that the estimator
-            rejects.
+        InvalidSetting: for an unknown name, a missing address, or an address that the estimator rejects.
     """
     name, colon, address = choice.partition(":")
     if name in WITH_ADDRESS and not address:
@@ -127,9 +126,7 @@ def new_estimator(choice: str) -> Estimator:
 
 
 class Sentences:
-    """Counter of messages about frames. Messages with the same text before the first colon count as
-    one kind.
-    """
+    """Counter of messages about frames. Messages with the same text before the first colon count as one kind."""
 
     def __init__(self) -> None:
         self._first: dict[str, str] = {}
@@ -184,8 +181,7 @@ class DepthFinder:
 
         Args:
             frame: frame to find depth for.
-            shown_only: the frame is displayed but not used for training, so only its own depth is
-                returned.
+            shown_only: the frame is displayed but not used for training, so only its own depth is returned.
         """
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         if (camera.width_px, camera.height_px) != (frame.width_px, frame.height_px):  # a stream may change its size

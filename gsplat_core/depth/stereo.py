@@ -50,9 +50,7 @@ EDGE_ERROR_PX = 1.5
 SMOOTHNESS, SMOOTH_GREY = 100.0, 5.0
 """Strength of the edge-aware filter, and the grey-value step across which it does not smooth."""
 LEAST_VARIANCE_PX2 = 0.05
-"""Lower bound of a disparity's variance in the filter, in pixels²; limits the weight of the best
-values.
-"""
+"""Lower bound of a disparity's variance in the filter, in pixels²; limits the weight of the best values."""
 LEAST_WEIGHT = 1e-4
 """Smallest filtered weight of known disparities for a smoothed disparity to count as known."""
 
@@ -66,9 +64,7 @@ class Disparity:
     known: Tensor
     """Validity, bool [H, W]."""
     error_px: Tensor
-    """Standard deviation in pixels estimated from the pictures, float32 [H, W]; infinite where
-    unknown.
-    """
+    """Standard deviation in pixels estimated from the pictures, float32 [H, W]; infinite where unknown."""
 
 
 @dataclass(frozen=True)
@@ -158,9 +154,7 @@ def enlarged(found: Disparity, width_px: int, height_px: int) -> Disparity:
 COARSE_WIDTH_PX = 200
 """Picture width at which the whole disparity range is searched, in pixels."""
 COARSE_RANGE = (-0.3, 0.5)
-"""Searched disparities as shares of the width. The negative part is implausible and reveals swapped
-eyes.
-"""
+"""Searched disparities as shares of the width. The negative part is implausible and reveals swapped eyes."""
 CORNERS, CORNER_QUALITY, CORNER_APART_PX = 400, 0.01, 7
 SATURATED = 250
 """Grey value from which a pixel counts as saturated."""
@@ -169,15 +163,12 @@ BACK_PX = 0.5
 LEAST_POINTS = 24
 """Fewest points from which a pair is judged."""
 LEAST_SHARE = 0.2
-"""Share of the corners that must be found in the other eye, and share of the found ones that must
-fit the common rows.
+"""Share of the corners that must be found in the other eye, and share of the found ones that must fit the common rows.
 """
 ROW_ERROR_PX = 1.5
 """Row error in pixels above which a point counts as wrongly matched."""
 MOST_SLOPE_PX = 1.0
-"""Largest accepted row difference at the edge of the picture in pixels, relative to the common row
-offset.
-"""
+"""Largest accepted row difference at the edge of the picture in pixels, relative to the common row offset."""
 MOST_OFFSET = 0.03
 """Largest accepted common row offset, as a share of the picture's height."""
 LEAST_DISPARITY_PX = 0.5
@@ -273,9 +264,7 @@ def _levelled(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _coarse_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], at: Points) -> NDArray[np.float32]:
-    """Return approximate disparities [N] at points [N, 2], or the median disparity where none was
-    found.
-    """
+    """Return approximate disparities [N] at points [N, 2], or the median disparity where none was found."""
     factor = max(1.0, left.shape[1] / COARSE_WIDTH_PX)
     size = max(1, round(left.shape[1] / factor)), max(1, round(left.shape[0] / factor))
     small = [np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in (left, right)]
@@ -330,13 +319,9 @@ MATCHED_WIDTH_PX = 800
 more than one of their pixels, and the fit is sub-pixel.
 """
 MARGIN_SHARE, MARGIN_PX = 0.2, 4
-"""Margin of the search range around the observed disparities, as a share of their span and in
-pixels.
-"""
+"""Margin of the search range around the observed disparities, as a share of their span and in pixels."""
 HALF_BELIEVED_PX = 0.5
-"""Standard deviation of a disparity at which its confidence is one half, in pixels of the matched
-pictures.
-"""
+"""Standard deviation of a disparity at which its confidence is one half, in pixels of the matched pictures."""
 SAMPLED_PX = 200
 """Number of samples along a row for the depth range of a picture."""
 LEAST_BELIEVED = 0.05
@@ -370,9 +355,7 @@ class StereoDepth(Estimator):
         self._forget((0, 0))
 
     def work_on(self, device: torch.device | str) -> None:
-        """See `OnDevice`. Matching runs on the device; the occasional check of the pair runs on the
-        CPU.
-        """
+        """See `OnDevice`. Matching runs on the device; the occasional check of the pair runs on the CPU."""
         self._device = torch.device(device)
         self._stream = torch.cuda.Stream(self._device) if self._device.type == "cuda" else None
 
@@ -417,9 +400,7 @@ class StereoDepth(Estimator):
         return found
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> str | None:
-        """Check the pair and update its rows and disparity range. Returns the reason why the pair
-        is unusable, or None.
-        """
+        """Check the pair and update its rows and disparity range. Returns the reason why the pair is unusable, or None."""
         look = look_at(left, right, frame.loss_mask)
         why = look.doubt or _why_implausible(look, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:
@@ -434,9 +415,8 @@ class StereoDepth(Estimator):
     def _widen_to(self, seen: tuple[float, float]) -> None:
         """Extend the search range by the disparities of the last frame.
 
-        Until the next check of the pair the range only grows, by at most one margin. Wrong matches
-        occur anywhere in the range and would otherwise widen it without limit. A stable range also
-        matches similar pictures alike.
+        Until the next check of the pair the range only grows, by at most one margin. Wrong matches occur anywhere in
+        the range and would otherwise widen it without limit. A stable range also matches similar pictures alike.
         """
         assert self._span is not None and self._looked is not None
         least, most = _widened(self._looked)
@@ -500,9 +480,7 @@ class StereoDepth(Estimator):
         return DepthMap(depth, confidence, STEREO, frame.right_camera is not None, remark=self._remark(middle, reach))
 
     def _remark(self, middle: float, reach: float) -> str | None:
-        """Return a remark about corrected row offsets. Their cause may have shifted columns as
-        well.
-        """
+        """Return a remark about corrected row offsets. Their cause may have shifted columns as well."""
         off = float(np.median(self._rows, axis=0)[0])
         if abs(off) < SAID_FROM_PX:
             return None
@@ -578,9 +556,7 @@ def _why_implausible(look: PairLook, parallel_px: float, *, calibrated: bool) ->
 
 
 def reach_of(frame: Frame, camera: Camera) -> float:
-    """Return depth times disparity in millimetres times pixels; in baselines times pixels without a
-    right camera.
-    """
+    """Return depth times disparity in millimetres times pixels; in baselines times pixels without a right camera."""
     baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
     return float(camera.K[0, 0] * baseline)
 
@@ -601,9 +577,7 @@ def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: 
 
 
 def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
-    """Warp the right picture so that each point is in the same row as in the left one; `rows` as in
-    `PairLook`.
-    """
+    """Warp the right picture so that each point is in the same row as in the left one; `rows` as in `PairLook`."""
     if np.abs(rows).sum() < ROWS_FROM_PX:
         return right
     height, width = right.shape

@@ -44,13 +44,9 @@ SPREAD_PX = 0.7
 """Cauchy scale of errors in pixels."""
 ROUNDS = 8
 HEAD_ON = 0.05
-"""Regularising sine of the angle between motion and line of sight; limits the estimate for motion
-seen head-on.
-"""
+"""Regularising sine of the angle between motion and line of sight; limits the estimate for motion seen head-on."""
 LEAST_TOLD = 15.0
-"""Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the
-direction is ambiguous.
-"""
+"""Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the direction is ambiguous."""
 
 
 @dataclass(frozen=True)
@@ -121,9 +117,7 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
 
 
 WINDOW_S = 8.0
-"""Length in seconds of a window in which motion is assumed periodic. Windows of longer recordings
-overlap by half.
-"""
+"""Length in seconds of a window in which motion is assumed periodic. Windows of longer recordings overlap by half."""
 RATE_HZ = 12.5
 """Largest number of frames used per second; several per heart beat."""
 KEY_EVERY_S = 1.2
@@ -138,9 +132,7 @@ MOST_OFF_PX = 1.0
 OWN_MOTION = 3.0
 """Factor from a point's error across its ray to its assumed error along the ray."""
 PULL_FRAMES = 3
-"""Frames before and after, at the sampled rate, in which a tool's pull is assumed to have one
-direction.
-"""
+"""Frames before and after, at the sampled rate, in which a tool's pull is assumed to have one direction."""
 PULL_ERROR = 0.4
 """Relative uncertainty of the depth change caused by a pull."""
 TOO_SHORT = (
@@ -280,9 +272,7 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
 
 
 def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -> tuple[Array, Array]:
-    """Return the relative depth change of pulled points against their periodic motion, and its
-    uncertainty.
-    """
+    """Return the relative depth change of pulled points against their periodic motion, and its uncertainty."""
     tracks = window.tracks
     near = range(max(0, index - PULL_FRAMES), min(len(tracks.times_s), index + PULL_FRAMES))
     seen = [tracks.seen[each] for each in near]
@@ -302,9 +292,7 @@ def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -
 
 
 MOST_PIXELS = 64_000_000
-"""Largest total number of pixels of frames with depth. Each takes 12 bytes here and again in the
-observations.
-"""
+"""Largest total number of pixels of frames with depth. Each takes 12 bytes here and again in the observations."""
 NEEDS_ALL_FRAMES = "depth of breathing tissue is estimated from a complete recording, by `intrasplat reconstruct`"
 
 

@@ -68,13 +68,10 @@ class LocalShares:
     def __init__(self, settings: SharesSettings) -> None:
         self._settings = settings
         self._products: NDArray[np.float32] | None = None
-        """Products of the predictions with each other and with the observation, [h, w, K, K + 1].
-        """
+        """Products of the predictions with each other and with the observation, [h, w, K, K + 1]."""
 
     def learn(self, guesses: Sequence[Field], came: Field, weight: NDArray[np.float32]) -> None:
-        """Add an observation `came` [h, w, channels] of earlier predictions, with pixel weights [h,
-        w].
-        """
+        """Add an observation `came` [h, w, channels] of earlier predictions, with pixel weights [h, w]."""
         fields = [*guesses, came]
         count, size = len(guesses), cells_for(came.shape)
         products = np.empty((size[1], size[0], count, count + 1), np.float32)
@@ -171,9 +168,7 @@ class SimilarMoments:
         self._unlike[self._taken :] = np.inf
 
     def next_motions(self) -> list[Weighted]:
-        """Return the motions after the moments most similar to now with weights summing to 1; empty
-        without any.
-        """
+        """Return the motions after the moments most similar to now with weights summing to 1; empty without any."""
         newest = self._taken - 1
         kept = np.arange(max(0, self._taken - REMEMBERED + 1), newest - SOONEST)
         unlike = self._unlike[kept % REMEMBERED]
@@ -277,9 +272,7 @@ class ExpectedPicture:
 
 
 def origin(motion: Flow) -> Flow:
-    """Invert a flow: return for each cell the displacement in pixels that brought its content
-    there.
-    """
+    """Invert a flow: return for each cell the displacement in pixels that brought its content there."""
     came = motion
     for _ in range(INVERSE_STEPS):
         came = _looked_up(motion, np.asarray(came / CELL_PX, np.float32))
@@ -307,9 +300,7 @@ def _looked_up(field: Field, back: Field) -> Field:
 REFERENCE_S = 1 / 30
 """Unit interval of stored motions in seconds."""
 MOTION_SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, pull=4.0, ridge=0.2)
-"""Settings for the shares of the last motion and of motions after similar moments, in squared
-pixels.
-"""
+"""Settings for the shares of the last motion and of motions after similar moments, in squared pixels."""
 COLOUR_STEPS = 16
 """Iterations of the colour fit of moved Gaussians to the expected picture."""
 
@@ -326,12 +317,11 @@ class Expectation:
 
 
 class LearnedPrior(FlowPrior):
-    """Motion prior that mixes the last motion with those after earlier similar moments, and lets
-    colours return to their mean.
+    """Motion prior that mixes the last motion with those after earlier similar moments, and lets colours return to
+    their mean.
 
-    The mixture is learned on the host from earlier predictions in the picture, and applied to
-    Gaussians on the device. It assumes a static camera; for a moving one it behaves like
-    `FlowPrior`.
+    The mixture is learned on the host from earlier predictions in the picture, and applied to Gaussians on the device.
+    It assumes a static camera; for a moving one it behaves like `FlowPrior`.
     """
 
     def forget(self) -> None:

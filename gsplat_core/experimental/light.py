@@ -36,8 +36,7 @@ class LightWindow:
         Args:
             grid: cell grid.
             key: look from which tissue is tracked.
-            before: earlier looks in temporal order. Looks up to the last one that cannot be tracked
-                are dropped.
+            before: earlier looks in temporal order. Looks up to the last one that cannot be tracked are dropped.
         """
         self._grid = grid
         self.looks = [key]
@@ -88,25 +87,20 @@ EVERY_S = 0.3
 MOST_LOOKS = 12
 """Largest number of looks fitted together."""
 NEWEST = 0.2
-"""Least weight of the newest relief relative to the tracked earlier one. The first few estimates
-are averaged equally.
+"""Least weight of the newest relief relative to the tracked earlier one. The first few estimates are averaged equally.
 """
 LEAST_SEEN = 0.25
 """Share of the picture that must be tissue, neither under- nor overexposed."""
 ERROR = 0.05
 """Standard deviation of log brightness caused by pigment and model errors."""
 REACH = 0.05
-"""Distance from usable cells at which the confidence halves, as a share of the picture's longer
-side.
-"""
+"""Distance from usable cells at which the confidence halves, as a share of the picture's longer side."""
 UNSEEN = "too little of the picture is well exposed tissue for depth by shading"
 FLAT = "brightness does not change more than pigment could explain, so depth by shading is no better than a plane"
 
 
 class LightDepth(Estimator):
-    """Depth estimator by shading for one stream. It tracks the tissue while the scope does not
-    move.
-    """
+    """Depth estimator by shading for one stream. It tracks the tissue while the scope does not move."""
 
     origin = LIGHT
     evidence = "light and shade"
@@ -196,9 +190,7 @@ def share_of_distance(grid: Grid, reliefs: Array) -> float:
 
 
 def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, int]) -> DepthMap:
-    """Return the depth map of size [H, W] for a relief. `share` is the confidence in the relief as
-    a whole, 0 to 1.
-    """
+    """Return the depth map of size [H, W] for a relief. `share` is the confidence in the relief as a whole, 0 to 1."""
     logarithm = (Places.at(grid, *grid.middles()).value @ relief).reshape(grid.height, grid.width)
     return DepthMap(
         _enlarged(RELATIVE_DISTANCE * np.exp(logarithm), size),

@@ -58,9 +58,7 @@ OUTSIDE = 0.15
 AMPLITUDE = 0.04
 """Prior standard deviation of the motion, relative to the tissue's distance."""
 BEND = 0.008
-"""Prior standard deviation of a node's vector from the mean of its neighbours, relative to the
-distance.
-"""
+"""Prior standard deviation of a node's vector from the mean of its neighbours, relative to the distance."""
 RELIEF = 0.5
 """Prior standard deviation of the points' depth from the median, relative to it."""
 SPREAD_PX = 0.5
@@ -68,9 +66,7 @@ SPREAD_PX = 0.5
 TRACK_PX = 0.35
 """Standard deviation of a tracked position in pixels."""
 TOGETHER = 3.0
-"""Number of consecutive observations with the same error; errors of neighbouring times are
-correlated.
-"""
+"""Number of consecutive observations with the same error; errors of neighbouring times are correlated."""
 ALIKE = 3.0
 """Factor by which depth errors exceed those of independent points. Light that moves with the scope
 shifts neighbouring points alike.
@@ -126,8 +122,7 @@ def fitted(
     Args:
         tracks: observations of N points.
         frequencies_hz: frequencies of the motion; empty for static tissue.
-        begin: rest positions [N, 3] to start from; None for a sphere around the cameras with the
-            best-fitting radius.
+        begin: rest positions [N, 3] to start from; None for a sphere around the cameras with the best-fitting radius.
         rounds: number of Gauss-Newton steps.
         nodes: size of the vector grid.
     """
@@ -227,9 +222,7 @@ class _Fit:
         self._error = ALIKE * np.sqrt(variance) / self._distance
 
     def _field(self, S: Array, s: Array, nodes: Array) -> tuple[Array, Array]:
-        """Return vectors at the nodes [nodes, 3 * 2 F], and the covariance of all of them in the
-        order (vector, node).
-        """
+        """Return vectors at the nodes [nodes, 3 * 2 F], and the covariance of all of them in the order (vector, node)."""
         size, count = S.shape[1], nodes.shape[1]
         whole = np.zeros((size, count, size, count))
         for row in range(size):
@@ -345,12 +338,9 @@ def _gathered(values: Array, where: NDArray[np.integer], size: tuple[int, int]) 
 BREATHING_HZ = 0.1, 0.8
 HEART_HZ = 0.8, 3.0
 LEAST_CYCLES = 0.6
-"""Fewest cycles over the recording of the slowest frequency tried; slower motion cannot be
-distinguished from drift.
-"""
+"""Fewest cycles over the recording of the slowest frequency tried; slower motion cannot be distinguished from drift."""
 STEP_CYCLES = 0.25
-"""Spacing of the tried frequencies in cycles over the recording; closer ones are indistinguishable.
-"""
+"""Spacing of the tried frequencies in cycles over the recording; closer ones are indistinguishable."""
 COARSE, FINE = (5, 5), (8, 7)
 """Node counts of the motion fits used for comparison: in the coarse search and near the optimum."""
 POINTS, TIMES = 400, 48
@@ -369,17 +359,13 @@ class Frequencies:
     """Frequencies of the tissue's motion, with the uncertainty of the depth."""
 
     hz: tuple[float, ...]
-    """Empty for static tissue, otherwise the breathing frequency, or the breathing and heart
-    frequencies.
-    """
+    """Empty for static tissue, otherwise the breathing frequency, or the breathing and heart frequencies."""
     error: float
     """Relative change of the tissue's depth between equally plausible frequencies."""
 
 
 def found_in(tracks: GridTracks) -> Frequencies:
-    """Find the frequencies that best explain the tracks; none if static tissue explains them nearly
-    as well.
-    """
+    """Find the frequencies that best explain the tracks; none if static tissue explains them nearly as well."""
     few = _few(tracks)
     still = fitted(few, (), rounds=2 * ROUNDS, nodes=COARSE)
     rest = still.terms[:, :, 0]
@@ -430,9 +416,7 @@ def _changed(best: PeriodicMotion, which: int, change: float) -> tuple[float, ..
 
 
 def _spread(tried: Iterable[PeriodicMotion], best: PeriodicMotion, tracks: GridTracks) -> float:
-    """Return the largest median relative depth difference between the best fit and all equally
-    plausible fits.
-    """
+    """Return the largest median relative depth difference between the best fit and all equally plausible fits."""
     pose = tracks.poses[len(tracks.poses) // 2]
     depths = [each.terms[:, :, 0] @ pose[2, :3] + pose[2, 3] for each in tried if each.cost <= AS_GOOD * best.cost]
     return float(max(np.median(np.abs(depth / depths[-1] - 1)) for depth in depths))

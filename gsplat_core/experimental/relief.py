@@ -45,13 +45,10 @@ Array = NDArray[np.float64]
 HALF_WAVES = 9
 """Half periods of the finest cosine along the longer side."""
 SOFTNESS = 0.25
-"""Fill light by subsurface scattering and surrounding walls: cos θ is replaced by (cos θ +
-SOFTNESS) / (1 + SOFTNESS).
+"""Fill light by subsurface scattering and surrounding walls: cos θ is replaced by (cos θ + SOFTNESS) / (1 + SOFTNESS).
 """
 ROUND = 0.1
-"""Angle in radians below which differences hardly affect highlights, since fine bumps are never all
-level.
-"""
+"""Angle in radians below which differences hardly affect highlights, since fine bumps are never all level."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +71,7 @@ class Grid:
 
     @property
     def waves(self) -> list[tuple[int, int, float]]:
-        """Half periods of each cosine down and across, and along the longer side. The constant is
-        excluded.
-        """
+        """Half periods of each cosine down and across, and along the longer side. The constant is excluded."""
         longer = max(self.height, self.width)
         all_waves = ((j, i) for j in range(HALF_WAVES) for i in range(HALF_WAVES))
         counted = [(j, i, float(np.hypot(i * longer / self.width, j * longer / self.height))) for j, i in all_waves]
@@ -140,9 +135,7 @@ class Appearance:
     """Logarithm of brightness [places]."""
     lit_by: Array
     angle: Array
-    """Angle between normal and ray [places], approximately in radians and rounded off near zero
-    (`ROUND`).
-    """
+    """Angle between normal and ray [places], approximately in radians and rounded off near zero (`ROUND`)."""
     angle_by: Array
 
 
@@ -186,9 +179,7 @@ FINER_HALF_WAVES, FINER_POWER = 1.5, 4.0
 FINER_HALF_WAVES)²) ** (-FINER_POWER / 2).
 """
 PIGMENT = 0.5
-"""Prior standard deviation of the coarse cosines of remaining pigment, in units of
-`Shading.detail`.
-"""
+"""Prior standard deviation of the coarse cosines of remaining pigment, in units of `Shading.detail`."""
 PIGMENT_HALF_WAVES = 2.0
 """Number of half waves beyond which the pigment's prior falls quadratically."""
 FALL_OFF, FALL_OFF_DEVIATION = 1.0, 0.5
@@ -200,13 +191,9 @@ CHANGES_TELL = 0.3
 cells are correlated and carry no relief information.
 """
 RARER, RARER_DEVIATION = 12.0, 0.4
-"""Prior of the decay rate of highlights with the angle, per radian, and the standard deviation of
-its logarithm.
-"""
+"""Prior of the decay rate of highlights with the angle, per radian, and the standard deviation of its logarithm."""
 GLINT_LOOKS = 4.0
-"""Effective number of independent highlight pictures; slowly moving tissue repeats highlights at
-the same positions.
-"""
+"""Effective number of independent highlight pictures; slowly moving tissue repeats highlights at the same positions."""
 GLINT_CELL_SHARE = 1 / 64
 """Size of one highlight as a share of a cell."""
 FEWEST_GLINTS = 0.3
@@ -418,9 +405,7 @@ def find_reliefs(grid: Grid, shadings: Sequence[Shading], followed: Sequence[Cha
 
 
 def find_change(grid: Grid, key: Array, change: Change) -> Array:
-    """Return the change of the coefficients [cosines] for one time, with the relief of the key time
-    fixed.
-    """
+    """Return the change of the coefficients [cosines] for one time, with the relief of the key time fixed."""
     followed, added = Followed(grid, change), np.zeros(len(key))
     for _ in range(ROUNDS_OF_CHANGE):
         followed.equations(key, added)

@@ -48,15 +48,11 @@ LEAST_KNOWN = 0.3
 LEAST_DETAIL = 0.01
 """Lower bound of `Shading.detail`, the least noise of any picture."""
 LEAST_RED = 0.1
-"""Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable.
-"""
+"""Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable."""
 GLINT = 0.35
-"""Smallest excess of white over the surroundings of a highlight, relative to the surroundings'
-brightness.
-"""
+"""Smallest excess of white over the surroundings of a highlight, relative to the surroundings' brightness."""
 SURROUNDINGS = 0.025
-"""Standard deviation of the window for a highlight's surroundings, as a share of the longer side.
-"""
+"""Standard deviation of the window for a highlight's surroundings, as a share of the longer side."""
 BESIDE_TOOL_EDGE = 0.0125
 """Margin around tools excluded from the search for highlights, as a share of the longer side."""
 
@@ -66,15 +62,11 @@ class Cells:
     """Brightness of a picture's cells."""
 
     brightness: NDArray[np.float64]
-    """Log brightness without pigment up to an offset, [h, w]; meaningless where `share` is too
-    small.
-    """
+    """Log brightness without pigment up to an offset, [h, w]; meaningless where `share` is too small."""
     share: NDArray[np.float64]
     """Share of usable pixels in each cell, [h, w]."""
     detail: float
-    """Standard deviation of brightness between neighbouring cells caused by remaining pigment and
-    noise.
-    """
+    """Standard deviation of brightness between neighbouring cells caused by remaining pigment and noise."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -121,9 +113,7 @@ class SmallPicture:
     def averaged(
         self, values: NDArray[np.float32], weight: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Average values [H, W] or [H, W, C] with weights [H, W] over the cells; also returns the
-        mean weights [h, w].
-        """
+        """Average values [H, W] or [H, W, C] with weights [H, W] over the cells; also returns the mean weights [h, w]."""
         share = cv2.resize(weight, self.cells, interpolation=cv2.INTER_AREA).astype(np.float64)
         weighted = values * (weight if values.ndim == 2 else weight[..., None])
         total = cv2.resize(weighted, self.cells, interpolation=cv2.INTER_AREA).astype(np.float64)
@@ -178,9 +168,7 @@ def _glints(picture: SmallPicture) -> NDArray[np.float32]:
 
 
 def _least_pigment(steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return channel weights [3], summing to 1, that minimise the mean square of the weighted
-    `steps` [N, 3].
-    """
+    """Return channel weights [3], summing to 1, that minimise the mean square of the weighted `steps` [N, 3]."""
     covariance = steps.T @ steps / max(len(steps), 1) + 1e-5 * np.eye(3)
     weights = np.linalg.solve(covariance, np.ones(3))
     return np.asarray(weights / weights.sum())
@@ -214,9 +202,7 @@ def _shrunk(tissue: NDArray[np.uint8], margin_px: float) -> NDArray[np.uint8]:
 
 
 def _log_light() -> NDArray[np.float32]:
-    """Return the log light of each level [256]: inverse sRGB curve (IEC 61966-2-1), then inverse
-    shoulder.
-    """
+    """Return the log light of each level [256]: inverse sRGB curve (IEC 61966-2-1), then inverse shoulder."""
     level = np.arange(256) / 255
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     return np.log(np.maximum(-np.log1p(-SHOULDER * linear) / SHOULDER, 1e-4)).astype(np.float32)

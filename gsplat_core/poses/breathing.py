@@ -1,7 +1,7 @@
 """Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the tissue.
 
-The breathing and heart frequencies are searched for without a known trajectory. A test shows whether the scope's own motion can be separated from
-breathing at all.
+The breathing and heart frequencies are searched for without a known trajectory. A test shows whether the scope's own
+motion can be separated from breathing at all.
 
 Test of whether the scope's own motion can be separated from breathing.
 
@@ -13,12 +13,11 @@ frequency. A scope that moves nearly as fast as the tissue breathes shows at bot
 Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the points.
 
 Poses estimated for static tissue contain its breathing. This module searches for breathing and heart frequencies that
-explain the observations better. It then optimises cameras, points and periodic motion
-together (`moving_bundle`). A prior of the scope's trajectory (`trajectory_prior`) is re-estimated as the trajectory
-improves.
+explain the observations better. It then optimises cameras, points and periodic motion together (`moving_bundle`). A
+prior of the scope's trajectory (`trajectory_prior`) is re-estimated as the trajectory improves.
 
-There is no result if no frequency explains the observations clearly better, if the recording shows less than one and
-a half breaths, or if the scope itself moves nearly as fast as the tissue.
+There is no result if no frequency explains the observations clearly better, if the recording shows less than one and a
+half breaths, or if the scope itself moves nearly as fast as the tissue.
 """
 
 from __future__ import annotations
@@ -53,9 +52,7 @@ A smooth scope trajectory explains less than `LEAST_CYCLES` equally well. Slower
 still tried, because otherwise their double would win.
 """
 STEP_CYCLES = 0.25
-"""Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the
-heart.
-"""
+"""Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the heart."""
 SPREAD = 0.007
 """Cauchy scale of ray errors (x / z)."""
 ROUNDS = 2
@@ -160,9 +157,7 @@ def _tried(
     spread: float = SPREAD,
     prior: TrajectoryPrior | None = None,
 ) -> _Try:
-    """Adjust a start bundle that already contains all of these frequencies, or all but the last
-    one.
-    """
+    """Adjust a start bundle that already contains all of these frequencies, or all but the last one."""
     return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, prior))
 
 
@@ -216,9 +211,7 @@ def separability(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[fl
 
 
 def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[float]) -> float:
-    """Return the root mean square motion at the first frequency beyond that of a trajectory like
-    `like`.
-    """
+    """Return the root mean square motion at the first frequency beyond that of a trajectory like `like`."""
     swings = waves(times_s, hz)
     prior = learned_from(like, times_s, swings)
     y, _ = coordinates(poses)
@@ -237,13 +230,10 @@ EVERY_S = 0.4
 FEWEST_FRAMES, MOST_FRAMES = 40, 150
 LONGEST_S = MOST_FRAMES * EVERY_S
 POINTS, LEAST_SEEN = 600, 5
-"""Number of points used, most often observed first, and the least number of observations of each.
-"""
+"""Number of points used, most often observed first, and the least number of observations of each."""
 FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
-"""Accepted initial depths relative to the median; points outside this range start at the median
-depth.
-"""
+"""Accepted initial depths relative to the median; points outside this range start at the median depth."""
 FINEST = 0.0017
 STAGES = (
     (0.014, 3, 0.0),
@@ -254,9 +244,8 @@ STAGES = (
     (FINEST, 3, 0.015),
     *((FINEST, 4, 0.0),) * 9,
 )
-"""Optimisation stages: Cauchy scale of ray errors (x / z), number of steps, and the frequency
-spacing in cycles over the recording for the refinement that follows (0 = none). The trajectory
-prior is re-estimated before each stage.
+"""Optimisation stages: Cauchy scale of ray errors (x / z), number of steps, and the frequency spacing in cycles over
+the recording for the refinement that follows (0 = none). The trajectory prior is re-estimated before each stage.
 """
 FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 40, 16
 """Size of the reduced problem on which frequencies are searched."""
@@ -271,9 +260,7 @@ GOLDEN = 0.5 * (5**0.5 - 1)
 
 @dataclass(frozen=True)
 class Sightings:
-    """Point observations of all frames with a static reconstruction. The unit of length is about
-    the points' distance.
-    """
+    """Point observations of all frames with a static reconstruction. The unit of length is about the points' distance."""
 
     frame: Tensor
     """Frame index of each observation, int64 [K], ascending."""
@@ -355,8 +342,7 @@ def refined(
         frequencies_hz: start values of the frequencies.
 
     Returns:
-        The adjusted bundle, the refined frequencies in Hz, and the trajectory prior learned from
-            the result.
+        The adjusted bundle, the refined frequencies in Hz, and the trajectory prior learned from the result.
     """
     bundle, hz = with_waves(start, waves(times_s, frequencies_hz)), frequencies_hz
     for spread, rounds, cycles in STAGES:

@@ -98,9 +98,7 @@ SPREAD_PX = 1.0
 """Smallest Cauchy scale in pixels, used in the last rounds."""
 ROUNDS, LAST_ROUNDS = 8, 3
 PLACEMENT_DONE = 1e-5
-"""Step length, in radians plus translation relative to the median depth, below which the iteration
-ends.
-"""
+"""Step length, in radians plus translation relative to the median depth, below which the iteration ends."""
 Array = NDArray[np.float64]
 
 
@@ -140,9 +138,7 @@ def placed(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Ar
 
 
 def moved(pose: Array, twist: Array) -> Array:
-    """Apply a small twist (translation [3], rotation vector [3]) in camera coordinates: `exp(twist)
-    @ pose`.
-    """
+    """Apply a small twist (translation [3], rotation vector [3]) in camera coordinates: `exp(twist) @ pose`."""
     along, turn = twist[:3], twist[3:]
     angle = max(float(np.linalg.norm(turn)), 1e-12)
     cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
@@ -213,8 +209,7 @@ def adjust(
 
     Args:
         bundle: start values.
-        fixed: bool [C], cameras that keep their pose. At least one must be fixed, or the whole
-            scene may drift.
+        fixed: bool [C], cameras that keep their pose. At least one must be fixed, or the whole scene may drift.
         rounds: maximum number of Levenberg-Marquardt steps.
         spread_px: Cauchy scale in pixels; errors well above it have little influence.
         points_move: optimise the points as well. If False, each camera is optimised independently.
@@ -232,9 +227,7 @@ def _cost(bundle: Bundle, spread_px: float) -> float:
 
 
 def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
-    """Return residuals [M, 2] in pixels, points in camera coordinates [M, 3] and camera rotations
-    [M, 3, 3].
-    """
+    """Return residuals [M, 2] in pixels, points in camera coordinates [M, 3] and camera rotations [M, 3, 3]."""
     pose = bundle.poses[bundle.camera]
     rotation = pose[:, :3, :3]
     local = (rotation @ bundle.points[bundle.point][:, :, None])[:, :, 0] + pose[:, :3, 3]

@@ -28,9 +28,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import one_thread
 
 SHORTEST, LONGEST = 0.6, 1.6
-"""Bounds of the search in units of the picture's longer side, corresponding to fields of view of
-80° and 35°.
-"""
+"""Bounds of the search in units of the picture's longer side, corresponding to fields of view of 80° and 35°."""
 CANDIDATES = 8
 """Focal lengths tried between the bounds, in equal ratios, before refinement."""
 REFINEMENTS = 4
@@ -47,13 +45,9 @@ LEAST_SEEN = 3
 LEAST_POINTS = 50
 ROUNDS = 60
 OUTLIER_PX = (4.0, 3.0)
-"""Reprojection errors above which observations are rejected after the first and the second
-adjustment, in pixels.
-"""
+"""Reprojection errors above which observations are rejected after the first and the second adjustment, in pixels."""
 NEAREST = 0.05
-"""Share of the median depth below which a point counts as wrongly triangulated; includes points
-behind the camera.
-"""
+"""Share of the median depth below which a point counts as wrongly triangulated; includes points behind the camera."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +58,7 @@ class FocalLength:
     best_px: float
     """Focal length with the least error."""
     range_px: tuple[float, float]
-    """Lowest and highest plausible focal length. At a bound of the search the true range may be
-    wider.
-    """
+    """Lowest and highest plausible focal length. At a bound of the search the true range may be wider."""
     known: bool
     """True if the range is narrow and away from the bounds of the search."""
 
@@ -76,8 +68,7 @@ def focal_length_of(frames: Iterable[Frame], camera: Camera, found: Trajectory) 
 
     Args:
         frames: the frames from which `found` was estimated, iterated a second time.
-        camera: assumed pinhole camera with one focal length for both axes; its principal point is
-            kept.
+        camera: assumed pinhole camera with one focal length for both axes; its principal point is kept.
         found: trajectory estimated with `camera`.
 
     Returns:
@@ -112,9 +103,7 @@ def trajectory_without_calibration(
 
 
 def with_focal_length(camera: Camera, focal_px: float) -> Camera:
-    """Return a pinhole camera with the same principal point and pose but another focal length in
-    pixels.
-    """
+    """Return a pinhole camera with the same principal point and pose but another focal length in pixels."""
     K = camera.K.copy()
     K[0, 0] = K[1, 1] = focal_px
     return Camera(K, camera.width_px, camera.height_px, camera.world_to_camera)
@@ -151,9 +140,7 @@ def _search(start: Bundle, side_px: float) -> FocalLength:
 
 
 def _refine(tries: dict[float, _Try], tried: Callable[[float, _Try], _Try]) -> None:
-    """Refine by golden-section search between the neighbours of the best candidate, on a
-    logarithmic scale.
-    """
+    """Refine by golden-section search between the neighbours of the best candidate, on a logarithmic scale."""
     ordered = sorted(tries)
     at = min(range(len(ordered)), key=lambda number: tries[ordered[number]].cost)
     low, high = ordered[max(at - 1, 0)], ordered[min(at + 1, len(ordered) - 1)]
@@ -229,9 +216,7 @@ def _with_focal(bundle: Bundle, focal_px: float) -> Bundle:
 
 
 def _triangulated(poses: Tensor, camera: Tensor, point: Tensor, rays: Tensor, count: int) -> Tensor:
-    """Triangulate points [count, 3] by linear least squares (Hartley and Zisserman 2004, section
-    12.2).
-    """
+    """Triangulate points [count, 3] by linear least squares (Hartley and Zisserman 2004, section 12.2)."""
     pose = poses[camera]
     rows = pose[:, :2, :3] - rays[:, :, None] * pose[:, 2:3, :3]
     right = rays * pose[:, 2:3, 3] - pose[:, :2, 3]
@@ -243,9 +228,7 @@ def _triangulated(poses: Tensor, camera: Tensor, point: Tensor, rays: Tensor, co
 
 
 def _without_outliers(bundle: Bundle, limit_px: float) -> Bundle:
-    """Remove observations with large errors or implausible depths, and points left with too few
-    observations.
-    """
+    """Remove observations with large errors or implausible depths, and points left with too few observations."""
     pose = bundle.poses[bundle.camera]
     depth = (pose[:, 2, :3] * bundle.points[bundle.point]).sum(1) + pose[:, 2, 3]
     kept = (errors_px(bundle) < limit_px) & (depth > NEAREST * depth.median())

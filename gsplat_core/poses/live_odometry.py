@@ -38,9 +38,7 @@ from gsplat_core.scene.depth_origin import BELIEVED, RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 RETURN_PX, ROWS_PX = 0.5, 1.5
-"""Largest accepted forward-backward error and row difference of a point tracked to the right eye,
-in pixels.
-"""
+"""Largest accepted forward-backward error and row difference of a point tracked to the right eye, in pixels."""
 LEAST_DISPARITY_PX = 0.5
 
 
@@ -91,9 +89,7 @@ FITTING = 0.4
 GIVEN_UP_PX = 8.0
 """Reprojection error in pixels above which a point is no longer tracked."""
 MOVED_PX = 16.0
-"""Median displacement of the points since the last key frame from which a new one is added, in
-pixels.
-"""
+"""Median displacement of the points since the last key frame from which a new one is added, in pixels."""
 OFF_PX = 0.4
 """Median reprojection error from which a key frame is added at the earliest `OFF_EVERY` frames
 after the last one, in pixels. A larger error means that the points' positions no longer fit.
@@ -104,13 +100,10 @@ LEFT = 0.7
 ADJUSTED = 2
 """Number of frames after a key frame in which the newest key frames are adjusted."""
 FIRST_KEYS = 6
-"""Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`.
-"""
+"""Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`."""
 FIRST_MOVED_PX = 0.5
 FOLLOWED_KEYS = 3
-"""Nearest earlier key frames whose points are searched at their predicted positions when a key
-frame is added.
-"""
+"""Nearest earlier key frames whose points are searched at their predicted positions when a key frame is added."""
 MATCHED_KEYS, NEAR_KEYS = 2, 12
 """Key frames matched by features when a key frame is added. They are taken in turn from the
 `NEAR_KEYS` nearest ones and the key frames of earlier maps.
@@ -277,9 +270,7 @@ class LiveOdometry:
         return None
 
     def _relocalise(self, picture: SmallPicture) -> bool:
-        """Relocalise a picture that could not be placed by the key frames of all kept maps. Returns
-        True on success.
-        """
+        """Relocalise a picture that could not be placed by the key frames of all kept maps. Returns True on success."""
         maps = [self.map, *self._left]
         found = self._recognition.find(
             picture, [(key, each) for each in maps for key in each.keys[::-1]], MATCHED_WHEN_LOST

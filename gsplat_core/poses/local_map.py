@@ -30,9 +30,7 @@ MOST_KEY_FRAMES = 40
 NEIGHBOURS = 5
 """Known points around a new one whose median depth initialises it."""
 MOST_SIGHTINGS = 1500
-"""Budget of observations per adjustment: the number of steps is this divided by the observations of
-the window ...
-"""
+"""Budget of observations per adjustment: the number of steps is this divided by the observations of the window ..."""
 MOST_ROUNDS = 5
 """... but at most this many steps."""
 
@@ -78,9 +76,7 @@ class LocalMap:
         return np.isin(numbers, self._numbers)
 
     def add_points(self, numbers: Numbers, places: Tensor) -> None:
-        """Add points [N] at world positions [N, 3]. Their numbers must be larger than all earlier
-        ones.
-        """
+        """Add points [N] at world positions [N, 3]. Their numbers must be larger than all earlier ones."""
         self._numbers = np.concatenate([self._numbers, numbers])
         self._points = torch.cat([self._points, places])
 
@@ -98,8 +94,7 @@ class LocalMap:
     def depth_around(
         self, pose: Tensor, rays: NDArray[np.float64], numbers: Numbers, seen: NDArray[np.float64]
     ) -> Tensor:
-        """Return the depth of new points as the median depth of the known points nearest to them in
-        the picture.
+        """Return the depth of new points as the median depth of the known points nearest to them in the picture.
 
         Args:
             pose: world-to-camera pose [4, 4] of the picture.
@@ -118,8 +113,7 @@ class LocalMap:
     def brought_back(self, key: KeyFrame, after: Tensor, scale: float) -> None:
         """Correct the drift accumulated since an earlier key frame that was recognised again.
 
-        The newest key frame and its points get the full correction, those between get a share that
-        grows linearly.
+        The newest key frame and its points get the full correction, those between get a share that grows linearly.
 
         Args:
             key: the recognised key frame.
@@ -139,17 +133,14 @@ class LocalMap:
             each.pose = scaled(each.pose, factor) @ inverse(step)
 
     def earlier(self, position: NDArray[np.float64], most: int) -> list[KeyFrame]:
-        """Return the `most` key frames before the window that are nearest to a position [3],
-        nearest first.
-        """
+        """Return the `most` key frames before the window that are nearest to a position [3], nearest first."""
         before = self.keys[:-WINDOW]
         order = np.argsort([float(np.linalg.norm(key.position - position)) for key in before], kind="stable")
         return [before[index] for index in order[:most]]
 
     def adjust(self) -> None:
-        """Run a few steps of bundle adjustment over the newest key frames. The earliest key frame
-        is fixed. With fewer than two anchors its median point depth is kept as well, because the
-        scale is then free.
+        """Run a few steps of bundle adjustment over the newest key frames. The earliest key frame is fixed. With fewer
+        than two anchors its median point depth is kept as well, because the scale is then free.
         """
         window = self.keys[-WINDOW:]
         anchors = self._anchors(window)
@@ -238,14 +229,11 @@ SHOWN = 0.4
 FOUND = 0.3
 """Share of the searched points that must be found."""
 AGREE, AGREE_PX = 0.5, 4.0
-"""Share of the found points that must agree on a pose, and their largest reprojection error in
-pixels.
-"""
+"""Share of the found points that must agree on a pose, and their largest reprojection error in pixels."""
 FEATURES = 400
 """Largest number of ORB features per picture."""
 CLEARER = 0.8
-"""Largest ratio of the best to the second-best descriptor distance of a match (Lowe's ratio test).
-"""
+"""Largest ratio of the best to the second-best descriptor distance of a match (Lowe's ratio test)."""
 FEWEST_MATCHES, MATCH_PX = 12, 8.0
 """Fewest RANSAC inliers and their largest reprojection error in pixels. The error is large because
 their depth is interpolated from known points.
@@ -316,9 +304,7 @@ class PlaceRecognition:
         self._turn = 0
 
     def find(self, picture: SmallPicture, kept: Sequence[tuple[KeyFrame, LocalMap]], most: int) -> Recognised | None:
-        """Return the first recognised of at most `most` key frames. Candidates rotate from call to
-        call.
-        """
+        """Return the first recognised of at most `most` key frames. Candidates rotate from call to call."""
         candidates = [kept[(self._turn + number) % len(kept)] for number in range(min(most, len(kept)))]
         self._turn += len(candidates)
         if not candidates:

@@ -1,7 +1,7 @@
 """Bundle adjustment of cameras in front of periodically moving tissue.
 
-The trajectory has a prior: smooth, and without a component at the breathing and heart frequencies. Tissue motion is a smooth vector field over the
-surface.
+The trajectory has a prior: smooth, and without a component at the breathing and heart frequencies. Tissue motion is a
+smooth vector field over the surface.
 
 Prior of a scope's trajectory: smooth, and without a component at the breathing and heart frequencies.
 
@@ -17,10 +17,9 @@ The prior is a Gaussian random field with a linear part, which includes rigid mo
 correlation length (kriging with a linear trend). Lengths are in units of the tissue's distance.
 
 The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. The vectors vary
-smoothly over the surface. Cameras, rest positions and vectors are estimated together by
-Levenberg-Marquardt with Cauchy weights, with rest positions eliminated (Schur complement). Rigid motion common to
-tissue and scope is unobservable from pictures; the trajectory prior decides it. The unit of
-length is the tissue's median distance.
+smoothly over the surface. Cameras, rest positions and vectors are estimated together by Levenberg-Marquardt with Cauchy
+weights, with rest positions eliminated (Schur complement). Rigid motion common to tissue and scope is unobservable from
+pictures; the trajectory prior decides it. The unit of length is the tissue's median distance.
 """
 
 from __future__ import annotations
@@ -61,9 +60,7 @@ class TrajectoryPrior:
 
     @one_thread()
     def terms(self, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the Gauss-Newton matrix [6 C, 6 C] and gradient [6 C] of the cost by twists of the
-        cameras.
-        """
+        """Return the Gauss-Newton matrix [6 C, 6 C] and gradient [6 C] of the cost by twists of the cameras."""
         y, by_twist = coordinates(poses)
         pushed = torch.einsum("jts,sj->tj", self.precision, y)
         matrix = torch.einsum("jts,tja,sjb->tasb", self.precision, by_twist, by_twist)
@@ -178,9 +175,7 @@ class SurfaceField:
     middle: Tensor
     """Median position of the points [3]."""
     stiffness: Tensor
-    """Inverse covariance [M, M]; v' stiffness v / 2 is the negative log prior of values v at the
-    nodes.
-    """
+    """Inverse covariance [M, M]; v' stiffness v / 2 is the negative log prior of values v at the nodes."""
 
     @classmethod
     @one_thread()
@@ -225,8 +220,7 @@ RELIEF = 0.3
 NEAREST = 0.05
 """Smallest depth used in projections, in units of the median depth."""
 HELD = 1e3
-"""Stiffness that holds the tissue's common rigid motion constant when there is no trajectory prior.
-"""
+"""Stiffness that holds the tissue's common rigid motion constant when there is no trajectory prior."""
 
 
 @dataclass(frozen=True)
@@ -306,9 +300,7 @@ def _in_unit(bundle: MovingBundle) -> MovingBundle:
 
 
 def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ray residuals [K, 2], points in camera coordinates [K, 3] and camera rotations [K, 3,
-    3].
-    """
+    """Return ray residuals [K, 2], points in camera coordinates [K, 3] and camera rotations [K, 3, 3]."""
     pose = bundle.poses[bundle.camera]
     rotation = pose[:, :3, :3]
     local = (rotation @ bundle.places()[:, :, None])[:, :, 0] + pose[:, :3, 3]

@@ -37,9 +37,7 @@ LEAST_POINTS = 24
 """Fewest known points that a frame must observe to be placed."""
 MOST_FRAMES = 3000
 KEY_FRAMES = 60
-"""Number of key frames of a short recording; longer ones have at least one in `FARTHEST_APART`
-frames.
-"""
+"""Number of key frames of a short recording; longer ones have at least one in `FARTHEST_APART` frames."""
 FARTHEST_APART = 10
 NEIGHBOURS = 5
 """Known points around a new one whose median depth initialises it."""
@@ -71,29 +69,21 @@ class Trajectory:
     error_px: float
     """Median reprojection error in pixels."""
     still_error_px: float
-    """Median distance of observations from their track's median position in pixels: the error of a
-    static scope.
-    """
+    """Median distance of observations from their track's median position in pixels: the error of a static scope."""
     lost: tuple[int, ...]
     """Indices of frames with too few known points; each keeps the pose of the frame before it."""
     breathing: Breathing | None = None
-    """Periodic tissue motion, or None if the tissue is assumed static. Breathing is then part of
-    the poses.
-    """
+    """Periodic tissue motion, or None if the tissue is assumed static. Breathing is then part of the poses."""
 
     @property
     def path(self) -> float:
-        """Length of the trajectory, in the unit in which the first frame's tissue is `RELATIVE_DISTANCE`
-        away.
-        """
+        """Length of the trajectory, in the unit in which the first frame's tissue is `RELATIVE_DISTANCE` away."""
         centres = -np.einsum("nji,nj->ni", self.poses[:, :3, :3], self.poses[:, :3, 3])
         return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
 
     @property
     def explained(self) -> float:
-        """Share of the squared image motion that scope motion and breathing explain; the rest is
-        other tissue motion.
-        """
+        """Share of the squared image motion that scope motion and breathing explain; the rest is other tissue motion."""
         return 1 - (self.error_px / max(self.still_error_px, 1e-9)) ** 2
 
 
@@ -138,9 +128,7 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
 
 
 class _Odometry:
-    """State of one recording's estimate, float64 on the CPU. The same observations give the same
-    bytes.
-    """
+    """State of one recording's estimate, float64 on the CPU. The same observations give the same bytes."""
 
     def __init__(self, seen: Observations, camera: Camera, times_s: list[float]) -> None:
         K, count = camera.K, len(times_s)
@@ -161,9 +149,7 @@ class _Odometry:
 
     @one_thread()
     def run(self) -> Trajectory:
-        """Process all frames in order, then place the frames between key frames again with the
-        final points.
-        """
+        """Process all frames in order, then place the frames between key frames again with the final points."""
         self._take_up(0)
         keys, next_adjustment = 1, 3
         for frame in range(1, self._count):
@@ -270,9 +256,7 @@ class _Odometry:
         )
 
     def _still_errors_px(self) -> Tensor:
-        """Return the distance of each observation from the median position of its track in pixels
-        [M].
-        """
+        """Return the distance of each observation from the median position of its track in pixels [M]."""
         order = torch.argsort(self._point, stable=True)
         point, rays = self._point[order], self._rays[order]
         middles = torch.stack([group.median(0).values for group in rays.split(torch.bincount(point).tolist())])

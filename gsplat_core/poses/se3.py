@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 SMALL = 1e-4
-"""Angle in radians below which Taylor series replace the quotients; the truncation error is below
-float64 precision.
-"""
+"""Angle in radians below which Taylor series replace the quotients; the truncation error is below float64 precision."""
 
 
 def hat(vector: Tensor) -> Tensor:
@@ -68,9 +66,7 @@ def inverse(pose: Tensor) -> Tensor:
 
 
 def between(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """Interpolate poses [..., 4, 4] along one screw motion; `share` 0 gives `first`, 1 gives
-    `second`.
-    """
+    """Interpolate poses [..., 4, 4] along one screw motion; `share` 0 gives `first`, 1 gives `second`."""
     return exp(share * log(second @ inverse(first))) @ first
 
 

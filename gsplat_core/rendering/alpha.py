@@ -32,11 +32,10 @@ from gsplat_core.scene.cameras import Camera
 class AlphaRenderer:
     """Renderer that deforms, projects, sorts and alpha-blends Gaussians (Kerbl et al. 2023).
 
-    On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once
-    for the slot. A `Model` has its own graph, captured by `prepare`. On the CPU, and for
-    fields without a fused frame path, the field's own function deforms the model and
-    `gsplat_core.render` renders it. `Surface` outputs (`ray_depth`, `normals`, `median_depth`,
-    `spread`, `confidence`) take much longer than a picture on any device.
+    On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once for the slot. A
+    `Model` has its own graph, captured by `prepare`. On the CPU, and for fields without a fused frame path, the field's
+    own function deforms the model and `gsplat_core.render` renders it. `Surface` outputs (`ray_depth`, `normals`,
+    `median_depth`, `spread`, `confidence`) take much longer than a picture on any device.
     """
 
     capabilities = Capabilities(
@@ -145,9 +144,7 @@ class _FrameInFlight:
 def _with_surface(
     model: Model, camera: Camera, time_s: float, background: Tensor | None, asked: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """Render surface outputs by single launches, also on a GPU; they are not meant for
-    live frames.
-    """
+    """Render surface outputs by single launches, also on a GPU; they are not meant for live frames."""
     outputs = {**model.surface(time_s, camera)._asdict(), **model.render(time_s, camera, background)._asdict()}
     return {name: outputs[name] for name in asked}
 

@@ -65,12 +65,11 @@ class GraphMemory:
 class CapturedSequence(Generic[Result]):
     """CUDA graph of the launches of `sequence()`.
 
-    Allocations of the sequence keep their addresses. `results` are the same tensors at every
-    replay, which overwrites them. Inputs that change between replays must be in device memory
-    referenced by the sequence.
+    Allocations of the sequence keep their addresses. `results` are the same tensors at every replay, which overwrites
+    them. Inputs that change between replays must be in device memory referenced by the sequence.
 
-    Kernels cannot be loaded during a capture. The sequence must have run before, or `warm_up` runs
-    it once with all its side effects.
+    Kernels cannot be loaded during a capture. The sequence must have run before, or `warm_up` runs it once with all its
+    side effects.
     """
 
     def __init__(
@@ -235,15 +234,13 @@ class LaunchedFrame:
 class FrameRenderer:
     """Repeated renderer of one set of Gaussians with changing camera, time and parameters.
 
-    The number of Gaussians is fixed. `render` enqueues a frame and returns without waiting for the
-    device. Tile lists have a fixed capacity. A frame that exceeds it reports the overflow in its
-    status, and `LaunchedFrame.result` renders it again with a larger capacity. No finished picture
-    lacks a splat.
+    The number of Gaussians is fixed. `render` enqueues a frame and returns without waiting for the device. Tile lists
+    have a fixed capacity. A frame that exceeds it reports the overflow in its status, and `LaunchedFrame.result`
+    renders it again with a larger capacity. No finished picture lacks a splat.
 
-    Tensors of the Gaussians and the field are read in place, so in-place changes affect the next
-    frame. Exceptions are values computed at construction: half-precision spherical harmonics and
-    values that `FrameDeltas.frame_deltas` precomputes. With `recompute` they are computed in every
-    frame.
+    Tensors of the Gaussians and the field are read in place, so in-place changes affect the next frame. Exceptions are
+    values computed at construction: half-precision spherical harmonics and values that `FrameDeltas.frame_deltas`
+    precomputes. With `recompute` they are computed in every frame.
     """
 
     def __init__(
@@ -258,13 +255,12 @@ class FrameRenderer:
     ) -> None:
         """Create a renderer and capture its graph.
 
-        With precision "fp16", SH coefficients, field and blending use half precision. The picture
-        is nearly exact (PSNR in `benchmarks/results/renderer.md`) and faster. `camera` determines
-        size and camera model of every frame, and the pose of those rendered without a camera.
+        With precision "fp16", SH coefficients, field and blending use half precision. The picture is nearly exact (PSNR
+        in `benchmarks/results/renderer.md`) and faster. `camera` determines size and camera model of every frame, and
+        the pose of those rendered without a camera.
 
         Raises:
-            InvalidInput: if the Gaussians are not float32 on a CUDA device, or the precision is
-                unknown.
+            InvalidInput: if the Gaussians are not float32 on a CUDA device, or the precision is unknown.
         """
         if precision not in get_args(Precision):
             raise InvalidInput(f"unknown precision {precision!r}; choose {' or '.join(get_args(Precision))}")

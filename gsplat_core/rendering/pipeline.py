@@ -169,10 +169,9 @@ def view_colors(
 ) -> tuple[Tensor, DenseProjection]:
     """Return the colours [..., C, N, D] seen by each camera; cull Gaussians with non-finite colour.
 
-    On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They
-    have no
-    effect: culled Gaussians are in no tile list, compositing skips non-finite values, and a zero
-    colour gradient adds nothing to the coefficients' gradient.
+    On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They have no effect: culled
+    Gaussians are in no tile list, compositing skips non-finite values, and a zero colour gradient adds nothing to the
+    coefficients' gradient.
     """
     shape = dense.depths.shape
     visible = dense.radii[..., 0] > 0
@@ -209,10 +208,9 @@ def view_colors(
 def camera_centers(viewmats: Tensor) -> Tensor:
     """Return the camera centres [..., 3] of world-to-camera matrices [..., 4, 4].
 
-    This is the translation column of the inverse of any invertible matrix. On CUDA it is computed
-    by Cramer's rule, because `torch.linalg.inv` synchronises with the host to check invertibility.
-    The centre is the vector orthogonal to the first three rows, scaled so that its product with the
-    fourth row is 1.
+    This is the translation column of the inverse of any invertible matrix. On CUDA it is computed by Cramer's rule,
+    because `torch.linalg.inv` synchronises with the host to check invertibility. The centre is the vector orthogonal to
+    the first three rows, scaled so that its product with the fourth row is 1.
     """
     if not viewmats.is_cuda:
         return torch.linalg.inv(viewmats)[..., :3, 3]

@@ -46,15 +46,12 @@ class Capabilities:
 
 
 class PendingFrame(Protocol):
-    """Requested frame, on a GPU possibly still in flight; holds its source data while
-    referenced.
-    """
+    """Requested frame, on a GPU possibly still in flight; holds its source data while referenced."""
 
     def outputs(self) -> Mapping[str, Tensor]:
         """Return the requested outputs by name; waits for the frame on a GPU.
 
-        The renderer owns the memory and may reuse it for its next frame. Copy outputs that must
-        persist.
+        The renderer owns the memory and may reuse it for its next frame. Copy outputs that must persist.
         """
 
     def result(self) -> RenderOutput:
@@ -62,11 +59,10 @@ class PendingFrame(Protocol):
 
 
 class Renderer(Protocol):
-    """Interface of renderers for published models, with one camera size and projection per
-    instance.
+    """Interface of renderers for published models, with one camera size and projection per instance.
 
-    Create with `new_renderer`. Call `prepare` for every published model, then `render` any number
-    of times. Not thread-safe.
+    Create with `new_renderer`. Call `prepare` for every published model, then `render` any number of times. Not
+    thread-safe.
     """
 
     capabilities: ClassVar[Capabilities]

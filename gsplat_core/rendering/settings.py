@@ -130,9 +130,7 @@ class RenderSettings:
 
 
 def check_tensors(arguments: Arguments) -> None:
-    """Raise InvalidInput for a missing, non-floating or wrongly shaped argument of
-    `rasterization`.
-    """
+    """Raise InvalidInput for a missing, non-floating or wrongly shaped argument of `rasterization`."""
     by_covars = arguments.covars is not None
     for name, value in arguments._asdict().items():
         if value is None:

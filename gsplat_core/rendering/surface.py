@@ -55,9 +55,7 @@ class SplatPlanes(NamedTuple):
     """Unit normals [N, 3] in camera axes, towards the camera: the Gaussian's shortest axis."""
 
     def depths_at_origin(self) -> Tensor:
-        """z [N] of each splat's plane at pixel coordinates (0, 0), so that z(u) = this + slopes ·
-        u.
-        """
+        """z [N] of each splat's plane at pixel coordinates (0, 0), so that z(u) = this + slopes · u."""
         return self.rows.depths - (self.slopes * self.rows.means2d).sum(-1)
 
 
@@ -108,9 +106,7 @@ def _conditional(covariance: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _jacobian(local: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
-    """Return the derivative [N, 2, 3] of pixel by camera-space coordinates at the
-    splats' centres.
-    """
+    """Return the derivative [N, 2, 3] of pixel by camera-space coordinates at the splats' centres."""
     fx, fy = intrinsics[0, 0].expand(len(local)), intrinsics[1, 1].expand(len(local))
     x, y, z = local.unbind(-1)
     zero = torch.zeros_like(x)
@@ -232,15 +228,11 @@ def _blended_tile(splats: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor,
 COVERED = 0.1
 """Minimum opacity of an observed pixel."""
 HALVED_AFTER_S = 5.0
-"""Time in seconds after which the confidence in unseen tissue is 1/2; it is 1/3 after
-twice that.
-"""
+"""Time in seconds after which the confidence in unseen tissue is 1/2; it is 1/3 after twice that."""
 
 
 class Surface(NamedTuple):
-    """Surface seen by one camera, in the scene's unit and camera axes (x right, y down,
-    z forward).
-    """
+    """Surface seen by one camera, in the scene's unit and camera axes (x right, y down, z forward)."""
 
     alpha: Tensor
     """Opacity [H, W]."""
@@ -262,9 +254,7 @@ class Surface(NamedTuple):
 
 
 def certainty(unseen_s: Tensor) -> Tensor:
-    """Return the confidence [N] in Gaussians, 0 to 1, by the time [N] in seconds since
-    last seen.
-    """
+    """Return the confidence [N] in Gaussians, 0 to 1, by the time [N] in seconds since last seen."""
     return 1 / (1 + unseen_s / HALVED_AFTER_S)
 
 
@@ -301,9 +291,7 @@ def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None 
 
 
 def _blended(planes: SplatPlanes, lists: TileLists, camera: Camera, certain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Blend per-splat values [H, W, 6 or 7] (depth plane, normal, certainty) and the opacity [H,
-    W].
-    """
+    """Blend per-splat values [H, W, 6 or 7] (depth plane, normal, certainty) and the opacity [H, W]."""
     columns = [planes.depths_at_origin()[:, None], planes.slopes, planes.normals]
     if certain is not None:
         columns.append(certain.to(planes.opacities.dtype)[:, None])

@@ -21,9 +21,8 @@ have missed the deadline, or `at_most` steps were made before it.
 MAX_IN_FLIGHT = 4
 """Steps that may be queued on a GPU while a deadline is watched; enough to keep it busy."""
 TURNS, SECOND_EYE = 4, 2
-"""With two eyes, the third of every four steps trains the second eye. The first eye is the
-displayed one, and the host prepares the second eye's picture while the GPU works on the first
-steps.
+"""With two eyes, the third of every four steps trains the second eye. The first eye is the displayed one, and the host
+prepares the second eye's picture while the GPU works on the first steps.
 """
 
 
@@ -54,9 +53,7 @@ class Budget:
 
     @staticmethod
     def of_steps(steps: int) -> Budget:
-        """Return a budget of a fixed number of steps. The same frames then give the same model on
-        every machine.
-        """
+        """Return a budget of a fixed number of steps. The same frames then give the same model on every machine."""
         return Budget(steps)
 
     @staticmethod
@@ -97,14 +94,10 @@ class Budget:
 
 
 class Spending:
-    """Accounting of one frame's budget: call `allows_step` before each step and `step_made` after
-    it.
-    """
+    """Accounting of one frame's budget: call `allows_step` before each step and `step_made` after it."""
 
     def __init__(self, budget: Budget, step_s: float | None = None) -> None:
-        """Start the accounting. `step_s` is the recent duration of a step in seconds, or None if
-        unknown.
-        """
+        """Start the accounting. `step_s` is the recent duration of a step in seconds, or None if unknown."""
         self._budget = budget
         self._expected_s = step_s or 0.0
         self._in_flight = 0
@@ -120,9 +113,8 @@ class Spending:
     def allows_step(self, by_turns: bool = False) -> bool:
         """Return True if another step should be made.
 
-        With `by_turns`, two eyes alternate (`turn`). A step on the second eye is started only if
-        there is time for one on the first eye after it. That one is then always made, so the newest
-        step trains the displayed eye.
+        With `by_turns`, two eyes alternate (`turn`). A step on the second eye is started only if there is time for one
+        on the first eye after it. That one is then always made, so the newest step trains the displayed eye.
         """
         budget = self._budget
         if budget.steps is not None:
@@ -156,9 +148,7 @@ class Spending:
         return int(self.made % TURNS == SECOND_EYE and not is_last)
 
     def step_made(self, in_flight: int = 0) -> None:
-        """Record a step that was made or queued. `in_flight` is the number of queued steps that are
-        not finished.
-        """
+        """Record a step that was made or queued. `in_flight` is the number of queued steps that are not finished."""
         self.made += 1
         self._in_flight = in_flight
         self._has_queued = self._has_queued or in_flight > 0
@@ -170,9 +160,7 @@ class Spending:
         self._look()
 
     def planned(self) -> int:
-        """Return the number of remaining steps, at least 1: exact for a step budget, estimated for
-        a deadline.
-        """
+        """Return the number of remaining steps, at least 1: exact for a step budget, estimated for a deadline."""
         budget = self._budget
         if budget.steps is not None:
             return max(1, budget.steps - self.made)

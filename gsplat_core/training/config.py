@@ -90,9 +90,8 @@ class ReconstructorConfig:
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM relative to L1 or squared error, 0 to 1."""
     depth_weight: float = 0.1
-    """Weight of the inverse-depth loss of frames with depth, multiplied by the scene's initial
-    distance so that it does not depend on the unit, and by a factor of the depth's origin
-    (`DEPTH_ORIGINS`).
+    """Weight of the inverse-depth loss of frames with depth, multiplied by the scene's initial distance so that it does
+    not depend on the unit, and by a factor of the depth's origin (`DEPTH_ORIGINS`).
     """
     default_depth_mm: float = RELATIVE_DISTANCE
     """Distance of the plane on which a scene without depth starts, in millimetres."""
@@ -145,8 +144,7 @@ class ReconstructorConfig:
 
     @classmethod
     def offline(cls, field: str = "auto") -> ReconstructorConfig:
-        """Return the configuration for `Reconstructor.fit`, with more Gaussians and finer motion
-        than for a stream.
+        """Return the configuration for `Reconstructor.fit`, with more Gaussians and finer motion than for a stream.
 
         Training starts with `gaussians` and ends with `max_gaussians` Gaussians.
         """
@@ -160,8 +158,7 @@ class ReconstructorConfig:
         )
 
     def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:
-        """Return the settings for a scene that starts from `frame`, with weights that depend on its
-        depth source.
+        """Return the settings for a scene that starts from `frame`, with weights that depend on its depth source.
 
         Streams with a limited `history_s` keep their weights for all scenes.
 

@@ -25,8 +25,7 @@ ImageLike: TypeAlias = NDArray[np.generic] | Tensor
 """RGB [H, W, 3], uint8 or floats in 0..1."""
 
 PSNR_CAP_DB = 100.0
-"""PSNR of equal images and highest reported value, corresponding to a mean squared error of 1e-10.
-"""
+"""PSNR of equal images and highest reported value, corresponding to a mean squared error of 1e-10."""
 
 
 _UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 255).numpy()
@@ -60,9 +59,7 @@ class _MaskedPair:
         return cv2.copyTo(self.image, self.tissue), cv2.copyTo(self.target, self.tissue)
 
     def squared_error(self) -> float:
-        """Return the squared error summed over tissue pixels and channels, for values in 0..1;
-        exact for bytes.
-        """
+        """Return the squared error summed over tissue pixels and channels, for values in 0..1; exact for bytes."""
         if self.image.dtype == np.uint8:
             return float(cv2.norm(self.image, self.target, cv2.NORM_L2SQR, self.tissue)) / 255**2
         image, target = (torch.from_numpy(values) for values in self.masked())
@@ -148,11 +145,10 @@ def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None =
 
 
 def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
-    """Return the PSNR in dB of masked images over the whole frame: squared error over tissue / (3 x
-    all pixels).
+    """Return the PSNR in dB of masked images over the whole frame: squared error over tissue / (3 x all pixels).
 
-    Most papers print this variant. It rises with the tool's size, so report it only together with
-    `psnr_tissue_db`. Arguments and return value are the same as there.
+    Most papers print this variant. It rises with the tool's size, so report it only together with `psnr_tissue_db`.
+    Arguments and return value are the same as there.
     """
     pair = _masked_pair(image, target, mask)
     return _psnr_db(pair.squared_error(), pair.pixels if pair.tissue_pixels else 0)
@@ -164,12 +160,10 @@ def psnrs_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None)
 
 
 def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
-    """Return the mean structural similarity of the masked images over the whole frame (Wang et al.
-    2004).
+    """Return the mean structural similarity of the masked images over the whole frame (Wang et al. 2004).
 
-    It uses the usual convention: 11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 =
-    0.03^2, range 1. Masked-out pixels count as equal. Arguments as in `psnr_tissue_db`; NaN if the
-    mask has no tissue.
+    It uses the usual convention: 11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, range 1.
+    Masked-out pixels count as equal. Arguments as in `psnr_tissue_db`; NaN if the mask has no tissue.
     """
     pair = _masked_pair(image, target, mask)
     return pair.mean_ssim() if pair.tissue_pixels else math.nan
@@ -260,7 +254,5 @@ class QualityTracker:
             mean.add(getattr(quality, name))
 
     def means(self) -> dict[str, float | None]:
-        """Return the mean of each measure over frames that have it (PSNR averaged in dB), or None
-        without any.
-        """
+        """Return the mean of each measure over frames that have it (PSNR averaged in dB), or None without any."""
         return {name: mean.mean for name, mean in self._means.items()}

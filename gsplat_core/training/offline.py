@@ -28,11 +28,9 @@ NEIGHBOURS = 8
 
 
 def nearest_others(points: Tensor) -> Tensor:
-    """Return the indices of the nearest other points of `points` [N, 3], int64 [N, K]. Synchronises
-    with the device.
+    """Return the indices of the nearest other points of `points` [N, 3], int64 [N, K]. Synchronises with the device.
 
-    Ties are broken arbitrarily. A non-finite point has only itself as neighbour and is no neighbour
-    of others.
+    Ties are broken arbitrarily. A non-finite point has only itself as neighbour and is no neighbour of others.
     """
     host = HostCopy(points.detach().float()).numpy()
     finite = np.flatnonzero(np.isfinite(host).all(axis=1))
@@ -57,13 +55,11 @@ MOST_FRAMES = 32
 
 
 def steadiness(observations: Sequence[Observation]) -> float:
-    """Return the ratio of noise to the deviation of frames from the interpolation of their
-    neighbours, 0 to 1.
+    """Return the ratio of noise to the deviation of frames from the interpolation of their neighbours, 0 to 1.
 
-    The value is 1 if the deviation is at most noise, and decreases with its square. Temporal
-    smoothing removes this deviation, so the ratio is the admissible amount of smoothing. Only
-    tissue counts; without three frames with tissue it is 1. Integer sums make the result
-    independent of the order. Synchronises once.
+    The value is 1 if the deviation is at most noise, and decreases with its square. Temporal smoothing removes this
+    deviation, so the ratio is the admissible amount of smoothing. Only tissue counts; without three frames with tissue
+    it is 1. Integer sums make the result independent of the order. Synchronises once.
     """
     inner = range(1, len(observations) - 1)
     squared = torch.zeros(2, dtype=torch.int64, device=observations[0].image.device)
@@ -203,9 +199,7 @@ class OfflineTraining:
         """Neighbours of each Gaussian, or None if they must be searched again."""
 
     def __call__(self, steps: int, progress: Callable[[int, Tensor], None] | None) -> Tensor:
-        """Run `steps` steps, calling `progress` after each. Returns the last loss, [] on the
-        device.
-        """
+        """Run `steps` steps, calling `progress` after each. Returns the last loss, [] on the device."""
         rounds = densification_rounds(steps)
         loss = torch.zeros(())
         for number in range(steps):

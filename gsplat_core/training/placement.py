@@ -48,22 +48,17 @@ class LateDepth:
     """Depth of a frame as tensors on the training device, prepared concurrently with training."""
 
     believed: Tensor | None
-    """Target of the depth loss, float32 [H, W], 0 where not confident; None if the loss ignores
-    this depth source.
-    """
+    """Target of the depth loss, float32 [H, W], 0 where not confident; None if the loss ignores this depth source."""
     possible: Tensor | None
-    """Depth for correcting the scene, float32 [H, W], 0 where unknown; None if unknown everywhere.
-    """
+    """Depth for correcting the scene, float32 [H, W], 0 where unknown; None if unknown everywhere."""
     everywhere: Tensor | None
-    """`possible` extrapolated to all pixels, for placing a whole scene; None if not yet computed.
-    """
+    """`possible` extrapolated to all pixels, for placing a whole scene; None if not yet computed."""
 
     @staticmethod
     def of(frame: Frame, device: torch.device | str, *, places: bool = False) -> LateDepth:
         """Prepare the depth of a frame. `places` also computes `everywhere`.
 
-        Copies to a GPU are queued on the thread's current stream, which must be the training
-        stream.
+        Copies to a GPU are queued on the thread's current stream, which must be the training stream.
         """
         possible = possible_depth(frame)
         is_known = bool(possible.any())
@@ -85,13 +80,9 @@ class LateDepth:
 
 
 LARGEST_STEP = 1.4
-"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is
-known.
-"""
+"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is known."""
 SHARE = 0.5
-"""Share of the correction (of log depth) applied by one frame, which averages the depth of several
-frames.
-"""
+"""Share of the correction (of log depth) applied by one frame, which averages the depth of several frames."""
 CORRECTED_PX = 16
 """Side of the picture blocks whose Gaussians move together, in pixels."""
 
@@ -117,8 +108,7 @@ def smooth_factor(depth: Tensor, shown: Tensor, known: Tensor, pixels: Tensor) -
 
 
 def move_along_rays_(deltas: Tensor, means: Tensor, factor: Tensor, centre: Tensor) -> None:
-    """Change raw field rows so that Gaussians move along their rays and scale with the distance, in
-    place.
+    """Change raw field rows so that Gaussians move along their rays and scale with the distance, in place.
 
     The camera at `centre` sees the same picture as before.
 
@@ -134,8 +124,7 @@ def move_along_rays_(deltas: Tensor, means: Tensor, factor: Tensor, centre: Tens
 
 
 class CapturedCorrection:
-    """Depth correction of `Placement` at one time, captured for a scene whose tensors keep their
-    addresses.
+    """Depth correction of `Placement` at one time, captured for a scene whose tensors keep their addresses.
 
     A frame that overflows the tile lists corrects nothing; the lists are enlarged for the next one.
     """
@@ -209,9 +198,7 @@ class CapturedCorrection:
 
 
 class Placement:
-    """Depth corrections of consecutive scenes: the first depth places the whole scene, later ones
-    refine it.
-    """
+    """Depth corrections of consecutive scenes: the first depth places the whole scene, later ones refine it."""
 
     def __init__(self, *, postpones: bool = False) -> None:
         """Set the state before the first scene.
@@ -246,15 +233,14 @@ class Placement:
         shown_s: float | None = None,
         late: LateDepth | None = None,
     ) -> None:
-        """Correct the scene by a frame's depth, if it has any and the field supports it. The field
-        must cover the frame's time.
+        """Correct the scene by a frame's depth, if it has any and the field supports it. The field must cover the
+        frame's time.
 
         Args:
             step: training step of the scene.
             frame: frame with depth.
             observation: the same frame as tensors.
-            shown_s: time at which motion is corrected, in seconds; None for the frame's own. Later
-                for late depth.
+            shown_s: time at which motion is corrected, in seconds; None for the frame's own. Later for late depth.
             late: prepared depth of the frame, if any.
         """
         if self._postpones and self.is_placed and shown_s is None:
@@ -295,9 +281,7 @@ class Placement:
 
 
 def _place(step: TrainingStep, motion: EditableMotion, frame: Frame, observation: Observation, late: LateDepth) -> bool:
-    """Move the whole scene to the distance of its first depth. Returns False if the depth covers
-    none of the scene.
-    """
+    """Move the whole scene to the distance of its first depth. Returns False if the depth covers none of the scene."""
     assert late.possible is not None
     seen = _shown_now(step, motion, observation)
     inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(late.possible)

@@ -21,12 +21,9 @@ MOST_PLACES = 8
 RENDERED_PX = 160
 """Width at which a place is rendered for comparison, in pixels."""
 COMPARED_PX = 64
-"""Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels.
-"""
+"""Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels."""
 FINE_PX, COARSE_PX = 1.0, 16.0
-"""Standard deviations, in pixels of that size, of the band-pass filter that removes noise and
-illumination.
-"""
+"""Standard deviations, in pixels of that size, of the band-pass filter that removes noise and illumination."""
 SAME_PLACE = 0.75
 """Correlation from which a picture shows a place. See benchmarks/results/constants.md."""
 LEAST_SHARE = 0.3
@@ -46,9 +43,7 @@ class Place:
     _looks: dict[Camera, tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=dict, repr=False)
 
     def look(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Render the place `COMPARED_PX` wide: colours [H, W, 3] and opacity [H, W]. The last
-        result is cached.
-        """
+        """Render the place `COMPARED_PX` wide: colours [H, W, 3] and opacity [H, W]. The last result is cached."""
         if camera not in self._looks:
             with torch.no_grad():
                 output = render(self.gaussians, camera.scaled(RENDERED_PX / camera.width_px), depth=False)

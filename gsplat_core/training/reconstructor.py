@@ -39,16 +39,14 @@ from gsplat_core.transfers import HostCopy
 class Reconstructor:
     """Owner of the model that is being learned.
 
-    Online: call `observe` for each frame in order, and `publish` for a model to display. Offline:
-    call `fit`. The result is deterministic for equal frames, settings and seed. It is
-    also independent of the number of threads, unless the field uses torch's matrix products, which
-    round differently with other numbers of threads.
+    Online: call `observe` for each frame in order, and `publish` for a model to display. Offline: call `fit`. The
+    result is deterministic for equal frames, settings and seed. It is also independent of the number of threads, unless
+    the field uses torch's matrix products, which round differently with other numbers of threads.
 
-    For a stream that does not wait, give `live`. All steps of `observe` then train on the newest
-    frame. After `publish`, call `grow` and `rehearse` until the next frame.
+    For a stream that does not wait, give `live`. All steps of `observe` then train on the newest frame. After
+    `publish`, call `grow` and `rehearse` until the next frame.
 
-    All tensors are kept and trained on `device`. A GPU works on a frame's steps while the host
-    prepares the next frame.
+    All tensors are kept and trained on `device`. A GPU works on a frame's steps while the host prepares the next frame.
     """
 
     def __init__(
@@ -131,9 +129,7 @@ class Reconstructor:
 
     @property
     def _time_window_s(self) -> tuple[float, float]:
-        """Times that the model covers in seconds, from the first frame or as far back as the field
-        reaches.
-        """
+        """Times that the model covers in seconds, from the first frame or as far back as the field reaches."""
         start = self._first_time_s
         if self._step is not None and self.config.history_s is not None:
             start = min(max(start, self._step.field.time_window_s[0]), self._last_time_s)
@@ -224,9 +220,7 @@ class Reconstructor:
         self._schedule.rehearse(self._step, self._window, steps)
 
     def rehearsal_ns(self, steps: int) -> float:
-        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0
-        if unknown.
-        """
+        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0 if unknown."""
         return self._schedule.rehearsal_ns(steps)
 
     def grow(self, frame: Frame) -> None:
@@ -247,11 +241,10 @@ class Reconstructor:
             self._growth.once(self._step, self._window.newest)
 
     def begin_scene(self, frame: Frame) -> bool:
-        """Leave the scene. The next observed frame, `frame`, starts a new scene or one that was
-        left before.
+        """Leave the scene. The next observed frame, `frame`, starts a new scene or one that was left before.
 
-        A bounded number of left scenes is kept in host memory in their last state. The frame may
-        have another size. Version numbers continue.
+        A bounded number of left scenes is kept in host memory in their last state. The frame may have another size.
+        Version numbers continue.
 
         Returns:
             True if the frame shows a place that was left before.
@@ -264,9 +257,7 @@ class Reconstructor:
         return self._left.recognise(frame)
 
     def forget(self) -> None:
-        """Reset to the state before the first frame, but keep the allocated memory and the
-        estimated step time.
-        """
+        """Reset to the state before the first frame, but keep the allocated memory and the estimated step time."""
         self._end_scene()
         self._left.forget()
         self._version = 0
@@ -332,12 +323,11 @@ class Reconstructor:
         return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
-        """Return the model for displaying the time of the newest trained frame and later, with the
-        next version number.
+        """Return the model for displaying the time of the newest trained frame and later, with the next version number.
 
-        On a GPU the whole model is copied into a preallocated slot without allocation or
-        synchronisation, see `gsplat_core.models.snapshots`. On a CPU with a motion prior only the
-        current state is copied; `whole_model` includes the past. Otherwise it equals `snapshot`.
+        On a GPU the whole model is copied into a preallocated slot without allocation or synchronisation, see
+        `gsplat_core.models.snapshots`. On a CPU with a motion prior only the current state is copied; `whole_model`
+        includes the past. Otherwise it equals `snapshot`.
         """
         step, prior = self._step, self._motion.prior
         if step is not None and prior is not None and self.device.type == "cpu":

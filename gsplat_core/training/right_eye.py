@@ -41,16 +41,12 @@ SHIFT_STAYS = 4
 LEAST_OVERLAP = 0.4
 """Smallest overlap of the two views, as a share of the width."""
 QUANTILES = (10, 50, 90)
-"""Compared quantiles in per cent; highlights and shadows, which differ between the eyes, are
-outside.
-"""
+"""Compared quantiles in per cent; highlights and shadows, which differ between the eyes, are outside."""
 FLAT_LEVELS = 8.0
 """Distance of the outer quantiles in levels below which a channel gives no gain."""
 MOST_GAIN = 2.0
 NOISE_LEVELS = 1.5
-"""Largest change of a quantile in levels that counts as estimation noise; such a correction is not
-applied.
-"""
+"""Largest change of a quantile in levels that counts as estimation noise; such a correction is not applied."""
 
 
 class EyeColours:
@@ -62,9 +58,7 @@ class EyeColours:
         """Gains and offsets as a matrix [3, 4], or None for no correction."""
         self._frames = 0
         self.shift: float | None = None
-        """Shift of the right picture to the left, as a share of its width, at the last comparison;
-        None before it.
-        """
+        """Shift of the right picture to the left, as a share of its width, at the last comparison; None before it."""
 
     def corrected(self, frame: Frame) -> NDArray[np.uint8]:
         """Return the right picture of a stereo frame in the colours of the left one."""
@@ -99,9 +93,7 @@ class EyeColours:
 
 
 def typical_shift(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
-    """Return the overall shift of the right picture to the left, as a share of its width, accurate
-    to a few pixels.
-    """
+    """Return the overall shift of the right picture to the left, as a share of its width, accurate to a few pixels."""
     first, second = _small(left), _small(right)
     return best_shift(first.mean(-1), second.mean(-1)) / first.shape[1]
 
@@ -113,11 +105,9 @@ def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: int | None = None) -> int:
-    """Return the shift of the right picture [h, w] to the left in pixels that maximises the
-    correlation.
+    """Return the shift of the right picture [h, w] to the left in pixels that maximises the correlation.
 
-    With `before`, a recent shift, only its neighbourhood is searched unless the maximum is at its
-    end.
+    With `before`, a recent shift, only its neighbourhood is searched unless the maximum is at its end.
     """
     most = int((1 - LEAST_OVERLAP) * left.shape[1])
     matches = _correlations(left, right, most)
@@ -130,9 +120,7 @@ def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: in
 
 
 def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: int) -> NDArray[np.float64]:
-    """Return the correlation of the overlap for each shift of the right picture from -`most` to
-    `most`, [2 most + 1].
-    """
+    """Return the correlation of the overlap for each shift of the right picture from -`most` to `most`, [2 most + 1]."""
     a, b = left.astype(np.float64), right.astype(np.float64)
     height, width = a.shape
     shifts = np.arange(-most, most + 1)
@@ -156,9 +144,7 @@ def _sums(picture: NDArray[np.float64], begins: NDArray, widths: NDArray) -> NDA
 
 
 def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray]:
-    """Return the parts of both pictures that overlap if the right one is shifted `shift` pixels to
-    the left.
-    """
+    """Return the parts of both pictures that overlap if the right one is shifted `shift` pixels to the left."""
     width = left.shape[1]
     if shift >= 0:
         return left[:, shift:], right[:, : width - shift]
@@ -166,11 +152,10 @@ def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray
 
 
 def line_between(left: NDArray[np.float32], right: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return gain and offset [3] that map the quantiles of the right colours [N, 3] to those of the
-    left ones, and the right quantiles [3, 3].
+    """Return gain and offset [3] that map the quantiles of the right colours [N, 3] to those of the left ones, and the
+    right quantiles [3, 3].
 
-    Quantiles need no pixel correspondence. Unlike a least-squares slope, their ratio is not biased
-    by noise.
+    Quantiles need no pixel correspondence. Unlike a least-squares slope, their ratio is not biased by noise.
     """
     ours, theirs = (np.percentile(colours, QUANTILES, axis=0) for colours in (left, right))
     spread_left, spread_right = ours[2] - ours[0], theirs[2] - theirs[0]
@@ -184,9 +169,7 @@ CELL_PX = 4
 TYPICAL_OF = 500
 """Number of cells (up to twice as many) whose median is the typical disparity."""
 NEAREST, FARTHEST = 2.0, 0.75
-"""Range of a tool's disparity without depth, as multiples of the typical one; tools are nearer than
-tissue.
-"""
+"""Range of a tool's disparity without depth, as multiples of the typical one; tools are nearer than tissue."""
 
 
 class PreparedPicture(NamedTuple):
@@ -226,8 +209,7 @@ class BothEyes:
         return self.beside(left, frame) if self._with_right and trains else left
 
     def beside(self, left: Observation, frame: Frame) -> Observation:
-        """Add the right eye's observation to the left one of `frame`, if the frame has a calibrated
-        right picture.
+        """Add the right eye's observation to the left one of `frame`, if the frame has a calibrated right picture.
 
         Raises:
             InvalidInput: if the camera models of the eyes differ.

@@ -56,18 +56,13 @@ class LiveTraining:
     last_rate: float = 0.5
     """Factor of all learning rates at the end; small steps converge."""
     rate_steps: int = 30
-    """Number of steps from the first to the last factor in equal ratios; further steps use the last
-    factor.
-    """
+    """Number of steps from the first to the last factor in equal ratios; further steps use the last factor."""
     recent_share: float = 0.6
-    """Share of the rehearsal steps on the newest frame; the others are spread evenly over the
-    window.
-    """
+    """Share of the rehearsal steps on the newest frame; the others are spread evenly over the window."""
     colour_relaxation: float = 0.0
-    """Above 0, colours are corrected by this multiple of the mean residual (`colour_correction`)
-    instead of trained with a learning rate, if the field has temporal colours. On a GPU this
-    requires spherical harmonics of degree 0, and depth is compared only in some rehearsal steps
-    (`DEPTH_EVERY`).
+    """Above 0, colours are corrected by this multiple of the mean residual (`colour_correction`) instead of trained
+    with a learning rate, if the field has temporal colours. On a GPU this requires spherical harmonics of degree 0, and
+    depth is compared only in some rehearsal steps (`DEPTH_EVERY`).
     """
 
     def __post_init__(self) -> None:
@@ -138,9 +133,7 @@ class Schedule(ABC):
             step.settle(unsettled)
 
     def rehearsal_ns(self, steps: int) -> float:
-        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0
-        if unknown.
-        """
+        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0 if unknown."""
         under_way = REHEARSED_IN_FLIGHT if self.device.type == "cuda" else 0
         return (steps + under_way) * (self.step_s or 0.0) * 1e9
 

@@ -1,10 +1,9 @@
 """Maintenance of a scene that is trained without end.
 
-Adam moves every parameter by about its learning rate even if pictures hardly constrain it.
-Unconstrained parameters therefore drift. Thin Gaussians become needles, opacities and colours
-diverge, quaternions grow, depths spread along the line of sight of a static camera, and Gaussians
-that drift off the tissue never return. The tissue then gets holes, which new Gaussians fill until
-the capacity is exhausted and the quality falls.
+Adam moves every parameter by about its learning rate even if pictures hardly constrain it. Unconstrained parameters
+therefore drift. Thin Gaussians become needles, opacities and colours diverge, quaternions grow, depths spread along the
+line of sight of a static camera, and Gaussians that drift off the tissue never return. The tissue then gets holes,
+which new Gaussians fill until the capacity is exhausted and the quality falls.
 """
 
 from __future__ import annotations
@@ -31,17 +30,13 @@ from gsplat_core.training.steps.step import TrainingStep
 RELAX_EVERY = 128
 """Training steps between two relaxation rounds."""
 RENEW_EVERY = 512
-"""Training steps between two searches for useless Gaussians and sparse tissue, which take
-milliseconds on a GPU.
-"""
+"""Training steps between two searches for useless Gaussians and sparse tissue, which take milliseconds on a GPU."""
 RELAXING_STEPS = 3600
 """Time constant in steps with which sizes, opacities and colours relax to default values where
 training does not hold them.
 """
 THINNEST_PX = 0.2
-"""Smallest standard deviation in pixels; smaller ones look alike because of the renderer's blur of
-0.55 px.
-"""
+"""Smallest standard deviation in pixels; smaller ones look alike because of the renderer's blur of 0.55 px."""
 WIDEST = 8.0
 """Largest size, in multiples of the default size."""
 MOST_SPLIT = 0.02
@@ -84,9 +79,7 @@ class Upkeep:
         self._has_moved = False
 
     def __call__(self, step: TrainingStep, observation: Observation, last_seen: LastSeen | None = None) -> None:
-        """Run the maintenance that is due, which synchronises with the device. `last_seen` is
-        updated with the rows.
-        """
+        """Run the maintenance that is due, which synchronises with the device. `last_seen` is updated with the rows."""
         self._has_moved = self._has_moved or observation.camera != self._first_camera
         if step.steps - self._relaxed_at < RELAX_EVERY:
             return
@@ -138,9 +131,7 @@ class Upkeep:
             last_seen.join(step.gaussians.count, observation.time_s)
 
     def _relax(self, step: TrainingStep, seen: Seen, camera: Camera) -> None:
-        """Relax visible Gaussians towards default sizes, opacities and colours. Others are kept as
-        memory.
-        """
+        """Relax visible Gaussians towards default sizes, opacities and colours. Others are kept as memory."""
         share = 1 - math.exp((self._relaxed_at - step.steps) / RELAXING_STEPS)
         self._relaxed_at = step.steps
         scene, pixel = step.gaussians, step.distance(camera) / float(camera.K[0, 0])
@@ -154,13 +145,11 @@ class Upkeep:
                 colours.sub_(part[:, None, None] * colours)
 
     def _towards_surface(self, step: TrainingStep, seen: Seen, since: int, observation: Observation) -> Tensor:
-        """Return distance factors [N] that relax visible Gaussians to the depth around them, for
-        `since` steps.
+        """Return distance factors [N] that relax visible Gaussians to the depth around them, for `since` steps.
 
-        The camera sees the same picture. If it moves or depth is known, training counteracts
-        errors. Otherwise all depths would drift together, because equal steps along the line of
-        sight are unequal in the picture. The median distance of visible Gaussians is then kept
-        constant.
+        The camera sees the same picture. If it moves or depth is known, training counteracts errors. Otherwise all
+        depths would drift together, because equal steps along the line of sight are unequal in the picture. The median
+        distance of visible Gaussians is then kept constant.
         """
         camera = observation.camera
         spacing = SURFACE_CELL * self._spacing_px
@@ -174,9 +163,8 @@ class Upkeep:
         return torch.where(seen.shown, factor, 1.0)
 
     def _useless(self, step: TrainingStep, seen: Seen) -> Tensor:
-        """Return which idle Gaussians can be removed, bool [N]: those outside the picture if the
-        camera never moved, and all but one per grid cell inside, since a tool that hides them may
-        leave.
+        """Return which idle Gaussians can be removed, bool [N]: those outside the picture if the camera never moved,
+        and all but one per grid cell inside, since a tool that hides them may leave.
         """
         idle = step.idle(IDLE)
         inside = idle & seen.inside
@@ -184,9 +172,7 @@ class Upkeep:
         return crowded if self._has_moved else crowded | (idle & ~seen.inside)
 
     def _fill_up(self, step: TrainingStep, observation: Observation, shown: Tensor) -> None:
-        """Split visible Gaussians (`shown`, bool [N]) with the largest gradients if tissue has
-        fewer than at the start.
-        """
+        """Split visible Gaussians (`shown`, bool [N]) with the largest gradients if tissue has fewer than at the start."""
         wanted = torch.count_nonzero(observation.mask) / self._spacing_px**2
         missing = int(wanted - torch.count_nonzero(shown))
         count = min(missing, round(MOST_SPLIT * step.gaussians.count), self._capacity - step.gaussians.count)

@@ -58,9 +58,7 @@ WITHOUT_LEARNING = ("heldout", "live", "retention", "second_eye", "geometry")
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Selection of protocols and their parameters. Raises InvalidSetting for a value out of
-    range.
-    """
+    """Selection of protocols and their parameters. Raises InvalidSetting for a value out of range."""
 
     recording: Path | str
     protocols: tuple[str, ...] = ()
@@ -192,8 +190,7 @@ def evaluate(
         stop_requested: polled; if True, the results so far are returned.
 
     Raises:
-        InvalidSetting: the model does not fit the recording, or a requested protocol cannot be
-            measured.
+        InvalidSetting: the model does not fit the recording, or a requested protocol cannot be measured.
         DeviceMissing: the device is not available.
         MemoryTooSmall: the evaluation does not fit into memory.
         RecordingError: the recording cannot be read.
@@ -260,9 +257,7 @@ class _Work:
         )
 
     def _is_wanted(self, name: str) -> bool:
-        """Return True if a protocol is to be measured. Raise InvalidSetting if a requested one
-        cannot be.
-        """
+        """Return True if a protocol is to be measured. Raise InvalidSetting if a requested one cannot be."""
         asked = name in self.settings.protocols
         if not asked and (self.settings.protocols or name not in WITHOUT_LEARNING):
             return False

@@ -43,9 +43,7 @@ class EvaluatedRun:
 
 @dataclass(frozen=True)
 class Playback:
-    """Mapping of a recording's timestamps to those of the stream that played it (see
-    `RealtimeSource`).
-    """
+    """Mapping of a recording's timestamps to those of the stream that played it (see `RealtimeSource`)."""
 
     last_s: float
     """Timestamp of the recording's last frame in the first round, in seconds."""
@@ -99,11 +97,10 @@ class SeenFrames:
 
 
 def frame_tolerance_s(fps: float) -> float:
-    """Return the tolerance of a model's time window in seconds, slightly more than one frame
-    interval.
+    """Return the tolerance of a model's time window in seconds, slightly more than one frame interval.
 
-    The frame after the last trained one counts as inside, because the held-out split of some
-    recordings includes the last frame.
+    The frame after the last trained one counts as inside, because the held-out split of some recordings includes the
+    last frame.
     """
     return 1.01 / fps
 
@@ -160,9 +157,7 @@ def fitting_source(
 
 
 def _scale_of_model(made: Camera, seen: Camera, run_scale: float | None) -> float:
-    """Return the scale at which pictures of `seen` have the size of `made`; preferably 1 or the
-    run's scale.
-    """
+    """Return the scale at which pictures of `seen` have the size of `made`; preferably 1 or the run's scale."""
     for scale in (1.0, run_scale):
         if scale is not None:
             scaled = seen.scaled(scale)

@@ -26,9 +26,7 @@ from operators.storage import mebibytes
 MAX_PIXELS = 64 * 2**20
 """Maximum number of pixels of a picture (8192x8192). Surgical video has at most 8 million."""
 MAX_SIDE_PX = 2**15
-"""Maximum side of a picture. Videos show two side by side, and video formats are limited to
-65535.
-"""
+"""Maximum side of a picture. Videos show two side by side, and video formats are limited to 65535."""
 LEAST_FPS = 0.001
 """Minimum frame rate; video containers cannot store much lower rates."""
 MAX_RENDERED_FRAMES = 1_000_000
@@ -114,9 +112,7 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
 
 
 def render_bytes(width_px: int, height_px: int, parameters: int) -> int:
-    """Estimate the memory in bytes for rendering pictures of this size from a loaded model of
-    `parameters` values.
-    """
+    """Estimate the memory in bytes for rendering pictures of this size from a loaded model of `parameters` values."""
     return FIXED_BYTES + width_px * height_px * RENDER_PIXEL_BYTES + RENDER_PARAMETER_BYTES * parameters
 
 

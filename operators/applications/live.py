@@ -50,9 +50,7 @@ GARBAGE_THRESHOLDS = (20_000, 20, 1000)
 a frame creates no cycles, and a full collection takes tens of milliseconds.
 """
 SWITCH_INTERVAL_S = 0.0002
-"""Interpreter switch interval in seconds. With the default of 5 ms, a thread could wait that long
-for the GIL.
-"""
+"""Interpreter switch interval in seconds. With the default of 5 ms, a thread could wait that long for the GIL."""
 OPENCV_THREADS = 1
 """Number of OpenCV threads. Starting more takes longer than processing a small picture."""
 
@@ -83,9 +81,7 @@ def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
-    """Create the components and exercise them: capture graphs, allocate memory, measure the
-    duration of a step.
-    """
+    """Create the components and exercise them: capture graphs, allocate memory, measure the duration of a step."""
     camera = source.description.camera
     parts = new_parts(settings, source)
 
@@ -100,9 +96,7 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
 
 @contextmanager
 def low_latency() -> Iterator[None]:
-    """Context manager with a short interpreter switch interval and existing objects exempt from
-    garbage collection.
-    """
+    """Context manager with a short interpreter switch interval and existing objects exempt from garbage collection."""
     interval_s = sys.getswitchinterval()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(min(threads, OPENCV_THREADS))
@@ -180,8 +174,7 @@ def live(
     on_shown: Callable[[Any], None] | None = None,
     report: Report | None = None,
 ) -> RunOutcome:
-    """Reconstruct a source until it ends, the duration elapses or a stop is requested, and write
-    the results.
+    """Reconstruct a source until it ends, the duration elapses or a stop is requested, and write the results.
 
     Args:
         settings: settings of the run.
@@ -220,8 +213,7 @@ def live(
 
 
 def measured_size(settings: LiveSettings, about: SourceDescription, share: float = SHARE_OF_INTERVAL) -> WorkingSize:
-    """Find the largest size at which this machine keeps up with a stream, by trial runs at several
-    sizes.
+    """Find the largest size at which this machine keeps up with a stream, by trial runs at several sizes.
 
     Args:
         settings: settings of the run.

@@ -26,9 +26,7 @@ LIVE_HISTORY_S = {"cpu": 3.0, "cuda": 6.0}
 LIVE_MOTION_DETAIL: Detail = "half"
 LIVE_GAUSSIANS = {"cpu": 12_000, "cuda": 45_000}
 LIVE_MOST_GAUSSIANS = 100_000
-"""Maximum number of initial Gaussians of a scene, for large pictures. The capacity is twice the
-initial number.
-"""
+"""Maximum number of initial Gaussians of a scene, for large pictures. The capacity is twice the initial number."""
 LIVE_PIXELS_PER_GAUSSIAN = 13
 """Pixels per initial Gaussian on a GPU, for pictures larger than usual."""
 LIVE_TRAINING = {
@@ -36,9 +34,7 @@ LIVE_TRAINING = {
     "cuda": LiveTraining(colour_relaxation=1.5),
 }
 LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
-"""Use a squared colour loss. It suits few steps per frame; with many steps, L1 follows motion
-better.
-"""
+"""Use a squared colour loss. It suits few steps per frame; with many steps, L1 follows motion better."""
 LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 """Minimum number of optimiser steps per frame, even past the display deadline."""
 LIVE_LEAST_SHARE = {"cpu": 0.34, "cuda": 0.2}
@@ -48,13 +44,9 @@ LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
 step improves the picture more than an earlier display, up to the next frame.
 """
 LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 5}
-"""Minimum number of steps on a scene's first frame. Its display and the following frames wait for
-them.
-"""
+"""Minimum number of steps on a scene's first frame. Its display and the following frames wait for them."""
 LIVE_PREDICT_EVERY = {"cpu": 8, "cuda": 4}
-"""One in this many pictures is also predicted and scored, at about the cost of rendering and
-scoring a picture.
-"""
+"""One in this many pictures is also predicted and scored, at about the cost of rendering and scoring a picture."""
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
 """Longest wait of a frame before it is dropped, in frame intervals. A GPU catches up within a few
 frames. A CPU with two cores would display all queued frames late.
@@ -64,9 +56,7 @@ LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
 on a GPU, flow is slower than training.
 """
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
-"""Weight of SSIM next to L1, which improves tracking of motion. On a CPU a step with SSIM takes 1.5
-times as long.
-"""
+"""Weight of SSIM next to L1, which improves tracking of motion. On a CPU a step with SSIM takes 1.5 times as long."""
 
 
 @dataclass(frozen=True)
@@ -122,9 +112,7 @@ class LiveSettings(LiveOptions):
         return (*((path,) if path.exists() else ()), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
-        """Return the reconstructor's settings for frames of `pixels` pixels. Raises
-        InvalidSetting.
-        """
+        """Return the reconstructor's settings for frames of `pixels` pixels. Raises InvalidSetting."""
         device = self.device
         wanted = LIVE_GAUSSIANS[device]
         if device == "cuda":

@@ -1,8 +1,6 @@
-"""Offline reconstruction: training on all training frames at once, then display and scoring of
-every frame.
+"""Offline reconstruction: training on all training frames at once, then display and scoring of every frame.
 
-The protocol's held-out frames are excluded from training. The evaluation uses the graph of replay
-with a fixed model.
+The protocol's held-out frames are excluded from training. The evaluation uses the graph of replay with a fixed model.
 """
 
 from __future__ import annotations
@@ -39,9 +37,7 @@ from operators.sources.source import FrameSource
 
 
 class FittedModel:
-    """Adapter that presents a finished model as a reconstructor, which observes without
-    training.
-    """
+    """Adapter that presents a finished model as a reconstructor, which observes without training."""
 
     def __init__(self, model: Model, eyes: BothEyes) -> None:
         self.model, self.eyes = model, eyes

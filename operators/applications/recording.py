@@ -23,15 +23,11 @@ if TYPE_CHECKING:
     from operators.applications.live_settings import LiveSettings
 
 RECORDING_RESERVE_BYTES = 64 * 2**20
-"""Disk space that a recording leaves free in addition to the space for finishing the run, in
-bytes.
-"""
+"""Disk space that a recording leaves free in addition to the space for finishing the run, in bytes."""
 
 
 def new_recording_folder(out: Path) -> Path:
-    """Return a new folder name for the recording of a run with the output folder `out`. Creates
-    nothing.
-    """
+    """Return a new folder name for the recording of a run with the output folder `out`. Creates nothing."""
     base = out / RECORDINGS / datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     folder, more = base, 1
     while folder.exists():

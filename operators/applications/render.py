@@ -84,9 +84,7 @@ RECORDED = ViewWish()
 
 @dataclass(frozen=True)
 class View:
-    """Cameras of a video. `cameras(time_s)` returns the cameras of the pictures side by side, all
-    of one size.
-    """
+    """Cameras of a video. `cameras(time_s)` returns the cameras of the pictures side by side, all of one size."""
 
     name: str
     window_s: tuple[float, float]
@@ -137,9 +135,7 @@ def on_orbit(camera: Camera, distance: float, turns: float) -> Camera:
 
 
 def typical_depth(model: Model, camera: Camera) -> float:
-    """Return the median depth at the model's start. Raises InvalidSetting if `camera` sees no part
-    of the scene.
-    """
+    """Return the median depth at the model's start. Raises InvalidSetting if `camera` sees no part of the scene."""
     output = model.render(model.time_window_s[0], camera)
     depth, alpha = HostCopy(output.depth).numpy(), HostCopy(output.alpha).numpy()
     known = depth[(alpha >= COVERED) & (depth > 0)]
@@ -187,9 +183,8 @@ def render_model(
 ) -> int:
     """Render the model to a video file or a folder of PNG images.
 
-    All views but the recorded one hatch unobserved areas. An existing video is replaced only with
-    `overwrite`, an existing folder only if an earlier run made it. Either stays unchanged until the
-    new one is complete.
+    All views but the recorded one hatch unobserved areas. An existing video is replaced only with `overwrite`, an
+    existing folder only if an earlier run made it. Either stays unchanged until the new one is complete.
 
     Args:
         bundle: the saved model.
@@ -284,9 +279,7 @@ def _images(
 
 
 def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
-    """Write the video atomically. After an error the partial video is kept only if no earlier one
-    exists.
-    """
+    """Write the video atomically. After an error the partial video is kept only if no earlier one exists."""
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
     with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
@@ -307,9 +300,7 @@ def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int],
 
 
 def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) -> int:
-    """Write numbered PNG files. After an error the images so far are kept only if the folder was
-    empty.
-    """
+    """Write numbered PNG files. After an error the images so far are kept only if the folder was empty."""
     written = 0
     with OutputFolder(out, "render", inputs) as output:
         reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)

@@ -33,9 +33,7 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings stated in the report. With the source they determine the result of a deterministic
-    run.
-    """
+    """Settings stated in the report. With the source they determine the result of a deterministic run."""
 
     device: str
     engine: str
@@ -52,21 +50,15 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Ending and outputs of a run, and the parts contributed by its operators (see
-    `operators.outcome`).
-    """
+    """Ending and outputs of a run, and the parts contributed by its operators (see `operators.outcome`)."""
 
     command: str
     settings: RunSettings
     started_at: datetime
     wall_s: float
-    """Duration from the start of the run to the end of its graph, in seconds, without saving and
-    baselines.
-    """
+    """Duration from the start of the run to the end of its graph, in seconds, without saving and baselines."""
     stop_reason: str
-    """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the error
-    message.
-    """
+    """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the error message."""
     interrupted: bool
     dropped: int
     """Number of messages dropped by the edges of the graph."""
@@ -140,8 +132,7 @@ class Session:
             finish: steps that `end` calls in order.
             notes: sentences for the report.
             stop_requested: returns True after a stop request.
-            started: start of the run if work began before the session; None for the call of
-                `start`.
+            started: start of the run if work began before the session; None for the call of `start`.
         """
         self.graph, self.settings, self.command, self.engine = graph, settings, command, engine
         self.finish, self.stop_requested = tuple(finish), stop_requested
@@ -154,9 +145,7 @@ class Session:
         self.started = started
 
     def execute(self) -> RunOutcome:
-        """Run all four phases. Raises RunFailed, with the outcome, after all phases if one
-        failed.
-        """
+        """Run all four phases. Raises RunFailed, with the outcome, after all phases if one failed."""
         self.start()
         self.run()
         self.end()
@@ -166,16 +155,12 @@ class Session:
         return outcome
 
     def start(self) -> None:
-        """Start the timer and register a check that rejects conflicting contributions before the
-        run.
-        """
+        """Start the timer and register a check that rejects conflicting contributions before the run."""
         self.started = self.started or Start.now()
         self.graph.checks.append(lambda: self._collect(OutcomeBuilder()))
 
     def run(self) -> None:
-        """Run the graph to its end. Errors of this program are kept in `failure`; KeyboardInterrupt
-        propagates.
-        """
+        """Run the graph to its end. Errors of this program are kept in `failure`; KeyboardInterrupt propagates."""
         assert self.started is not None, "start() comes first"
         # Preserve the state of the caller's random generators.
         with seeded(self.settings.seed, self.settings.device):
@@ -236,9 +221,7 @@ class Session:
             contributor.contribute(outcome)
 
     def _attempt(self, action: Callable[[], object]) -> None:
-        """Perform one step of the run. An error is kept in `failure`, so that later steps still
-        run.
-        """
+        """Perform one step of the run. An error is kept in `failure`, so that later steps still run."""
         try:
             action()
         except (CoreError, OperatorsError, OSError) as error:
@@ -268,9 +251,7 @@ def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], N
 
 
 def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
-    """Return a step that measures trivial baselines on the displayed frames, by reading the source
-    twice more.
-    """
+    """Return a step that measures trivial baselines on the displayed frames, by reading the source twice more."""
 
     def measure(session: Session) -> None:
         if session.stop_requested() or session.failure is not None:
@@ -334,17 +315,15 @@ def delivered(
     run: Callable[[Settings, list[str]], RunOutcome],
     report: Report | None = None,
 ) -> RunOutcome:
-    """Run `run` in a staging folder, add the report, and replace an earlier run's results by the
-    new ones.
+    """Run `run` in a staging folder, add the report, and replace an earlier run's results by the new ones.
 
-    A run that ends with RunFailed delivers its partial results. After any other exception the
-    earlier results are unchanged.
+    A run that ends with RunFailed delivers its partial results. After any other exception the earlier results are
+    unchanged.
 
     Args:
         settings: settings of the run.
         command: name of the command, for the marker of the output folder.
-        run: called with the settings, whose `out` is the staging folder, and a list of notes for
-            the report.
+        run: called with the settings, whose `out` is the staging folder, and a list of notes for the report.
         report: writes the report files; None for no report.
 
     Returns:

@@ -70,8 +70,7 @@ def made_up_tissue(height_px: int, width_px: int) -> NDArray[np.uint8]:
 def trial_run(
     settings: LiveSettings, source: FrameSource, new_graph: Callable[[FrameSource, LiveSettings], Application]
 ) -> None:
-    """Run the graph made by `new_graph` on synthetic pictures, to detect failures before the
-    stream.
+    """Run the graph made by `new_graph` on synthetic pictures, to detect failures before the stream.
 
     Args:
         settings: settings of the live run.
@@ -102,9 +101,7 @@ SHARE_OF_INTERVAL = 0.9
 """Largest share of the frame interval that a frame may take."""
 MOST_MEASUREMENTS = 4
 STARTING_FRAMES, TIMED_FRAMES = 3, 9
-"""Frames per measurement: first those that initialise the model, which are not counted, then those
-timed.
-"""
+"""Frames per measurement: first those that initialise the model, which are not counted, then those timed."""
 GIVEN_UP_S = 2.0
 """Timeout of a frame in seconds. It ends the measurement and counts as the frame's latency."""
 
@@ -143,8 +140,7 @@ def choose_working_size(
 
     Args:
         about: description of the stream at full size.
-        measure: returns the latency of a frame in seconds at a scale; called at most
-            `MOST_MEASUREMENTS` times.
+        measure: returns the latency of a frame in seconds at a scale; called at most `MOST_MEASUREMENTS` times.
         share: share of the frame interval that a frame may take.
     """
     interval_s = 1 / about.fps
@@ -169,9 +165,7 @@ def choose_working_size(
 
 
 def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
-    """Estimate the largest size step whose frames take `allowed_s`, from a fixed cost and a cost
-    per pixel.
-    """
+    """Estimate the largest size step whose frames take `allowed_s`, from a fixed cost and a cost per pixel."""
     near = sorted(measured, key=lambda step: abs(measured[step] - allowed_s))[:2]
     if len(near) == 1:
         (only,) = near
@@ -189,9 +183,7 @@ def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
 
 
 class PacedTissue(ThreadedSource):
-    """Source of synthetic pictures, each emitted after the display of the previous one. Measures
-    their latency.
-    """
+    """Source of synthetic pictures, each emitted after the display of the previous one. Measures their latency."""
 
     def __init__(self, like: SourceDescription) -> None:
         super().__init__(ahead=1)
@@ -232,8 +224,7 @@ class PacedTissue(ThreadedSource):
 def measured_frame_s(
     settings: LiveSettings, about: SourceDescription, new_graph: Callable[[PacedTissue, LiveSettings], Application]
 ) -> float:
-    """Run the graph made by `new_graph` on paced pictures and return the median latency of a frame
-    in seconds.
+    """Run the graph made by `new_graph` on paced pictures and return the median latency of a frame in seconds.
 
     Args:
         settings: settings of the live run; the number of steps is set to the minimum.

@@ -19,8 +19,7 @@ Engine = Literal["embedded", "holoscan"]
 
 
 class Fragment:
-    """A graph of operators. Derive from Application, add operators and flows in `compose`, then
-    call `run`.
+    """A graph of operators. Derive from Application, add operators and flows in `compose`, then call `run`.
 
     Args:
         name: name for logs.
@@ -32,9 +31,7 @@ class Fragment:
         self.result: RunResult | None = None
         """Result of the last run; None before the first run and during a run."""
         self.checks: list[Callable[[], None]] = []
-        """Functions called after composition and before any operator starts. An exception cancels
-        the run.
-        """
+        """Functions called after composition and before any operator starts. An exception cancels the run."""
         self._tracker = FlowTracker() if track else None
         self._scheduler: Scheduler = GreedyScheduler(self)
         self._operators: dict[str, Operator] = {}
@@ -49,9 +46,7 @@ class Fragment:
         raise NotImplementedError(f"{type(self).__name__} has no compose method")
 
     def add_operator(self, operator: Operator) -> None:
-        """Add an operator; `add_flow` does so implicitly. Raises GraphInvalid if another operator
-        has the name.
-        """
+        """Add an operator; `add_flow` does so implicitly. Raises GraphInvalid if another operator has the name."""
         if self._operators.setdefault(operator.name, operator) is not operator:
             raise GraphInvalid(f"two operators are named {operator.name!r}; taken are {sorted(self._operators)}")
 
@@ -100,24 +95,19 @@ class Fragment:
             self._flows.append(Flow(upstream, output, downstream, port, chosen, capacity))
 
     def scheduler(self, scheduler: Scheduler | None = None) -> Scheduler:
-        """Set the scheduler of the next runs, if given, and return the current one (default:
-        GreedyScheduler).
-        """
+        """Set the scheduler of the next runs, if given, and return the current one (default: GreedyScheduler)."""
         if scheduler is not None:
             self._scheduler = scheduler
         return self._scheduler
 
     def track(self) -> FlowTracker:
-        """Enable flow tracking and return the tracker. It is readable during a run and reset by
-        every run.
-        """
+        """Enable flow tracking and return the tracker. It is readable during a run and reset by every run."""
         if self._tracker is None:
             self._tracker = FlowTracker()
         return self._tracker
 
     def run(self) -> RunResult:
-        """Compose the graph and run it until all operators have finished or `stop_execution` is
-        called.
+        """Compose the graph and run it until all operators have finished or `stop_execution` is called.
 
         `result` holds the ending in every case.
 
@@ -142,9 +132,7 @@ class Fragment:
         return future
 
     def stop_execution(self, operator: Operator | None = None) -> None:
-        """Stop the current run, or only one operator. Thread-safe, also within compute; no effect
-        without a run.
-        """
+        """Stop the current run, or only one operator. Thread-safe, also within compute; no effect without a run."""
         if operator is not None:
             operator.stop_execution()
             return
@@ -202,8 +190,7 @@ class Application(Fragment):
 
 
 def run(app: Fragment, engine: Engine = "embedded") -> RunResult:
-    """Run an application on the embedded schedulers or on the Holoscan SDK. Results and counts are
-    the same.
+    """Run an application on the embedded schedulers or on the Holoscan SDK. Results and counts are the same.
 
     Args:
         app: the application.

@@ -39,8 +39,7 @@ class RealtimeClock:
 
 
 class ManualClock:
-    """Simulated time, which advances only when no operator can compute, to the time of the next one
-    due.
+    """Simulated time, which advances only when no operator can compute, to the time of the next one due.
 
     A replay therefore takes only as long as its operators compute, and its result is deterministic.
     """

@@ -1,5 +1,4 @@
-"""Scheduling conditions of operators. An operator computes only if its ports and all conditions
-allow it.
+"""Scheduling conditions of operators. An operator computes only if its ports and all conditions allow it.
 
 Custom conditions derive from `Condition` and implement `check`. They run on every engine.
 """
@@ -42,18 +41,14 @@ class Condition:
         self._wake: Callable[[], None] | None = None
 
     def check(self, timestamp: int) -> Verdict:
-        """Return the status at `timestamp` (ns). Called often under the scheduler's lock, so it
-        must be fast.
-        """
+        """Return the status at `timestamp` (ns). Called often under the scheduler's lock, so it must be fast."""
         raise NotImplementedError
 
     def on_execute(self, timestamp: int) -> None:
         """Update the state after a compute that was found ready at `timestamp` (ns)."""
 
     def wake_scheduler(self) -> None:
-        """Make the scheduler check the conditions again, after a change from outside of
-        `compute`.
-        """
+        """Make the scheduler check the conditions again, after a change from outside of `compute`."""
         wake = self._wake
         if wake is not None:
             wake()
@@ -81,9 +76,7 @@ class PeriodicConditionPolicy(Enum):
     """Treatment of missed ticks. The examples use a period of 100 ms."""
 
     CATCH_UP_MISSED_TICKS = 0
-    """After ticks at 0 and 250 ms, the next are due at 200 and 300 ms, so missed ticks are made up
-    for.
-    """
+    """After ticks at 0 and 250 ms, the next are due at 200 and 300 ms, so missed ticks are made up for."""
     MIN_TIME_BETWEEN_TICKS = 1
     """After ticks at 0 and 101 ms, the next is due at 201 ms."""
     NO_CATCH_UP_MISSED_TICKS = 2
@@ -127,9 +120,7 @@ class PeriodicCondition(Condition):
 
 
 class BooleanCondition(Condition):
-    """Allows computes until `disable_tick`, which is final, as on Holoscan. AsynchronousCondition
-    can pause.
-    """
+    """Allows computes until `disable_tick`, which is final, as on Holoscan. AsynchronousCondition can pause."""
 
     def __init__(self, fragment: Any, enable_tick: bool = True, *, name: str = "") -> None:
         super().__init__(fragment, name=name)
@@ -174,9 +165,7 @@ _EVENT_VERDICTS: dict[AsynchronousEventState, Verdict] = {
 
 
 class AsynchronousCondition(Condition):
-    """Allows computes according to an external event. Set `event_state` from any thread to wake the
-    scheduler.
-    """
+    """Allows computes according to an external event. Set `event_state` from any thread to wake the scheduler."""
 
     def __init__(self, fragment: Any, *, name: str = "") -> None:
         super().__init__(fragment, name=name)
@@ -198,9 +187,7 @@ class AsynchronousCondition(Condition):
 
 
 class MessageAvailableCondition(Condition):
-    """Condition of an input port passed as an operator argument, as on Holoscan. `receiver` names
-    the port.
-    """
+    """Condition of an input port passed as an operator argument, as on Holoscan. `receiver` names the port."""
 
     def __init__(self, fragment: Any, *, receiver: str, min_size: int = 1, name: str = "") -> None:
         super().__init__(fragment, name=name)
@@ -208,8 +195,7 @@ class MessageAvailableCondition(Condition):
 
 
 class MessageOrTimeoutCondition(Condition):
-    """Allows a compute when an input has a message, or `timeout_ns` nanoseconds after the last
-    compute.
+    """Allows a compute when an input has a message, or `timeout_ns` nanoseconds after the last compute.
 
     For operators whose inputs have `ConditionType.NONE` and that also act without messages.
     """
@@ -238,9 +224,7 @@ class MessageOrTimeoutCondition(Condition):
 
 
 class DownstreamMessageAffordableCondition(Condition):
-    """Condition of an output port passed as an operator argument, as on Holoscan. `transmitter`
-    names the port.
-    """
+    """Condition of an output port passed as an operator argument, as on Holoscan. `transmitter` names the port."""
 
     def __init__(self, fragment: Any, *, transmitter: str, min_size: int = 1, name: str = "") -> None:
         super().__init__(fragment, name=name)

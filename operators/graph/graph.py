@@ -38,9 +38,7 @@ class Scheduler(Protocol):
         """Create an edge suited to the scheduler's threads."""
 
     def execute(self, graph: Graph) -> None:
-        """Run the started operators until all have finished, the graph stops, or no operator can
-        compute.
-        """
+        """Run the started operators until all have finished, the graph stops, or no operator can compute."""
 
     def wake(self) -> None:
         """Make the scheduler check all operators again after an external change. Thread-safe."""
@@ -141,9 +139,7 @@ class Graph:
         return None if task is None else task.operator
 
     def run(self) -> RunResult:
-        """Initialise, start, run and stop the operators. Errors and interrupts are kept in the
-        result.
-        """
+        """Initialise, start, run and stop the operators. Errors and interrupts are kept in the result."""
         began = perf_counter()
         interrupt: BaseException | None = None
         self.clock.reset()
@@ -192,9 +188,7 @@ class Graph:
         self.scheduler.wake()
 
     def fail(self, failure: OperatorFailed) -> None:
-        """Stop because of a failed operator. `run()` raises the first failure; later ones are
-        logged.
-        """
+        """Stop because of a failed operator. `run()` raises the first failure; later ones are logged."""
         if self.failure is None:
             self.failure = failure
         else:
@@ -208,9 +202,7 @@ class Graph:
             logger.warning("%s; %s", failure, action.value, exc_info=_traceback_of(failure))
 
     def settle(self, now_ns: int) -> bool:
-        """Finish all operators that can do no more, repeatedly, as each may finish others. Return
-        True if all are.
-        """
+        """Finish all operators that can do no more, repeatedly, as each may finish others. Return True if all are."""
         again = True
         while again:
             again = False
@@ -281,15 +273,11 @@ class OperatorTask:
         self._durations = None if self.tracker is None else self.tracker.operator(self.name)
 
     def gates(self, edge: Edge) -> int:
-        """Return the number of messages that this input edge must hold before compute; 0 if it does
-        not gate.
-        """
+        """Return the number of messages that this input edge must hold before compute; 0 if it does not gate."""
         return next((need for _, gating, need in self._needs if gating is edge), 0)
 
     def leaves_room(self, edge: Edge) -> int:
-        """Return the number of messages that must fit into this output edge before compute; 0 if it
-        does not gate.
-        """
+        """Return the number of messages that must fit into this output edge before compute; 0 if it does not gate."""
         return next((edge.capacity - most for _, gating, most in self._rooms if gating is edge), 0)
 
     def has_messages(self) -> bool:
@@ -307,9 +295,7 @@ class OperatorTask:
         return True
 
     def consent(self, now_ns: int) -> tuple[SchedulingStatus, int]:
-        """Return the combined status of the operator's conditions, with the due time for
-        WAIT_TIME.
-        """
+        """Return the combined status of the operator's conditions, with the due time for WAIT_TIME."""
         status, due_ns = READY, 0
         for condition in self.conditions:
             verdict, at_ns = condition.check(now_ns)
@@ -454,9 +440,7 @@ class OperatorTask:
                 self.start()
 
     def _seq(self) -> int | None:
-        """Return the number of the frame in work, from the metadata or a received message; None if
-        unknown.
-        """
+        """Return the number of the frame in work, from the metadata or a received message; None if unknown."""
         found = [self.operator.metadata.get("seq")]
         found += [getattr(message.value, "seq", None) for message in self.received]
         return next((seq for seq in found if isinstance(seq, int)), None)
@@ -500,9 +484,7 @@ def _check_unconnected(tasks: Iterable[OperatorTask]) -> None:
 
 
 def _topological(tasks: list[OperatorTask], arrows: list[tuple[OperatorTask, OperatorTask]]) -> list[OperatorTask]:
-    """Sort producers before consumers, otherwise in composition order. A cycle starts at its first
-    composed operator.
-    """
+    """Sort producers before consumers, otherwise in composition order. A cycle starts at its first composed operator."""
     ordered: list[OperatorTask] = []
     left = tasks.copy()
     while left:
@@ -514,7 +496,5 @@ def _topological(tasks: list[OperatorTask], arrows: list[tuple[OperatorTask, Ope
 
 
 def _traceback_of(failure: OperatorFailed) -> BaseException | None:
-    """Return the cause of a failure for the log; None for a UserError, whose message needs no
-    traceback.
-    """
+    """Return the cause of a failure for the log; None for a UserError, whose message needs no traceback."""
     return None if isinstance(failure.__cause__, UserError) else failure.__cause__

@@ -1,9 +1,8 @@
 """Execution of a graph on the Holoscan SDK: the SDK schedules operators and transports messages.
 
-Each operator becomes a `Bridge`, and each edge a pair of ports, so that every edge of a fan-out
-keeps its own capacity and policy. A message travels as the opaque `Message`, which the SDK does not
-convert. Faults, stop reasons, counts and tracking are handled by `OperatorTask` and `Graph`, as on
-the embedded engine.
+Each operator becomes a `Bridge`, and each edge a pair of ports, so that every edge of a fan-out keeps its own capacity
+and policy. A message travels as the opaque `Message`, which the SDK does not convert. Faults, stop reasons, counts and
+tracking are handled by `OperatorTask` and `Graph`, as on the embedded engine.
 
 Workarounds for problems of the SDK (4.6):
 
@@ -119,9 +118,7 @@ class Bridge(_Operator):
         super().__init__(fragment, gate, name=task.name)
 
     def setup(self, spec: Any) -> None:
-        """Declare one port per edge. `min_size` is always given, because the SDK's default batches
-        messages.
-        """
+        """Declare one port per edge. `min_size` is always given, because the SDK's default batches messages."""
         kind = _PortCondition.MESSAGE_AVAILABLE
         for edge in self.in_edges:
             port = spec.input(edge.port).connector(_QUEUE, capacity=edge.capacity)
@@ -182,9 +179,7 @@ class HoloscanScheduler:
                 gate.notify_scheduler()
 
     def now_ns(self, timestamp: int) -> int:
-        """Convert the SDK's time to the time of the graph's clock. A manual clock is advanced to
-        the SDK's time.
-        """
+        """Convert the SDK's time to the time of the graph's clock. A manual clock is advanced to the SDK's time."""
         if isinstance(self.clock, ManualClock):
             self.clock.advance_to(timestamp)
         return self.clock.timestamp()

@@ -27,9 +27,7 @@ class FaultAction(Enum):
 
 @dataclass(frozen=True)
 class FaultPolicy:
-    """Reaction of an operator to its own exceptions. Messages in work at that time are lost and
-    counted as a fault.
-    """
+    """Reaction of an operator to its own exceptions. Messages in work at that time are lost and counted as a fault."""
 
     action: FaultAction = FaultAction.STOP_GRAPH
     restarts: int = 0
@@ -82,9 +80,7 @@ class MetadataPolicy(Enum):
     REJECT = "reject"
     """The first received message wins."""
     RAISE = "raise"
-    """Equal values are accepted and different ones raise MetadataConflict, to detect misaligned
-    joins.
-    """
+    """Equal values are accepted and different ones raise MetadataConflict, to detect misaligned joins."""
     INPLACE_UPDATE = "update"  # noqa: PIE796 - alias of the Holoscan SDK
 
 
@@ -145,9 +141,7 @@ class Operator:
         if fault_policy is not None:
             self.fault_policy = fault_policy
         self.metadata: dict[str, Any] = {}
-        """Merged metadata of the messages received in the current compute; attached to emitted
-        messages.
-        """
+        """Merged metadata of the messages received in the current compute; attached to emitted messages."""
         self.conditions: list[Condition] = []
         self.spec = OperatorSpec(self.name)
         self.setup(self.spec)
@@ -181,9 +175,7 @@ class Operator:
         """Release the resources acquired by `start`."""
 
     def stop_execution(self) -> None:
-        """Finish this operator after its current compute; downstream operators drain.
-        Thread-safe.
-        """
+        """Finish this operator after its current compute; downstream operators drain. Thread-safe."""
         self._finish = True
         if self._wake is not None:
             self._wake()
@@ -254,9 +246,7 @@ class InputContext:
         return self._receive_batch(name)
 
     def queued(self, name: str) -> int:
-        """Return the number of queued messages at an input with one connection; 0 if not
-        connected.
-        """
+        """Return the number of queued messages at an input with one connection; 0 if not connected."""
         edge = self._single.get(name)
         return 0 if edge is None else len(edge)
 
@@ -355,9 +345,7 @@ class ExecutionContext:
         """Clock of the scheduler, from the start of the run: `timestamp()` in ns, `time()` in s."""
 
     def find_operator(self, name: str = "") -> Operator | None:
-        """Return an operator of the graph by name, or this operator without a name. None if
-        unknown.
-        """
+        """Return an operator of the graph by name, or this operator without a name. None if unknown."""
         return self._find(name or self._name)
 
 

@@ -1,6 +1,4 @@
-"""Edges of the graph: bounded queues between an output and an input, with counts of dropped
-messages.
-"""
+"""Edges of the graph: bounded queues between an output and an input, with counts of dropped messages."""
 
 from __future__ import annotations
 
@@ -15,9 +13,7 @@ from operators.graph.tracking import Trail
 
 
 class Message:
-    """A queued value with its metadata (None if empty) and, with flow tracking, the path it
-    took.
-    """
+    """A queued value with its metadata (None if empty) and, with flow tracking, the path it took."""
 
     __slots__ = ("metadata", "trail", "value")
 
@@ -37,9 +33,7 @@ class EdgeStats:
     received: int
     queued: int
     dropped: dict[str, int]
-    """Dropped messages by reason: `drop_oldest`, `drop_new`, `closed` (the consumer had
-    finished).
-    """
+    """Dropped messages by reason: `drop_oldest`, `drop_new`, `closed` (the consumer had finished)."""
 
 
 class Edge:
@@ -107,9 +101,7 @@ class Edge:
 
 
 class LockedEdge(Edge):
-    """Edge between threads. Works under the scheduler's lock and wakes the operator at the other
-    end.
-    """
+    """Edge between threads. Works under the scheduler's lock and wakes the operator at the other end."""
 
     def __init__(self, name: str, capacity: int, policy: QueuePolicy, lock: Any) -> None:
         super().__init__(name, capacity, policy)
@@ -134,9 +126,8 @@ class LockedEdge(Edge):
 class CarriedEdge(LockedEdge):
     """Edge whose messages another engine transports, from `sender.emit` to `receiver.receive`.
 
-    The queue mirrors the engine's queue, counts and applies the policy. When `drop_oldest` replaces
-    a message, nothing is sent: the message in flight represents the then oldest one. The engine's
-    queue therefore never overflows.
+    The queue mirrors the engine's queue, counts and applies the policy. When `drop_oldest` replaces a message, nothing
+    is sent: the message in flight represents the then oldest one. The engine's queue therefore never overflows.
     """
 
     port = ""
@@ -154,9 +145,7 @@ class CarriedEdge(LockedEdge):
             self.sender.emit(message, self.port)
 
     def pop(self) -> Message | None:
-        """Receive from the engine and return the oldest message. Raises EngineError for wrong
-        order.
-        """
+        """Receive from the engine and return the oldest message. Raises EngineError for wrong order."""
         carried = self.receiver.receive(self.port)
         if carried is None:
             return None

@@ -20,8 +20,7 @@ _LOOK_S = 0.25
 def interruptible_wait(event: threading.Event, timeout_s: float | None = None) -> bool:
     """Wait for an event in short steps. Raises KeyboardInterrupt within one step after Ctrl-C.
 
-    A single long wait would not notice a signal that arrives just before it blocks or in another
-    thread.
+    A single long wait would not notice a signal that arrives just before it blocks or in another thread.
     """
     due_s = None if timeout_s is None else time.monotonic() + timeout_s
     while True:
@@ -85,9 +84,7 @@ class GreedyScheduler:
                 return
 
     def _await(self, due_ns: int | None, event_awaited: bool) -> bool:
-        """Wait for the next due time or event. Return False if neither is pending, which is a
-        deadlock.
-        """
+        """Wait for the next due time or event. Return False if neither is pending, which is a deadlock."""
         if self._woken.is_set():
             self._woken.clear()
         elif due_ns is not None:
@@ -183,9 +180,7 @@ class MultiThreadScheduler:
             self._over.set()
 
     def _await_ready(self, graph: Graph, task: OperatorTask) -> int | None:
-        """Wait until the operator is ready. Return the time of the check; None if the thread is to
-        end.
-        """
+        """Wait until the operator is ready. Return the time of the check; None if the thread is to end."""
         with self._lock:
             while not graph.stopping:
                 now_ns = self.clock.timestamp() if task.conditions else 0
@@ -213,9 +208,7 @@ class MultiThreadScheduler:
             self._wakers[task].notify()
 
     def _check_deadlock(self, graph: Graph) -> None:
-        """Declare a deadlock if all operators wait for each other, without a due time or event.
-        Requires the lock.
-        """
+        """Declare a deadlock if all operators wait for each other, without a due time or event. Requires the lock."""
         live = [task for task in graph.tasks if not task.finished]
         if live and all(self._asleep.get(task) is SchedulingStatus.WAIT for task in live):
             graph.declare_deadlock(self.clock.timestamp())

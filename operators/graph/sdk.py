@@ -20,9 +20,7 @@ _ADVICE = "install it with: pip install 'intrasplat[holoscan]'"
 
 
 def load_sdk() -> Any:
-    """Return the SDK's modules `core`, `schedulers` and `resources`. Raises EngineMissing naming
-    the missing part.
-    """
+    """Return the SDK's modules `core`, `schedulers` and `resources`. Raises EngineMissing naming the missing part."""
     if importlib.util.find_spec("holoscan") is None:
         raise EngineMissing(f"the Holoscan SDK is not installed; {_ADVICE}")
     _preload_cudart()

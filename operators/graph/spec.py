@@ -49,9 +49,7 @@ class IOSpec:
     """One port. `condition` and `connector` return the port for chaining."""
 
     ANY_SIZE: ClassVar[int] = -1
-    """Size of an input with any number of connections; `receive` returns a tuple with one entry per
-    connection.
-    """
+    """Size of an input with any number of connections; `receive` returns a tuple with one entry per connection."""
     ConnectorType = ConnectorType
     QueuePolicy = QueuePolicy
 
@@ -145,8 +143,7 @@ class OperatorSpec:
             name: unique name of the input.
             size: number of messages per `receive`, or `IOSpec.ANY_SIZE`.
             policy: policy of a full queue; None for `BLOCK`.
-            type: accepted type or union, checked against the connected output when the graph is
-                built.
+            type: accepted type or union, checked against the connected output when the graph is built.
             optional: the input may stay unconnected; `receive` then returns None.
         """
         return self._add(
@@ -162,9 +159,7 @@ class OperatorSpec:
         type: Any = None,
         optional: bool = False,
     ) -> IOSpec:
-        """Declare an output. An `optional` output may stay unconnected; its messages are
-        discarded.
-        """
+        """Declare an output. An `optional` output may stay unconnected; its messages are discarded."""
         port = IOSpec(name, is_input=False, size=size, policy=policy, type=type, optional=optional)
         return self._add(self.outputs, name, port)
 
@@ -188,9 +183,7 @@ class OperatorSpec:
 
 
 def queue_policy(policy: PolicyLike) -> QueuePolicy:
-    """Return the policy for a member or value; None gives BLOCK. Raises GraphInvalid for unknown
-    values.
-    """
+    """Return the policy for a member or value; None gives BLOCK. Raises GraphInvalid for unknown values."""
     if policy is None:
         return QueuePolicy.BLOCK
     try:

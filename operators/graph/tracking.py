@@ -59,8 +59,7 @@ class Histogram:
         """Return the number of durations between consecutive bounds. Thread-safe.
 
         Args:
-            bounds_ns: ascending upper bounds in nanoseconds. A bucket that contains a bound counts
-                as below it.
+            bounds_ns: ascending upper bounds in nanoseconds. A bucket that contains a bound counts as below it.
 
         Returns:
             One count per bound, and the count above the last one.
@@ -88,9 +87,7 @@ class Histogram:
 
 
 def _rank(fraction: float, total: int) -> int:
-    """Return the rank of a quantile among `total` values, rounded up with a tolerance for float
-    errors.
-    """
+    """Return the rank of a quantile among `total` values, rounded up with a tolerance for float errors."""
     return math.ceil(fraction * total - 1e-9 * total)
 
 
@@ -115,9 +112,7 @@ class PathNode:
         self._children: dict[str, PathNode] = {}
 
     def child(self, name: str) -> PathNode | None:
-        """Return the path extended by one operator; None if the operator is already on it (a
-        cycle).
-        """
+        """Return the path extended by one operator; None if the operator is already on it (a cycle)."""
         node = self._children.get(name)
         if node is None and name not in self.names:
             node = self._children[name] = PathNode((*self.names, name))
@@ -131,9 +126,8 @@ Trail = tuple[tuple[PathNode, int], ...]
 class FlowTracker:
     """Latencies of all root-to-leaf paths and compute durations of all operators.
 
-    A path begins when a compute without received messages emits. It ends when an operator without
-    connected outputs returns from the compute that received the message. Times are real times of
-    the machine's clock, also in a replay.
+    A path begins when a compute without received messages emits. It ends when an operator without connected outputs
+    returns from the compute that received the message. Times are real times of the machine's clock, also in a replay.
     """
 
     def __init__(self) -> None:
@@ -158,9 +152,7 @@ class FlowTracker:
         return {path: histogram.summary() for path, histogram in self._paths.copy().items()}
 
     def latency_quantiles_ms(self, fractions: Sequence[float]) -> dict[str, list[float]]:
-        """Return the latency quantiles in milliseconds by path, at ascending levels 0..1.
-        Thread-safe.
-        """
+        """Return the latency quantiles in milliseconds by path, at ascending levels 0..1. Thread-safe."""
         return {path: histogram.quantiles_ms(fractions) for path, histogram in self._paths.copy().items()}
 
     def compute(self) -> dict[str, DurationSummary]:
@@ -179,9 +171,7 @@ class FlowTracker:
         return ((root, began_ns),)
 
     def extend(self, operator: str, trails: list[Trail]) -> Trail:
-        """Return the trail of a message emitted after receiving messages with `trails`; keeps the
-        oldest time per path.
-        """
+        """Return the trail of a message emitted after receiving messages with `trails`; keeps the oldest time per path."""
         merged: dict[PathNode, int] = {}
         for trail in trails:
             for node, began_ns in trail:

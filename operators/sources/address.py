@@ -41,9 +41,7 @@ class SourceOptions:
     bounce: bool = False
     """Play every second round of a loop backwards, which avoids a jump between rounds."""
     speed: float = 1.0
-    """Playback speed of a recording. `math.inf`: each frame when the previous one is taken, without
-    drops.
-    """
+    """Playback speed of a recording. `math.inf`: each frame when the previous one is taken, without drops."""
     fps: float | None = None
     """Frame rate that replaces the recording's own, in frames/s."""
     waiting: int = 2
@@ -156,9 +154,7 @@ class Address:
         return _FLAGS[text.lower()]
 
     def size(self, name: str = "size") -> tuple[int, int] | None:
-        """Return an option for width and height in pixels, such as `640x512`. Raises
-        InvalidSetting.
-        """
+        """Return an option for width and height in pixels, such as `640x512`. Raises InvalidSetting."""
         text = self.text(name)
         if text is None:
             return None
@@ -190,16 +186,12 @@ PROTOCOLS = {
     "http": "http,https,httpproxy,tcp,tls,crypto",
     "https": "https,http,httpproxy,tcp,tls,crypto",
 }
-"""Protocols that FFmpeg may open for each scheme. Files are excluded, even if a server or playlist
-names one.
-"""
+"""Protocols that FFmpeg may open for each scheme. Files are excluded, even if a server or playlist names one."""
 FORMATS = (
     "rtsp,rtp,sdp,mpegts,flv,live_flv,mov,mp4,matroska,webm,avi,asf,ogg,nut,mpjpeg,mjpeg,h264,hevc,mpeg,mpegvideo,m4v,ivf,"
     "yuv4mpegpipe,hls,jpeg_pipe,png_pipe"
 )
-"""Permitted demuxers. None opens other files by name except HLS, whose segments are restricted by
-`PROTOCOLS`.
-"""
+"""Permitted demuxers. None opens other files by name except HLS, whose segments are restricted by `PROTOCOLS`."""
 _LABEL = re.compile(r"(?![-])[\w-]{1,63}(?<!-)")
 
 
@@ -220,9 +212,7 @@ class UrlAddress:
 
     @classmethod
     def parse(cls, scheme: str, rest: str) -> UrlAddress:
-        """Parse the text after `scheme://`. Raises InvalidSetting, without secrets, for an invalid
-        URL.
-        """
+        """Parse the text after `scheme://`. Raises InvalidSetting, without secrets, for an invalid URL."""
         place, _, fragment = rest.partition("#")
         url = f"{scheme}://{place}"
         ours = Address.parse(scheme, f"?{fragment}")
@@ -273,9 +263,7 @@ class UrlAddress:
 
 
 def _is_host(host: str) -> bool:
-    """Return True for an IP address or a valid host name: labels of letters, digits, - and _,
-    separated by dots.
-    """
+    """Return True for an IP address or a valid host name: labels of letters, digits, - and _, separated by dots."""
     with contextlib.suppress(ValueError):
         ipaddress.ip_address(host.partition("%")[0])
         return True

@@ -97,16 +97,13 @@ MOST_KEPT = 8
 
 
 class SplitSource(DerivedSource):
-    """`FrameSource` that splits each picture into a left or upper half (`image`) and the other half
-    (`right_image`).
+    """`FrameSource` that splits each picture into a left or upper half (`image`) and the other half (`right_image`).
 
     Halves that the sender has squeezed are not stretched. All other fields belong to the left eye.
     """
 
     def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
-        """Raises InvalidSetting if the source already has right pictures, or its camera is not that
-        of one eye.
-        """
+        """Raises InvalidSetting if the source already has right pictures, or its camera is not that of one eye."""
         self._layout = layout
         super().__init__(source, self._described(source.description))
 
@@ -162,11 +159,10 @@ class SplitSource(DerivedSource):
 
 
 class JoinedSource(LiveSource):
-    """Pairs each frame of the left source with the frame of the right source closest in arrival
-    time.
+    """Pairs each frame of the left source with the frame of the right source closest in arrival time.
 
-    A left frame waits for its right one for at most half a frame interval. Without one it is
-    emitted alone and counted as `without_right`, so that a lost eye never interrupts the stream.
+    A left frame waits for its right one for at most half a frame interval. Without one it is emitted alone and counted
+    as `without_right`, so that a lost eye never interrupts the stream.
     """
 
     def __init__(
@@ -178,8 +174,7 @@ class JoinedSource(LiveSource):
             left: source of the left eye.
             right: source of the right eye.
             waiting: capacity of the queue for `read`, in frames.
-            apart_s: largest difference of arrival times in a pair, in seconds; None: half a frame
-                interval.
+            apart_s: largest difference of arrival times in a pair, in seconds; None: half a frame interval.
 
         Raises:
             InvalidSetting: the sizes differ.
@@ -215,9 +210,7 @@ class JoinedSource(LiveSource):
         return "; ".join(said) or super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
-        """Return the counts of this source, and those of both eyes prefixed by `left` or
-        `right`.
-        """
+        """Return the counts of this source, and those of both eyes prefixed by `left` or `right`."""
         counts = Counter(super().counts())
         for name, eye in (("left", self._left), ("right", self._right)):
             if isinstance(eye, ReportingSource):
@@ -267,7 +260,5 @@ class JoinedSource(LiveSource):
 
 
 def moment_ns(frame: Frame) -> int:
-    """Return a frame's arrival time, which is comparable between sources; its timestamp if not
-    live.
-    """
+    """Return a frame's arrival time, which is comparable between sources; its timestamp if not live."""
     return frame.pts_ns if frame.arrived_ns is None else frame.arrived_ns

@@ -16,16 +16,12 @@ from operators.sources.address import OPEN_S, FolderAddress, SourceOptions
 from operators.sources.live import DEFAULT_FPS, SteadyClock, StreamSource
 
 SHARE = 10
-"""Minimum pause between scans of the folder, as a multiple of a scan's duration, because large
-folders are slow.
-"""
+"""Minimum pause between scans of the folder, as a multiple of a scan's duration, because large folders are slow."""
 _LAST_NUMBER = re.compile(r"(\d+)(?=\D*$)")
 
 
 class NewFiles:
-    """Yields images that follow the last one in name order. Names before it are skipped and counted
-    in `late`.
-    """
+    """Yields images that follow the last one in name order. Names before it are skipped and counted in `late`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -43,9 +39,7 @@ class NewFiles:
             self.taken()
 
     def next(self) -> Path | None:
-        """Return the next image, the same one until `taken`. None if there is none. Raises OSError
-        without the folder.
-        """
+        """Return the next image, the same one until `taken`. None if there is none. Raises OSError without the folder."""
         if self._waiting:
             return self._waiting[0]
         following = None if self._last is None else following_name(self._last)
@@ -88,9 +82,7 @@ def is_image(name: str) -> bool:
 
 
 def following_name(path: Path) -> Path | None:
-    """Return the path with the next number, `frame-000042.png` after `frame-000041.png`; None
-    without a number.
-    """
+    """Return the path with the next number, `frame-000042.png` after `frame-000041.png`; None without a number."""
     found = _LAST_NUMBER.search(path.stem)
     if found is None:
         return None

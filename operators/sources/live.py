@@ -49,27 +49,20 @@ class Backoff:
 
 
 RESET_S = 1.0
-"""Backward step of a sender's timestamp, in seconds, that counts as a restart rather than a late
-frame.
-"""
+"""Backward step of a sender's timestamp, in seconds, that counts as a restart rather than a late frame."""
 JUMP_S = 2.0
-"""Excess of a sender's timestamp step over the local clock, in seconds, that counts as a clock
-change.
-"""
+"""Excess of a sender's timestamp step over the local clock, in seconds, that counts as a clock change."""
 MOST_LOST = 1_000_000
 """Gap in sequence numbers above which a restart is assumed instead of lost frames."""
 RESET_FRAMES = 3
-"""Number of consecutive late frames, in order among themselves, that count as a restarted
-sender.
-"""
+"""Number of consecutive late frames, in order among themselves, that count as a restarted sender."""
 
 
 class FrameOrder:
     """Produces increasing `seq` and `pts_ns` from any sender.
 
-    Duplicate and late frames are dropped. If a sender restarts or its clock is changed, numbers and
-    timestamps continue; the step between the two frames is measured with the local clock. All
-    repairs are counted.
+    Duplicate and late frames are dropped. If a sender restarts or its clock is changed, numbers and timestamps
+    continue; the step between the two frames is measured with the local clock. All repairs are counted.
     """
 
     def __init__(self, *, trusted: bool = False) -> None:
@@ -97,9 +90,7 @@ class FrameOrder:
         self._restarted = False
 
     def restart(self) -> None:
-        """Continue numbers and timestamps with the next frame, which arrives over a new
-        connection.
-        """
+        """Continue numbers and timestamps with the next frame, which arrives over a new connection."""
         self._restarted = True
 
     def take(self, frame: Frame, arrived_ns: int) -> Frame | None:
@@ -141,9 +132,7 @@ class FrameOrder:
         return self._accept(frame, pts_ns, arrived_ns)
 
     def _is_a_new_beginning(self, frame: Frame) -> bool:
-        """Return True if the recent late frames form a consecutive stream, so that the sender has
-        restarted.
-        """
+        """Return True if the recent late frames form a consecutive stream, so that the sender has restarted."""
         late = self._late
         goes_on = late is not None and frame.seq > late.seq and frame.pts_ns >= late.pts_ns
         self._late_count = self._late_count + 1 if goes_on else 1
@@ -151,9 +140,7 @@ class FrameOrder:
         return self._late_count >= RESET_FRAMES
 
     def _rebase(self, frame: Frame, arrived_ns: int, reason: str | None) -> Frame:
-        """Continue with the next number, and with the time elapsed on the local clock since the
-        last frame.
-        """
+        """Continue with the next number, and with the time elapsed on the local clock since the last frame."""
         assert self._out is not None
         if reason is not None:
             self._counts[reason] += 1
@@ -183,10 +170,9 @@ STALLED_AFTER_S = 1.0
 class LiveSource(ThreadedSource):
     """`FrameSource` in real time. A subclass provides `description` and `frames()`.
 
-    `frames()` runs in a daemon thread and yields each frame on arrival. The queue for `read` holds
-    at most `waiting` frames; a further one replaces the oldest, counted as `too_late`. `frames()`
-    uses `wait` for waiting, `lost` to report a lost connection, and `count` for dropped or repaired
-    items.
+    `frames()` runs in a daemon thread and yields each frame on arrival. The queue for `read` holds at most `waiting`
+    frames; a further one replaces the oldest, counted as `too_late`. `frames()` uses `wait` for waiting, `lost` to
+    report a lost connection, and `count` for dropped or repaired items.
     """
 
     close_timeout_s = 1.0
@@ -232,9 +218,7 @@ class LiveSource(ThreadedSource):
                 self._counts[reason] += times
 
     def lost(self, sentence: str) -> None:
-        """Report a lost connection. The state holds until the next frame, which continues numbers
-        and timestamps.
-        """
+        """Report a lost connection. The state holds until the next frame, which continues numbers and timestamps."""
         with self._changed:
             if self._my_stop().is_set():
                 return
@@ -246,9 +230,7 @@ class LiveSource(ThreadedSource):
             self._order.restart()
 
     def _my_stop(self) -> threading.Event:
-        """Return the stop event of the current thread. A reader that outlived `close` keeps its own
-        event.
-        """
+        """Return the stop event of the current thread. A reader that outlived `close` keeps its own event."""
         return getattr(self._own, "stop", self._stop)
 
     # Methods for the consumer.
@@ -344,11 +326,10 @@ PAUSE_S = 1.0
 
 
 class SteadyClock:
-    """Advances the timestamp by one period per frame, plus a correction if it lags behind the
-    clock.
+    """Advances the timestamp by one period per frame, plus a correction if it lags behind the clock.
 
-    Arrival times jitter, which would disturb a deformation learned over time. Frames that arrive
-    faster than the nominal rate, for example from a piped file, keep that rate.
+    Arrival times jitter, which would disturb a deformation learned over time. Frames that arrive faster than the
+    nominal rate, for example from a piped file, keep that rate.
     """
 
     def __init__(self, fps: float) -> None:
@@ -357,9 +338,7 @@ class SteadyClock:
         self._time_ns = 0.0
 
     def time_ns(self, arrived_ns: int) -> int:
-        """Return the timestamp in nanoseconds of a frame that arrived at `arrived_ns`; 0 for the
-        first one.
-        """
+        """Return the timestamp in nanoseconds of a frame that arrived at `arrived_ns`; 0 for the first one."""
         if self._first_ns is None:
             self._first_ns = arrived_ns
             return 0
@@ -375,9 +354,7 @@ MIN_SIDE_PX = 8
 
 
 class StreamSource(LiveSource):
-    """`LiveSource` for an external sender. A subclass calls `describe` and implements
-    `pictures()`.
-    """
+    """`LiveSource` for an external sender. A subclass calls `describe` and implements `pictures()`."""
 
     def __init__(self, options: SourceOptions, *, stalled_after_s: float = STALLED_AFTER_S) -> None:
         """Set the options.
@@ -440,9 +417,7 @@ class StreamSource(LiveSource):
         )
 
     def pictures(self) -> Iterator[Frame]:
-        """Yield frames on arrival, with the sender's numbers and timestamps. Runs in the reader's
-        thread.
-        """
+        """Yield frames on arrival, with the sender's numbers and timestamps. Runs in the reader's thread."""
         raise NotImplementedError(f"{type(self).__name__} has no pictures method")
 
     def frames(self) -> Iterator[Frame]:

@@ -46,9 +46,7 @@ PLANES: dict[str, tuple[tuple[int, int, int], ...]] = {
 
 
 class RawFormat:
-    """Format of contiguous pictures of one size, as written by `ffmpeg -f rawvideo` and GStreamer's
-    `fdsink`.
-    """
+    """Format of contiguous pictures of one size, as written by `ffmpeg -f rawvideo` and GStreamer's `fdsink`."""
 
     def __init__(self, name: str, width_px: int, height_px: int) -> None:
         """Raises InvalidSetting for an unknown format or an unusable size."""
@@ -221,9 +219,7 @@ class PipeSource(StreamSource):
                     self._raw = None
 
     def _frames_of_a_writer(self) -> Iterator[memoryview]:
-        """Yield the bytes of each frame. Raises Ended if the writer is gone, SourceLost if the
-        stream is out of sync.
-        """
+        """Yield the bytes of each frame. Raises Ended if the writer is gone, SourceLost if the stream is out of sync."""
         if self._raw is None:
             self._read_header(None)
         assert self._raw is not None

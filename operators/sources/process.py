@@ -45,9 +45,7 @@ _ALIGNMENT = 64
 
 
 def new_memory() -> int:
-    """Return a file descriptor of empty shared memory, inheritable by a child process through
-    `pass_fds`.
-    """
+    """Return a file descriptor of empty shared memory, inheritable by a child process through `pass_fds`."""
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("frames", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         # Shrinking the memory would crash the reader.
@@ -170,9 +168,7 @@ IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _REPORT_S = 0.1
 """Period of state messages to the parent while no frame arrives, in seconds."""
 _EXIT_WITHIN_S = 0.6
-"""Time limit in seconds to exit after the parent has closed the connection, even if the source
-blocks.
-"""
+"""Time limit in seconds to exit after the parent has closed the connection, even if the source blocks."""
 
 
 class Served:
@@ -196,9 +192,7 @@ class Served:
             self._let_go()
 
     def listen(self) -> None:
-        """Receive messages from the parent until the connection closes, then exit. Runs in its own
-        thread.
-        """
+        """Receive messages from the parent until the connection closes, then exit. Runs in its own thread."""
         try:
             while True:
                 received = parsed(self._connection.recv_bytes(1 << 12))
@@ -272,8 +266,7 @@ def serve_source(connection_fd: int, memory_fd: int) -> None:
     The process ends when the parent closes the connection, even if the source blocks. It ignores signals sent to the
     process group, because the parent controls its lifetime.
 
-    The first message names the function that opens the source (`module:function`), an address and
-    options.
+    The first message names the function that opens the source (`module:function`), an address and options.
 
     Args:
         connection_fd: file descriptor of the connection to the parent.
@@ -387,9 +380,7 @@ class ChildProcess:
         return received
 
     def end(self) -> None:
-        """Close the connection, wait for the process to exit, kill it if necessary, and free its
-        resources.
-        """
+        """Close the connection, wait for the process to exit, kill it if necessary, and free its resources."""
         self.connection.close()
         try:
             self._process.wait(END_WITHIN_S)
@@ -432,9 +423,8 @@ LOOK_S = 0.05
 class ProcessSource(LiveSource):
     """Reads a source in a child process, which is restarted after an exit, hang or failure.
 
-    Frames arrive through shared memory. Numbers and timestamps continue over a restart. The
-    constructor starts the process and raises if the source cannot be opened. `close` ends the
-    process.
+    Frames arrive through shared memory. Numbers and timestamps continue over a restart. The constructor starts the
+    process and raises if the source cannot be opened. `close` ends the process.
     """
 
     def __init__(
@@ -455,11 +445,10 @@ class ProcessSource(LiveSource):
             options: source options.
             opener: `module:function` called in the process with address and options.
             hung_after_s: time without a message after which the process is replaced, in seconds.
-            stuck_after_s: time without a frame of a stalled source after which the process is
-                replaced.
+            stuck_after_s: time without a frame of a stalled source after which the process is replaced.
             open_timeout_s: timeout for opening the source, in seconds.
-            may_return: a source that is unavailable may return, such as a camera. Otherwise, as for a missing file,
-                the failure counts towards `MOST_FAILURES`.
+            may_return: a source that is unavailable may return, such as a camera. Otherwise, as for a missing file, the
+                failure counts towards `MOST_FAILURES`.
 
         Raises:
             SourceUnavailable: the source cannot be opened; has the message of the process.
@@ -483,9 +472,7 @@ class ProcessSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """State of the source. The state reported by the process applies while the process
-        responds.
-        """
+        """State of the source. The state reported by the process applies while the process responds."""
         state, reported, child = super().state, self._child_state, self._child
         if state is not SourceState.LIVE or self._ready:
             return state

@@ -40,8 +40,7 @@ class RealtimeSource(LiveSource):
 
         Args:
             recording: the recording.
-            options: `loop`, `bounce`, `speed`, `fps`, `max_frames` over all rounds, and `waiting`
-                apply.
+            options: `loop`, `bounce`, `speed`, `fps`, `max_frames` over all rounds, and `waiting` apply.
         """
         options = options or SourceOptions()
         super().__init__(waiting=options.waiting, drops=math.isfinite(options.speed))
@@ -120,16 +119,12 @@ class RealtimeSource(LiveSource):
             yield iter(remembered or self.recording)
 
     def _backwards(self, forwards: list[Frame]) -> list[Frame]:
-        """Return the frames between the last and the first in reverse, with increasing
-        timestamps.
-        """
+        """Return the frames between the last and the first in reverse, with increasing timestamps."""
         last_ns = forwards[-1].pts_ns
         return [replace(frame, pts_ns=last_ns - frame.pts_ns) for frame in reversed(forwards[1:-1])]
 
     def _remembering(self, remembered: list[Frame]) -> Iterator[Frame]:
-        """Yield the frames of the first round, storing them in `remembered` unless they are too
-        large.
-        """
+        """Yield the frames of the first round, storing them in `remembered` unless they are too large."""
         size = 0
         fits = True
         for frame in self.recording:
@@ -193,9 +188,7 @@ class RecordingSource(ThreadedSource):
 
 
 def recording_source(address: str, options: SourceOptions) -> FrameSource:
-    """Open a recording by its path, in real time if requested. Raises the errors of
-    `open_recording`.
-    """
+    """Open a recording by its path, in real time if requested. Raises the errors of `open_recording`."""
     if options.realtime:
         return play(address, options)
     return RecordingSource(open_recording(address, scale=options.scale, max_frames=options.max_frames))

@@ -1,6 +1,4 @@
-"""Registry of sources by the scheme of an address: `scheme:place`, `scheme://place`, or a
-recording's path.
-"""
+"""Registry of sources by the scheme of an address: `scheme:place`, `scheme://place`, or a recording's path."""
 
 from __future__ import annotations
 
@@ -20,9 +18,7 @@ from operators.sources.source import FrameSource
 __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "check_address", "open_source", "split_address"]
 
 SourceFactory = Callable[[str, SourceOptions], FrameSource]
-"""Creates a closed source from the text after the scheme and the options. Raises a UserError if it
-is unusable.
-"""
+"""Creates a closed source from the text after the scheme and the options. Raises a UserError if it is unusable."""
 
 _URLS = ("rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https")
 
@@ -44,9 +40,7 @@ SOURCES: Registry[SourceFactory] = Registry(
 _OF_PATHS = frozenset({"recording", "realtime", "folder", "v4l2", "pipe", "zmq+ipc"})
 """Schemes followed by a path, which may begin with a slash."""
 _BLOCKING = frozenset({*_URLS, "v4l2"})
-"""Schemes of sources that block in a library or driver and are therefore read in a separate
-process.
-"""
+"""Schemes of sources that block in a library or driver and are therefore read in a separate process."""
 
 _ON_DISK = frozenset({"recording", "realtime"})
 """Schemes of files, which do not return once they are missing."""
@@ -54,9 +48,7 @@ _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
 """Opening timeouts of slow sources in seconds; `synthetic` renders before it plays."""
 STUCK_AFTER_S = {"v4l2": 5.0}
-"""Time in seconds after which the process of a stalled source is replaced; a driver may block
-forever.
-"""
+"""Time in seconds after which the process of a stalled source is replaced; a driver may block forever."""
 _TWO_SOURCES = "stereo:"
 _STEREO = re.compile(r"(?P<before>[?&#])stereo=(?P<layout>[^&#]*)")
 
@@ -67,8 +59,7 @@ _ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):(?P<slashes>/{0,2})(?P<res
 def split_address(address: str | os.PathLike[str]) -> tuple[str, str]:
     """Split an address into its scheme and the rest.
 
-    An existing path is always a recording, and so is text without a known scheme or slashes after
-    it.
+    An existing path is always a recording, and so is text without a known scheme or slashes after it.
     """
     text = os.fspath(address)
     match = None if _exists(text) else _ADDRESS.fullmatch(text)
@@ -151,9 +142,7 @@ def _reads_in_a_process(scheme: str, rest: str, options: SourceOptions) -> bool:
 
 
 def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout | None]:
-    """Return the address without its `stereo` option, and the stereo layout from it or from the
-    options.
-    """
+    """Return the address without its `stereo` option, and the stereo layout from it or from the options."""
     if _exists(address) or not _ADDRESS.fullmatch(address):
         return address, options.stereo
     said = _STEREO.search(address)

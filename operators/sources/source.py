@@ -260,9 +260,7 @@ class ThreadedSource:
         """Make a blocked `frames()` return soon. Called by `close` from another thread."""
 
     def _ended(self, error: BaseException | None) -> None:
-        """Handle the end of the iterator; `error` is its exception or None. Called once per
-        reading, with the lock.
-        """
+        """Handle the end of the iterator; `error` is its exception or None. Called once per reading, with the lock."""
 
     def _run(self, stop: threading.Event) -> None:
         """Main function of the reader's thread."""

@@ -19,9 +19,8 @@ MOST_BYTES = 512 * 2**20
 def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
     """Open `synthetic:?width=640&height=512&fps=30&seed=0&frames=48&moving=1&eyes=1`.
 
-    Ray casting is slower than real time, so `frames` frames are rendered first and then played
-    forwards and backwards. They are cached for later runs. Raises InvalidSetting for options out of
-    range.
+    Ray casting is slower than real time, so `frames` frames are rendered first and then played forwards and backwards.
+    They are cached for later runs. Raises InvalidSetting for options out of range.
     """
     address = SyntheticAddress.parse(rest, options)
     width, height = (max(32, round(side * options.scale)) for side in (address.width_px, address.height_px))

@@ -26,9 +26,7 @@ PACKETS_WITHOUT_KEY = 300
 
 
 class ConnectionFailed(Exception):
-    """The connection failed. The message never contains the address, which may include a
-    password.
-    """
+    """The connection failed. The message never contains the address, which may include a password."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,7 @@ class Place:
 
 
 class Connection:
-    """An open stream. Raises ConnectionFailed if it cannot be opened or has no picture of a usable
-    size.
-    """
+    """An open stream. Raises ConnectionFailed if it cannot be opened or has no picture of a usable size."""
 
     def __init__(self, place: Place) -> None:
         self._container: av.container.InputContainer | None = None
@@ -83,9 +79,7 @@ class Connection:
         self.size = width_px, height_px
         self.fps = frame_rate(stream) or None
         self.has_an_end = bool(self._container.duration and self._container.duration > 0)
-        """True if the stream states its duration. Its end is then regular, otherwise a lost
-        connection.
-        """
+        """True if the stream states its duration. Its end is then regular, otherwise a lost connection."""
         try:
             self._decoder, self._converter = PictureDecoder(stream, probe=False), PictureConverter(0)
         except (av.FFmpegError, ValueError) as error:
@@ -155,9 +149,7 @@ class Connection:
 
 
 class StreamDamage:
-    """Damage of pictures: suspicious ones, and those predicted from them up to the next key
-    frame.
-    """
+    """Damage of pictures: suspicious ones, and those predicted from them up to the next key frame."""
 
     def __init__(self) -> None:
         self._keys: list[int] = []
@@ -192,9 +184,7 @@ def _words(error: Exception) -> str:
 
 
 FRESH_S = 1.0
-"""Age in seconds at which an idle connection is replaced before reading, because its data are
-outdated.
-"""
+"""Age in seconds at which an idle connection is replaced before reading, because its data are outdated."""
 
 
 class ConnectedSource(StreamSource):
@@ -266,9 +256,7 @@ class ConnectedSource(StreamSource):
 
 
 def url_source(scheme: str, rest: str, options: SourceOptions) -> ConnectedSource:
-    """Open `scheme://rest`, with options of this program after `#`. Raises InvalidSetting and
-    SourceUnavailable.
-    """
+    """Open `scheme://rest`, with options of this program after `#`. Raises InvalidSetting and SourceUnavailable."""
     address = UrlAddress.parse(scheme, rest)
     place = Place(address.url, address.options(), open_s=address.open_s, read_s=address.stall_s)
     return ConnectedSource(place, address.name, options)

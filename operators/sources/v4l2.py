@@ -16,11 +16,10 @@ READ_S = 5.0
 
 
 def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
-    """Open `v4l2:/dev/video0?size=1920x1080&fps=60&format=mjpeg`; omitted options keep the driver's
-    settings.
+    """Open `v4l2:/dev/video0?size=1920x1080&fps=60&format=mjpeg`; omitted options keep the driver's settings.
 
-    A disconnected camera is searched for again. Raises InvalidSetting, and SourceUnavailable if the
-    device does not exist.
+    A disconnected camera is searched for again. Raises InvalidSetting, and SourceUnavailable if the device does not
+    exist.
     """
     address = V4l2Address.parse(rest, options)
     size, fps, name = address.size, address.fps, address.format
@@ -37,9 +36,7 @@ def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
 
 
 def device_of(path: str) -> str:
-    """Resolve `/dev/video0`, or a link to it as in `/dev/v4l/by-id/`. Raises InvalidSetting and
-    SourceUnavailable.
-    """
+    """Resolve `/dev/video0`, or a link to it as in `/dev/v4l/by-id/`. Raises InvalidSetting and SourceUnavailable."""
     device = os.path.realpath(path) if path.startswith("/dev/") and "\0" not in path else path
     # Opening a device can have side effects, so only camera devices are accepted.
     if not _DEVICE.fullmatch(device):

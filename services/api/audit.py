@@ -20,8 +20,7 @@ from services.schemas.service import AuditPage, EntryView, Moment
 router = new_router("audit")
 MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/jsonl"}
 Text = Annotated[str, Query(pattern=r"^[A-Za-z0-9_ .:@/+()-]{1,100}$")]
-"""Filter text. Restricted to characters of audit values, because the filter itself is recorded in
-the log."""
+"""Filter text. Restricted to characters of audit values, because the filter itself is recorded in the log."""
 
 
 def wanted_of(

@@ -97,8 +97,8 @@ async def until_ended(
 ) -> AsyncIterator[Ending]:
     """Run a block until the display has to end.
 
-    The block is cancelled when the server drains, `left` returns, the connection breaks, or the
-    caller's key becomes invalid.
+    The block is cancelled when the server drains, `left` returns, the connection breaks, or the caller's key becomes
+    invalid.
 
     Args:
         connection: the viewer's connection.
@@ -109,8 +109,7 @@ async def until_ended(
         The reason, readable after the block.
 
     Raises:
-        ViewerStalled: if the connection accepts nothing more; waiting for the close would block
-            forever.
+        ViewerStalled: if the connection accepts nothing more; waiting for the close would block forever.
     """
     control = control_of(connection)
     stalled: ViewerStalled | None = None

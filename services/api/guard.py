@@ -125,8 +125,7 @@ def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
 
 
 async def _caller_of(connection: HTTPConnection) -> Caller:
-    """Return the caller of a request. WebSockets are guarded here, because their routes have no
-    handler to wrap."""
+    """Return the caller of a request. WebSockets are guarded here, because their routes have no handler to wrap."""
     if connection.scope["type"] == "websocket":
         rule = rule_of(connection.scope["endpoint"])
         admitted = await _admit(connection, rule, control_of(connection))
@@ -140,8 +139,7 @@ CallerOf = Annotated[Caller, Depends(_caller_of)]
 
 
 def still_valid(control: ControlState, caller: Caller) -> bool:
-    """Return False once a caller lost access: key revoked, expired or changed in role or streams,
-    or token expired.
+    """Return False once a caller lost access: key revoked, expired or changed in role or streams, or token expired.
 
     For connections that outlast their admission, such as displays.
     """

@@ -89,10 +89,9 @@ _HOST = re.compile(r"(?P<name>[a-z0-9._-]{1,253}|\[[0-9a-f:.]{2,45}\])(:\d{1,5})
 class KnownHosts:
     """Middleware that answers 421 to a request for an unknown host.
 
-    IP addresses are always accepted, because a browser sends one only for a page served from that
-    address. `localhost` and `server.host` are accepted too. Other names must be in
-    `server.allowed_hosts`. With TLS and an empty list every name is accepted, because the
-    certificate restricts the names.
+    IP addresses are always accepted, because a browser sends one only for a page served from that address. `localhost`
+    and `server.host` are accepted too. Other names must be in `server.allowed_hosts`. With TLS and an empty list every
+    name is accepted, because the certificate restricts the names.
     """
 
     def __init__(self, app: ASGIApp, server: ServerSettings, measures: Measures) -> None:
@@ -143,8 +142,7 @@ _BETWEEN = len(": \r\n")
 class HeadLength:
     """Middleware that answers 431 to a request whose head is longer than `MOST_HEAD_BYTES`.
 
-    The HTTP parser limits only incomplete heads; a long head that arrives in one piece passes the
-    parser.
+    The HTTP parser limits only incomplete heads; a long head that arrives in one piece passes the parser.
     """
 
     def __init__(self, app: ASGIApp, measures: Measures) -> None:
@@ -194,8 +192,7 @@ def refuse_by_length(request: Request, most_bytes: int) -> None:
 
 
 class BoundedBody:
-    """ASGI `receive` that raises TooLarge after `most_bytes` and TooSlow for a body that stalls or
-    trickles."""
+    """ASGI `receive` that raises TooLarge after `most_bytes` and TooSlow for a body that stalls or trickles."""
 
     def __init__(self, scope: Scope, receive: Receive, most_bytes: int, limits: LimitSettings) -> None:
         self._scope = scope
@@ -284,8 +281,7 @@ def network_of(scope: Scope) -> str:
 
 
 def network_of_address(host: str) -> str:
-    """Return the network of an address: the /64 for IPv6, since one host can use a whole /64,
-    otherwise the address."""
+    """Return the network of an address: the /64 for IPv6, since one host can use a whole /64, otherwise the address."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:

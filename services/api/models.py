@@ -57,8 +57,7 @@ async def model_version(request: Request, name: ResourceName, number: Number) ->
 @router.post("/models/{name}/activate")
 @requires("operator")
 async def activate_model(request: Request, caller: CallerOf, name: ResourceName, wanted: Activation) -> VersionView:
-    """Activate a version from the next frame on. 409 if another version than `expected_current` is
-    active."""
+    """Activate a version from the next frame on. 409 if another version than `expected_current` is active."""
     registry = registry_of(request)
     detail = {"expected_current": wanted.expected_current}
     async with recorded(request, caller, "model.activate", f"{name}/{wanted.version}", {**detail}):
@@ -139,8 +138,7 @@ def check_soon(control: ControlState, registry: ModelRegistry, record: VersionRe
 
 
 async def _check(control: ControlState, registry: ModelRegistry, name: str, version: int) -> None:
-    """Check a version and store the result. If the check cannot run, the state is unchanged until
-    the next start."""
+    """Check a version and store the result. If the check cannot run, the state is unchanged until the next start."""
     events = control.parts.events
     try:
         record = await asyncio.to_thread(registry.check, name, version)

@@ -47,8 +47,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Log formatter for terminals. Masks passwords in addresses and escapes line breaks of
-    messages."""
+    """Log formatter for terminals. Masks passwords in addresses and escapes line breaks of messages."""
 
     def format(self, record: logging.LogRecord) -> str:
         time = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
@@ -80,8 +79,7 @@ def _log_uncaught(kind: type[BaseException], error: BaseException | None, trace:
 
 
 def say_start(*lines: str) -> None:
-    """Log the service's addresses regardless of the log level, because launch scripts wait for
-    these lines."""
+    """Log the service's addresses regardless of the log level, because launch scripts wait for these lines."""
     logger = logging.getLogger("intrasplat.start")
     logger.setLevel(logging.INFO)
     for line in lines:

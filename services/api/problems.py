@@ -290,8 +290,7 @@ def _methods_of(app: FastAPI, connection: HTTPConnection) -> str:
 
 
 def _of_validation(error: RequestValidationError | WebSocketRequestValidationError) -> Problem:
-    """Describe a validation error by location and message. Values are left out because they may be
-    secrets."""
+    """Describe a validation error by location and message. Values are left out because they may be secrets."""
     errors = [{"at": ".".join(str(part) for part in each["loc"]), "what": each["msg"]} for each in error.errors()]
     said = "; ".join(f"{each['at']}: {each['what']}" for each in errors[:3])
     return Unprocessable(f"{said}; /docs describes what is expected", errors=errors[:20])

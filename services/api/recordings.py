@@ -1,6 +1,4 @@
-"""Recordings: upload as request body, list, delete. A separate process checks an upload after the
-answer.
-"""
+"""Recordings: upload as request body, list, delete. A separate process checks an upload after the answer."""
 
 from __future__ import annotations
 
@@ -99,8 +97,7 @@ async def delete_recording(request: Request, caller: CallerOf, name: ResourceNam
 
 
 async def _check(control: ControlState, kept: RecordingStore, name: str) -> None:
-    """Check a recording and store the result. If the check cannot run, the state is unchanged until
-    the next start."""
+    """Check a recording and store the result. If the check cannot run, the state is unchanged until the next start."""
     try:
         record = await asyncio.to_thread(kept.check, name)
     except Exception as error:  # background task: no caller receives the error

@@ -37,13 +37,11 @@ TOO_LARGE = "the head of the WebSocket handshake has too many or too long lines;
 class AnsweredHandshakes(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket protocol, extended to answer every handshake that the parser refuses.
 
-    uvicorn neither answers nor closes such a connection, so it would stay open until the client
-    closes it.
+    uvicorn neither answers nor closes such a connection, so it would stay open until the client closes it.
     """
 
     def data_received(self, data: bytes) -> None:
-        """Parse received bytes. Answer 431 or 400 if the parser refused the handshake before the
-        application saw it."""
+        """Parse received bytes. Answer 431 or 400 if the parser refused the handshake before the application saw it."""
         super().data_received(data)
         if self.conn.handshake_exc is not None and not self.handshake_initiated and not self.transport.is_closing():
             causes = (self.conn.handshake_exc, self.conn.handshake_exc.__cause__)
@@ -316,8 +314,7 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
 
 
 class DrainingServer(uvicorn.Server):
-    """uvicorn server that signals the drain to the application at once, so that endless displays
-    end."""
+    """uvicorn server that signals the drain to the application at once, so that endless displays end."""
 
     def __init__(
         self,
@@ -362,8 +359,7 @@ class DrainingServer(uvicorn.Server):
 def with_head_limits(head_s: float) -> type[H11Protocol]:
     """Return uvicorn's HTTP protocol with limits on the request head.
 
-    The head must be complete within `head_s`; uvicorn itself sets no such limit. A head that is too
-    long gets 431.
+    The head must be complete within `head_s`; uvicorn itself sets no such limit. A head that is too long gets 431.
 
     Args:
         head_s: time limit in seconds.
@@ -396,8 +392,7 @@ def with_head_limits(head_s: float) -> type[H11Protocol]:
                 self._timer = None
 
         def send_400_response(self, msg: str) -> None:
-            """Answer a malformed request with 400, or with 431 if h11 found no end of the head
-            within its limit."""
+            """Answer a malformed request with 400, or with 431 if h11 found no end of the head within its limit."""
             if len(self.conn.trailing_data[0]) <= MOST_HEAD_BYTES:
                 super().send_400_response(msg)
                 return
@@ -423,8 +418,7 @@ def bind(settings: ServiceSettings) -> socket.socket:
     """Bind the listening socket at the configured address.
 
     Raises:
-        CannotServe: if the port is in use, or the address is reachable from the network without
-            TLS.
+        CannotServe: if the port is in use, or the address is reachable from the network without TLS.
     """
     server = settings.server
     _refuse_plaintext(settings)

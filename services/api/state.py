@@ -56,8 +56,7 @@ class Parts:
     routers: Sequence[APIRouter] = ()
     """Further routers, created by `new_router`."""
     background: Sequence[Callable[[], AbstractAsyncContextManager[Any]]] = ()
-    """Context managers entered in order at server start and left in reverse order after the drain.
-    """
+    """Context managers entered in order at server start and left in reverse order after the drain."""
     checks: Mapping[str, Callable[[], Awaitable[CheckResult]]] = field(default_factory=dict)
     """Health checks for /readyz, by name."""
     collectors: Sequence[Collector] = ()
@@ -112,8 +111,7 @@ class Repeated:
         self._kept: OrderedDict[tuple[str, str], tuple[str, asyncio.Task[Any]]] = OrderedDict()
 
     async def once(self, caller: str, key: str | None, asked: str, act: Callable[[], Awaitable[Any]]) -> Any:
-        """Run `act` once per caller and key; later calls return the first result. Failed runs are
-        not cached.
+        """Run `act` once per caller and key; later calls return the first result. Failed runs are not cached.
 
         Args:
             caller: key id of the caller.
@@ -143,8 +141,7 @@ async def _awaited(act: Callable[[], Awaitable[Any]]) -> Any:
 
 log = logging.getLogger(__name__)
 SPARE_BYTES = 256 * 2**20
-"""Free bytes that uploads leave for the audit log and the database. With less the service is
-degraded."""
+"""Free bytes that uploads leave for the audit log and the database. With less the service is degraded."""
 
 
 def folders_of(settings: ServiceSettings) -> dict[str, Path]:
@@ -186,8 +183,7 @@ class Storage(Collector):
         return await asyncio.to_thread(self._disk)
 
     async def audit(self) -> CheckResult:
-        """Report the audit log's writability. After a failure, append a test entry to detect
-        recovery."""
+        """Report the audit log's writability. After a failure, append a test entry to detect recovery."""
         if self._audit.failure is None:
             return CheckResult(True, "entries are written")
         try:

@@ -36,8 +36,7 @@ _STEREO = "stereo:"
 
 
 def check_source(address: str, rules: SourceRules) -> None:
-    """Check an address against the source rules. No host name is resolved; unlisted names are
-    refused.
+    """Check an address against the source rules. No host name is resolved; unlisted names are refused.
 
     Raises:
         Unprocessable: if the rules do not allow the address.

@@ -187,8 +187,7 @@ frames/s. Longer durations have their own bucket."""
 
 
 class Durations:
-    """Histogram of one kind of duration. One thread adds; another thread may read counts that lag
-    by at most one."""
+    """Histogram of one kind of duration. One thread adds; another thread may read counts that lag by at most one."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
@@ -200,14 +199,12 @@ class Durations:
         self._sum_s += duration_s
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON form: the count of each bucket, the last without an upper bound, and the
-        sum."""
+        """Return the JSON form: the count of each bucket, the last without an upper bound, and the sum."""
         return {"counts": list(self._counts), "sum_s": round(self._sum_s, 6)}
 
 
 def cumulative(durations: Any) -> tuple[list[tuple[str, float]], float] | None:
-    """Convert the durations of a heartbeat to Prometheus buckets and their sum; None for malformed
-    values."""
+    """Convert the durations of a heartbeat to Prometheus buckets and their sum; None for malformed values."""
     counts = durations.get("counts") if isinstance(durations, Mapping) else None
     sum_s = durations.get("sum_s") if isinstance(durations, Mapping) else None
     whole = (

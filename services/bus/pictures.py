@@ -52,8 +52,7 @@ class PicturePublisher:
         self._send({**header, "pixels": "frame"}, *encode(frame))
 
     def publish(self, header: Mapping[str, Any], image: NDArray[np.uint8]) -> None:
-        """Send a picture, RGB uint8 [H, W, 3], without blocking. The array must not be modified
-        afterwards."""
+        """Send a picture, RGB uint8 [H, W, 3], without blocking. The array must not be modified afterwards."""
         height_px, width_px = image.shape[:2]
         said = {**header, "pixels": "rgb", "width_px": width_px, "height_px": height_px}
         self._send(said, np.ascontiguousarray(image).data)
@@ -68,8 +67,7 @@ class PicturePublisher:
 
 
 def subscribe(socket: Any, *endpoints: str, waiting: int = HIGH_WATER) -> Any:
-    """Connect a SUB socket (plain or asyncio) to endpoints of pictures or heartbeats. The
-    publishers may start later.
+    """Connect a SUB socket (plain or asyncio) to endpoints of pictures or heartbeats. The publishers may start later.
 
     Args:
         socket: the socket.

@@ -192,8 +192,7 @@ class StreamFolder:
         return self.path / f"{role}.log"
 
     def record(self, role: Role) -> ProcessRecord | None:
-        """Return the record of the running process for a role, or None. Files of an ended process
-        are removed."""
+        """Return the record of the running process for a role, or None. Files of an ended process are removed."""
         try:
             content = parsed_json((self.path / f"{role}.json").read_bytes())
             identity = ProcessIdentity(int(content["pid"]), str(content["started"]))

@@ -42,15 +42,13 @@ class EncodedPicture:
     """Encoded picture, shared by all viewers."""
 
     header: dict[str, object]
-    """JSON header: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`; for reconstructions also
-    `model_version`, `steps`, `psnr_db`, `previous_frame_db` and `next_frame_db`
-    (docs/design/processes.md)."""
+    """JSON header: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`; for reconstructions also `model_version`, `steps`,
+    `psnr_db`, `previous_frame_db` and `next_frame_db` (docs/design/processes.md)."""
     jpeg: bytes
 
     @cached_property
     def message(self) -> bytes:
-        """Return the picture as one message: header length (4 bytes, big-endian), JSON header,
-        JPEG."""
+        """Return the picture as one message: header length (4 bytes, big-endian), JSON header, JPEG."""
         header = json.dumps(self.header, separators=(",", ":")).encode()
         return b"".join((struct.pack(">I", len(header)), header, self.jpeg))
 

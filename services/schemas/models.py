@@ -8,8 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class VersionView(BaseModel):
-    """Model version. `state`: uploaded, validated, ready, active, retired, or rejected with a
-    reason."""
+    """Model version. `state`: uploaded, validated, ready, active, retired, or rejected with a reason."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["liver"])

@@ -28,8 +28,7 @@ class RecordingDescription(BaseModel):
 
 
 class RecordingView(BaseModel):
-    """Recording. `state`: uploaded, ready, rejected with a reason, or missing if its files are gone
-    from the disk."""
+    """Recording. `state`: uploaded, ready, rejected with a reason, or missing if its files are gone from the disk."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["case-7"])

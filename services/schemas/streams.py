@@ -41,8 +41,7 @@ class StreamRequest(StreamSettings):
 
 
 class StreamView(BaseModel):
-    """Stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason`
-    explains it."""
+    """Stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason` explains it."""
 
     name: str = Field(examples=["endoscope"])
     source: str = Field(examples=["rtsp://10.0.0.5/stream"])
@@ -74,8 +73,7 @@ class StreamView(BaseModel):
 
 
 class VirtualCamera(BaseModel):
-    """Position of the virtual camera relative to the endoscope, orbiting the point at the centre of
-    its picture."""
+    """Position of the virtual camera relative to the endoscope, orbiting the point at the centre of its picture."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}

@@ -127,8 +127,7 @@ class CapturedSource(LiveSource):
                 socket.close(0)
 
     def _begin_anew(self) -> None:
-        """Restart frame numbering, because the next frame is from another capture process or source
-        connection."""
+        """Restart frame numbering, because the next frame is from another capture process or source connection."""
         if self._order is not None:
             self._order.restart()
 
@@ -184,8 +183,7 @@ class Capture:
         self._lock = threading.Lock()
         self._source: FrameSource | None = None
         self._run = time.time_ns()
-        """Run id in the frame headers; a change tells readers that sequence numbers and timestamps
-        restart."""
+        """Run id in the frame headers; a change tells readers that sequence numbers and timestamps restart."""
         self.frames = 0
         self._last_ns: int | None = None
 

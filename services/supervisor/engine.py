@@ -178,8 +178,7 @@ class LiveSnapshots:
         The GPU snapshot is released here, because training needs another slot while one is held.
 
         Returns:
-            A copy of the model, the frame's sequence number and the pause of the training in
-            nanoseconds.
+            A copy of the model, the frame's sequence number and the pause of the training in nanoseconds.
         """
         request = running.request_model()
         answer = request.wait(WAIT_S)
@@ -287,8 +286,7 @@ def reconstruct(
 
 
 def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again: bool) -> None:
-    """Alternate between the live reconstruction and finished models until the process is asked to
-    stop."""
+    """Alternate between the live reconstruction and finished models until the process is asked to stop."""
     check_device(spec.device)
     check_renderer(spec.renderer, spec.device)
     models = ModelShow(worker, spec, screen, layers)

@@ -70,8 +70,7 @@ class FinishedModel:
         return start_s + math.fmod(max(0.0, stream_s), end_s - start_s) if end_s > start_s else start_s
 
     def scene(self, stream_s: float, header: Mapping[str, Any]) -> LayerScene:
-        """Return the scene at a stream time for the layer pictures. Not metric, because bundles
-        state no unit."""
+        """Return the scene at a stream time for the layer pictures. Not metric, because bundles state no unit."""
         return LayerScene(self._model, self._camera, self.at(stream_s), header)
 
     def picture(self, stream_s: float) -> NDArray[np.uint8]:
@@ -102,8 +101,7 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 REPEAT_NS = 200_000_000
 LATE_IN_A_ROW = 5
-"""Consecutive late pictures that count as a missed time limit. A single one may be caused by the
-machine."""
+"""Consecutive late pictures that count as a missed time limit. A single one may be caused by the machine."""
 
 
 @dataclass(frozen=True)
@@ -120,12 +118,11 @@ class Showing:
 
 
 class ModelShow:
-    """Display of one finished model at the time of each arriving frame. Keeps the previous model
-    for rollback.
+    """Display of one finished model at the time of each arriving frame. Keeps the previous model for rollback.
 
-    Models are swapped between two pictures. A model with non-finite pictures, or with repeatedly
-    more than `most_ms` per picture, is replaced by the previous model or the live reconstruction.
-    The selection is stored in a file, so the next engine process restores it.
+    Models are swapped between two pictures. A model with non-finite pictures, or with repeatedly more than `most_ms`
+    per picture, is replaced by the previous model or the live reconstruction. The selection is stored in a file, so the
+    next engine process restores it.
     """
 
     def __init__(self, worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers | None = None) -> None:
@@ -217,8 +214,7 @@ class ModelShow:
             thread.join()
 
     def _show_models(self) -> None:
-        """Render at the time of each frame until the live reconstruction takes over or the process
-        stops."""
+        """Render at the time of each frame until the live reconstruction takes over or the process stops."""
         stop = self._worker.stop_requested
         try:
             source = CapturedSource(self._worker.folder, stop)

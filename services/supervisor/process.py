@@ -28,12 +28,11 @@ SETTLED_S = 2.0
 
 
 class Restarts:
-    """Restart back-off. The first restart is immediate; further ones wait longer, up to a cap.
-    Restarts never stop, because a missing camera or GPU may return.
+    """Restart back-off. The first restart is immediate; further ones wait longer, up to a cap. Restarts never stop,
+    because a missing camera or GPU may return.
 
-    The cap is low for a process that has worked, even briefly: the cause is external or occasional,
-    and viewers wait for pictures. A process that never worked would only take resources from the
-    others, so its cap is higher.
+    The cap is low for a process that has worked, even briefly: the cause is external or occasional, and viewers wait
+    for pictures. A process that never worked would only take resources from the others, so its cap is higher.
     """
 
     def __init__(
@@ -93,8 +92,7 @@ COUNTED: dict[Role, str] = {"capture": "frames", "engine": "pictures"}
 SOURCE_GONE = ("opening", "stalled", "reconnecting", "lost", "ended")
 """Capture process states without frames."""
 LOST_AFTER_S = 2.0
-"""Seconds without frames after which the source counts as lost. Shorter gaps appear in the metrics
-only."""
+"""Seconds without frames after which the source counts as lost. Shorter gaps appear in the metrics only."""
 Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "lost", "recovered"]
 
 
@@ -114,8 +112,7 @@ class ProcessState:
     """Current state of a stream process as known to the supervisor."""
 
     state: str
-    """State from the heartbeat (`starting`, `live`, `running`, ...), or `down`, `failed`,
-    `stopped`."""
+    """State from the heartbeat (`starting`, `live`, `running`, ...), or `down`, `failed`, `stopped`."""
     reason: str
     pid: int | None
     restarts: int
@@ -136,8 +133,7 @@ class Rate:
         self._samples: deque[tuple[float, int]] = deque()
 
     def tell(self, count: int, now_s: float) -> None:
-        """Add a sample. A smaller count than before is from a new process and restarts the
-        measurement."""
+        """Add a sample. A smaller count than before is from a new process and restarts the measurement."""
         if self._samples and count < self._samples[-1][1]:
             self._samples.clear()
         self._samples.append((now_s, count))

@@ -172,8 +172,7 @@ class LayerScene:
 class LayerDrawing:
     """Layer renderer for use in the thread that creates it. On a GPU it uses its own CUDA stream.
 
-    Renders without CUDA graphs, because capturing a graph blocks other threads, and always by alpha
-    blending.
+    Renders without CUDA graphs, because capturing a graph blocks other threads, and always by alpha blending.
     """
 
     def __init__(self, device: str) -> None:
@@ -254,8 +253,7 @@ def _rendered(scene: LayerScene) -> RenderOutput:
 
 
 def _weighted(gaussians: Gaussians, unseen_s: torch.Tensor | None) -> Gaussians:
-    """Return the Gaussians with confidence as colour: 1 if visible or unknown, decreasing with the
-    unseen time."""
+    """Return the Gaussians with confidence as colour: 1 if visible or unknown, decreasing with the unseen time."""
     weight = gaussians.means.new_ones(gaussians.count)
     if unseen_s is not None:
         weight = certainty(unseen_s).to(gaussians.dtype)
@@ -271,8 +269,7 @@ log = logging.getLogger(__name__)
 PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
 """Minimum time between two pictures of a layer, in seconds, by device."""
 MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
-"""Largest share of time spent on drawing, by device. A slow picture is followed by a longer pause.
-"""
+"""Largest share of time spent on drawing, by device. A slow picture is followed by a longer pause."""
 LOOK_S = 0.2
 Scene = Callable[[], LayerScene | None]
 """Callable that creates the scene when it is drawn; None if it cannot be drawn."""
@@ -281,8 +278,7 @@ Scene = Callable[[], LayerScene | None]
 class Layers:
     """Drawing thread for the watched layers. `offer` and `camera` are thread-safe.
 
-    The publishers' sockets report subscribers. Without subscribers nothing is drawn and no scene is
-    held.
+    The publishers' sockets report subscribers. Without subscribers nothing is drawn and no scene is held.
     """
 
     def __init__(
@@ -315,8 +311,7 @@ class Layers:
             self._thread.join()
 
     def offer(self, scene: Scene) -> None:
-        """Offer the displayed scene. Returns at once; the drawing thread calls `scene` only if it
-        draws it."""
+        """Offer the displayed scene. Returns at once; the drawing thread calls `scene` only if it draws it."""
         if self._watched:
             with self._changed:
                 self._scene = scene
@@ -324,8 +319,7 @@ class Layers:
                 self._changed.notify()
 
     def camera(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Handle `camera {azimuth_deg?, elevation_deg?, zoom?}`: move the virtual camera. Defaults
-        are 0, 0 and 1.
+        """Handle `camera {azimuth_deg?, elevation_deg?, zoom?}`: move the virtual camera. Defaults are 0, 0 and 1.
 
         Args:
             arguments: arguments of the command.
@@ -373,8 +367,7 @@ class Layers:
                 publisher.close()
 
     def _next(self) -> tuple[Layer, Scene] | None:
-        """Return the watched layer that waited longest for an undrawn scene, and that scene. None
-        if no layer waits."""
+        """Return the watched layer that waited longest for an undrawn scene, and that scene. None if no layer waits."""
         with self._changed:
             waiting = [each for each in LAYERS if each in self._watched and self._drawn_of[each][0] < self._number]
             if not waiting or self._scene is None:
@@ -405,8 +398,7 @@ class Layers:
         self._drawn[layer] += 1
 
     def _state(self, screen: PictureState, age_ns: int) -> PictureState:
-        """Return the state for a picture of this age; never better than the state of the main
-        picture."""
+        """Return the state for a picture of this age; never better than the state of the main picture."""
         own = picture_state(age_ns, PERIOD_S[self._device] * 1e9, SourceState.LIVE)
         order = list(PictureState)
         return max(screen, own, key=order.index)

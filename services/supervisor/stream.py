@@ -156,8 +156,7 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
 
 
 def _withheld(engine: ProcessState) -> str | None:
-    """Explain why a running engine has shown no picture although frames arrived; None if no frame
-    was withheld."""
+    """Explain why a running engine has shown no picture although frames arrived; None if no frame was withheld."""
     frames, withheld = engine.figures.get("frames"), engine.figures.get("withheld")
     if not frames or not isinstance(withheld, Mapping) or not withheld:
         return None
@@ -182,8 +181,7 @@ class SupervisedStreams:
             runtime: runtime folder of the service.
             on_event: receives process events.
             most: limit on the number of streams, including stopped ones (`limits.streams`).
-            takeover_s: time for which processes continue after this process has died
-                (`server.takeover_s`).
+            takeover_s: time for which processes continue after this process has died (`server.takeover_s`).
         """
         self._runtime, self._on_event, self._most = runtime, on_event, most
         self._limits = ProcessLimits(orphan_after_s=takeover_s)
@@ -358,8 +356,7 @@ class SupervisedStreams:
 
 LOOK_S = 0.25
 MOST_MS = 200.0
-"""Time limit per picture in milliseconds. A model that repeatedly exceeds it is replaced by the
-previous one."""
+"""Time limit per picture in milliseconds. A model that repeatedly exceeds it is replaced by the previous one."""
 PREPARE_S = 60.0
 """Seconds allowed for loading a model and rendering its first picture."""
 AGAIN_S = 5.0

@@ -52,8 +52,7 @@ class EngineSpec(CallerEngineOptions):
 
 
 class _Strict(BaseModel):
-    """Base class of the specifications. Rejects unknown fields and type conversions, such as true
-    for the number 1."""
+    """Base class of the specifications. Rejects unknown fields and type conversions, such as true for the number 1."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -365,8 +364,7 @@ class Worker:
         self._handlers.update(handlers)
 
     def say(self, state: str, reason: str) -> None:
-        """Set the state and its reason for the heartbeats; a changed state is logged and sent at
-        once."""
+        """Set the state and its reason for the heartbeats; a changed state is logged and sent at once."""
         with self._saying:
             changed = self._said["state"] != state or (state == "starting" and self._said["reason"] != reason)
             self._said = {"state": state, "reason": reason[:2000]}

@@ -29,8 +29,7 @@ from gsplat_core.transfers import HostCopy
 UNCOVERED_ALPHA = 0.5
 """Accumulated opacity below which a pixel counts as uncovered."""
 SMALLEST_SHARE = 0.002
-"""Uncovered share of the frame from which Gaussians are added; training closes single-pixel gaps.
-"""
+"""Uncovered share of the frame from which Gaussians are added; training closes single-pixel gaps."""
 
 
 def uncovered_pixels(alpha: Tensor, mask: Tensor) -> Tensor:
@@ -44,9 +43,7 @@ def uncovered_pixels(alpha: Tensor, mask: Tensor) -> Tensor:
 
 
 def are_worth_filling(uncovered: Tensor) -> bool:
-    """Return True if the uncovered pixels [H, W] are more than single gaps. Synchronises with the
-    device.
-    """
+    """Return True if the uncovered pixels [H, W] are more than single gaps. Synchronises with the device."""
     return HostCopy(torch.count_nonzero(uncovered)).item() >= SMALLEST_SHARE * uncovered.numel()
 
 
@@ -58,9 +55,7 @@ class CapturedCoverage:
     """
 
     def __init__(self, camera: Camera, device: torch.device, rows: int = 0) -> None:
-        """Prepare the test for at most `rows` Gaussians; 0 for a quarter more than the scene's
-        first size.
-        """
+        """Prepare the test for at most `rows` Gaussians; 0 for a quarter more than the scene's first size."""
         self._slots = SnapshotSlots(device, most=2, rows=rows)  # the renderer holds one while the other is written
         self._renderer = AlphaRenderer(camera, device)
 
@@ -95,17 +90,14 @@ class Uncovered:
     pixels: HostCopy
     """Uncovered pixels, bool [H, W]."""
     depth: HostCopy | None
-    """Depth of the scene, float32 [H, W], 0 where uncovered; None if the frame's own depth is used.
-    """
+    """Depth of the scene, float32 [H, W], 0 where uncovered; None if the frame's own depth is used."""
 
     def gaussians(
         self, frame: Frame, observation: Observation, config: ReconstructorConfig, most: int
     ) -> Gaussians | None:
-        """Create Gaussians for the uncovered tissue on the observation's device, with the density
-        of the first frame.
+        """Create Gaussians for the uncovered tissue on the observation's device, with the density of the first frame.
 
-        Their depth is the frame's own or extrapolated from the covered pixels around. Waits for the
-        copies.
+        Their depth is the frame's own or extrapolated from the covered pixels around. Waits for the copies.
 
         Args:
             frame: frame that provides colours and depth.
@@ -188,9 +180,8 @@ def gaussians_beside(
 class Covering:
     """Search for uncovered tissue in consecutive frames.
 
-    With `beside`, a host thread creates the Gaussians, which takes longer than a live frame. They
-    are added at the next search, independent of its time, so the same sequence of searches gives
-    the same scene.
+    With `beside`, a host thread creates the Gaussians, which takes longer than a live frame. They are added at the next
+    search, independent of its time, so the same sequence of searches gives the same scene.
     """
 
     def __init__(self, config: ReconstructorConfig, *, beside: bool = False) -> None:

@@ -1,9 +1,8 @@
-"""Densification between offline training steps: removes invisible Gaussians and splits those with
-large errors.
+"""Densification between offline training steps: removes invisible Gaussians and splits those with large errors.
 
-A Gaussian's share of the error is computed by the gradient trick of Rota Bulò et al. 2024
-("Revising Densification in Gaussian Splatting", section 3.1). The gradient of a colour common to
-all Gaussians, for a picture weighted by the error, is the error under their blending weights.
+A Gaussian's share of the error is computed by the gradient trick of Rota Bulò et al. 2024 ("Revising Densification in
+Gaussian Splatting", section 3.1). The gradient of a colour common to all Gaussians, for a picture weighted by the
+error, is the error under their blending weights.
 """
 
 from __future__ import annotations
@@ -22,14 +21,11 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 
 UNSEEN_PX = 0.5
-"""Sum of blending weights in every picture, in pixels, below which a Gaussian counts as invisible.
-"""
+"""Sum of blending weights in every picture, in pixels, below which a Gaussian counts as invisible."""
 SHRINK = 1.6
 """Factor by which the halves of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
 APART = 0.5
-"""Distance of the halves from their parent's centre, in its standard deviations along its longest
-axis.
-"""
+"""Distance of the halves from their parent's centre, in its standard deviations along its longest axis."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +98,7 @@ def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
 
 
 def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors [N, 3] by quaternions wxyz [N, 4] of any norm: v + 2 w (q x v) + 2 q x (q x
-    v).
-    """
+    """Rotate vectors [N, 3] by quaternions wxyz [N, 4] of any norm: v + 2 w (q x v) + 2 q x (q x v)."""
     unit = torch.nn.functional.normalize(quats, dim=1)
     w, q = unit[:, :1], unit[:, 1:]
     across = torch.linalg.cross(q, vectors)

@@ -1,6 +1,4 @@
-"""Creation of Gaussians from one frame: a jittered pixel grid at the tissue's depth, coloured by
-the picture.
-"""
+"""Creation of Gaussians from one frame: a jittered pixel grid at the tissue's depth, coloured by the picture."""
 
 from __future__ import annotations
 
@@ -56,9 +54,7 @@ def gaussians_from_frame(
 
 
 def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArray[np.float64], float]:
-    """Return about `count` pixels [M, 2] (x, y) spread evenly over a picture, and their spacing in
-    pixels.
-    """
+    """Return about `count` pixels [M, 2] (x, y) spread evenly over a picture, and their spacing in pixels."""
     spacing = math.sqrt(height * width / count)
     columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
     jitter = np.random.default_rng(seed).uniform(-0.15, 0.15, (2, rows, columns))
@@ -68,9 +64,7 @@ def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArr
 
 
 def blur_sigma_px(spacing_px: float) -> float:
-    """Return the blur (standard deviation in pixels) of a picture from which Gaussians of this
-    spacing take colours.
-    """
+    """Return the blur (standard deviation in pixels) of a picture from which Gaussians of this spacing take colours."""
     return max(0.3, 0.3 * spacing_px)
 
 
@@ -138,9 +132,7 @@ def unprojected(
 
 
 def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit quaternion wxyz of a rotation matrix [3, 3] (Shepperd 1978, numerically
-    stable for any rotation).
-    """
+    """Return the unit quaternion wxyz of a rotation matrix [3, 3] (Shepperd 1978, numerically stable for any rotation)."""
     trace_terms = np.array([np.trace(rotation), *np.diag(rotation)])
     largest = int(np.argmax(trace_terms))
     if largest == 0:
@@ -204,8 +196,7 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
 
 
 COARSE = 4
-"""Reduction factor at which tissue under tools is filled, equal to that of the host's in-painting.
-"""
+"""Reduction factor at which tissue under tools is filled, equal to that of the host's in-painting."""
 
 
 def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:

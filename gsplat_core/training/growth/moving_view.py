@@ -24,8 +24,7 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy, tensor_of
 
 SEE_EVERY = 8
-"""Number of frames between two visibility tests; with little free capacity every frame is tested.
-"""
+"""Number of frames between two visibility tests; with little free capacity every frame is tested."""
 ROOM_SHARE = 0.1
 """Share of the capacity kept free for new tissue, if there are Gaussians to archive."""
 UNSEEN_S = 0.5
@@ -139,9 +138,7 @@ LOOKS_AFTER = 0.02
 search takes some milliseconds.
 """
 EDGE_CELLS = 1.0
-"""Margin in cells at the previous picture's edge that counts as new, so that slow motion leaves no
-gap.
-"""
+"""Margin in cells at the previous picture's edge that counts as new, so that slow motion leaves no gap."""
 
 
 def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
@@ -189,9 +186,7 @@ class NewTissue:
         return bool(self._entered.any())
 
     def _empty(self, now: Gaussians) -> tuple[Tensor, Tensor]:
-        """Return which new cells are almost empty of Gaussians, bool [rows, columns], and the mean
-        depth around each.
-        """
+        """Return which new cells are almost empty of Gaussians, bool [rows, columns], and the mean depth around each."""
         count, depth = around_cells(now, self._camera, self._spacing, self._shape)
         return tensor_of(self._entered.reshape(self._shape), now.device) & (count < 9 * USUAL_DENSITY), depth
 
@@ -200,11 +195,10 @@ class NewTissue:
         return self._of_cells(self._empty(now)[0])
 
     def unfilled(self, now: Gaussians, mask: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Return the centres [M, 2] of empty new cells on tissue, and the scene's depth [H, W], 0
-        where unknown.
+        """Return the centres [M, 2] of empty new cells on tissue, and the scene's depth [H, W], 0 where unknown.
 
-        Depth is the mean over Gaussians. A rendered depth is biased to the front, so tissue placed
-        by it would come nearer and nearer as the camera moves. Synchronises with the device.
+        Depth is the mean over Gaussians. A rendered depth is biased to the front, so tissue placed by it would come
+        nearer and nearer as the camera moves. Synchronises with the device.
         """
         empty, depth = self._empty(now)
         wanted = HostCopy(empty.flatten() & (value_at(mask, tensor_of(self._grid, mask.device)) > 0))
@@ -229,11 +223,10 @@ def fill_new_tissue(
     config: ReconstructorConfig,
     out_of_view: OutOfView | None,
 ) -> None:
-    """Fill tissue that came into view before the first step on a frame, from the archive or with
-    new Gaussians.
+    """Fill tissue that came into view before the first step on a frame, from the archive or with new Gaussians.
 
-    Otherwise training would stretch neighbouring Gaussians over it, which would follow the
-    picture's edge as the camera moves.
+    Otherwise training would stretch neighbouring Gaussians over it, which would follow the picture's edge as the camera
+    moves.
 
     Args:
         step: training step of the scene.

@@ -57,9 +57,7 @@ class StartOnDevice:
         return same_size and bool((mine.K == camera.K).all())
 
     def __call__(self, frame: Frame, observation: Observation, *, sh_degree: int, default_depth_mm: float) -> Gaussians:
-        """Create the Gaussians of `frame`, which is `observation` on the device, without
-        synchronisation.
-        """
+        """Create the Gaussians of `frame`, which is `observation` on the device, without synchronisation."""
         image, camera = observation.image, observation.camera
         z = image.new_full((len(self._cells),), default_depth_mm, dtype=torch.float32)
         if frame.depth is not None:

@@ -73,8 +73,7 @@ class LastSeen:
         self._count = 0
 
     def see(self, now: Gaussians, observation: Observation) -> None:
-        """Mark Gaussians as visible whose centre is on tissue of the observation, and newly added
-        ones.
+        """Mark Gaussians as visible whose centre is on tissue of the observation, and newly added ones.
 
         `now` is the scene at the observation's time. Occluded Gaussians count as visible.
         """
@@ -154,8 +153,7 @@ def around_cells(
         camera: camera of the picture.
         spacing: side of a cell in pixels.
         shape: number of rows and columns of cells.
-        reach: number of neighbouring cells on each side that are included, also beyond the
-            picture's edge.
+        reach: number of neighbouring cells on each side that are included, also beyond the picture's edge.
 
     Returns:
         Number of centres and their mean depth (0 for none), float32 [rows, columns] each.

@@ -30,9 +30,7 @@ Flow: TypeAlias = NDArray[np.float32]
 CELL_PX = 4
 """Side of a flow cell in pixels."""
 SMALLEST_PX = 48
-"""Shortest side of a picture for which flow is computed; the method needs patches of 8 pixels in a
-pyramid.
-"""
+"""Shortest side of a picture for which flow is computed; the method needs patches of 8 pixels in a pyramid."""
 WIDE_CELLS = 6.0
 """Standard deviation of the neighbourhood used where no tissue is visible, in cells."""
 WIDE_WEIGHT = 0.02
@@ -42,14 +40,11 @@ Detail: TypeAlias = Literal["full", "half"]
 halves pictures of more than `SMALL_PIXELS`.
 """
 SMALL_PIXELS = 150_000
-"""Number of pixels up to which pictures are not halved, since that would lose detail and save
-little time.
-"""
+"""Number of pixels up to which pictures are not halved, since that would lose detail and save little time."""
 
 
 class ImageMotion:
-    """Flow between consecutive pictures by DIS (Kroeger et al., "Fast Optical Flow using Dense
-    Inverse Search", 2016).
+    """Flow between consecutive pictures by DIS (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", 2016).
 
     Only the last picture is kept. The result does not depend on the number of threads.
     """
@@ -66,8 +61,7 @@ class ImageMotion:
 
         Args:
             image: RGB uint8 [H, W, 3].
-            mask: [H, W], non-zero on tissue, or None for all. Other pixels get the flow of the
-                surrounding tissue.
+            mask: [H, W], non-zero on tissue, or None for all. Other pixels get the flow of the surrounding tissue.
 
         Returns:
             The flow, or None for the first picture and after a change of size.
@@ -84,9 +78,7 @@ class ImageMotion:
         return smoothed(flow, tissue)
 
     def _pixel_flow(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-        """Return the raw flow [h, w, 2] in pixels of the full picture; h and w are halved if the
-        search was.
-        """
+        """Return the raw flow [h, w, 2] in pixels of the full picture; h and w are halved if the search was."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = grey.shape
         if self._shrinks and height * width > SMALL_PIXELS:
@@ -125,9 +117,7 @@ def typical_px(flow: Flow) -> float:
 
 
 def revealed_px(flow: Flow) -> float:
-    """Return the width in pixels of the largest strip revealed by inward motion at any edge of the
-    picture.
-    """
+    """Return the width in pixels of the largest strip revealed by inward motion at any edge of the picture."""
     inwards = (flow[:, 0, 0], -flow[:, -1, 0], flow[0, :, 1], -flow[-1, :, 1])
     return max(float(np.maximum(each, 0).mean()) for each in inwards)
 
@@ -140,9 +130,7 @@ INVERSE_STEPS = 2
 
 @dataclass(frozen=True)
 class SurfaceMotion:
-    """Motion of the surface between two frames: flow [h, w, 2] in pixels on the device, and both
-    cameras.
-    """
+    """Motion of the surface between two frames: flow [h, w, 2] in pixels on the device, and both cameras."""
 
     flow: Tensor
     before: Camera
@@ -163,9 +151,7 @@ class SurfaceMotion:
         return later.to_world(seen.pixels + self.at(seen.pixels) - later.pixels, seen.inside)
 
     def arrived(self, points: Tensor) -> Tensor:
-        """Return the world-space motion [N, 3] that brought points to their positions [N, 3] in the
-        second frame.
-        """
+        """Return the world-space motion [N, 3] that brought points to their positions [N, 3] in the second frame."""
         if self._is_compiled_for(points):
             return surface_motion(points, self.flow, self.before, self.after, arrived=True)
         seen = Seen(self.after, points)
@@ -205,9 +191,7 @@ class Seen:
         self.inside = in_picture & (local[:, 2:] > NEAREST)
 
     def read(self, plane: Tensor) -> Tensor:
-        """Sample a plane [H, W] at the points' pixels [N]; points outside get the value at the
-        edge.
-        """
+        """Sample a plane [H, W] at the points' pixels [N]; points outside get the value at the edge."""
         column, row = self.pixels.long().clamp(min=0).unbind(1)
         height, width = plane.shape
         return plane[row.clamp(max=height - 1), column.clamp(max=width - 1)]

@@ -69,22 +69,17 @@ class Damping:
         self._share = share + torch.where(seen.isfinite(), step, torch.zeros_like(step))
 
     def damped(self, moved: Tensor) -> Tensor:
-        """Return the part of a motion [N, 3] that is expected to continue, between none and all of
-        it.
-        """
+        """Return the part of a motion [N, 3] that is expected to continue, between none and all of it."""
         return moved * (AT_FIRST if self._share is None else self._share.clamp(0, 1).to(moved.dtype))
 
 
 FLOW_ERROR_PX = 1.0
-"""Standard deviation in pixels of motion that the camera does not explain: tissue motion and errors
-of flow and pose.
+"""Standard deviation in pixels of motion that the camera does not explain: tissue motion and errors of flow and pose.
 """
 RELATIVE_ERROR = 0.15
 """Prior standard deviation of a Gaussian's inverse depth, relative to it."""
 LARGEST_STEP = 1.4
-"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is
-known.
-"""
+"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is known."""
 LEAST_PARALLAX_PX = 1.5
 """Median parallax in pixels from which the scene's distance is estimated."""
 LEAST_EXPLAINED = 0.5
@@ -92,8 +87,7 @@ LEAST_EXPLAINED = 0.5
 SMALLEST_SHIFT = 1e-9
 """Smallest displacement of a camera along an axis in scene units; less is rounding."""
 ROUNDS = 4
-"""Rounds of reweighting, which reduce the influence of independently moving points on the distance.
-"""
+"""Rounds of reweighting, which reduce the influence of independently moving points on the distance."""
 
 
 class DepthFromMotion:
@@ -159,8 +153,7 @@ class DepthFromMotion:
 
 
 def parallax_terms(pixels: Tensor, target: Tensor, before: Camera, after: Camera) -> tuple[Tensor, Tensor]:
-    """Return c and d [N, 2] of the equation w c = d for inverse depths w, in units of the focal
-    length.
+    """Return c and d [N, 2] of the equation w c = d for inverse depths w, in units of the focal length.
 
     Args:
         pixels: positions before [N, 2].
@@ -186,9 +179,7 @@ def inverse_depths(pixels: Tensor, target: Tensor, before: Camera, after: Camera
 
 
 def translation_between(before: Camera, after: Camera) -> NDArray[np.float64]:
-    """Return the first camera's centre in coordinates of the second [3]; exactly 0 without
-    translation.
-    """
+    """Return the first camera's centre in coordinates of the second [3]; exactly 0 without translation."""
     moved = before.position - after.position
     return np.asarray(after.world_to_camera[:3, :3] @ np.where(np.abs(moved) < SMALLEST_SHIFT, 0.0, moved))
 
@@ -199,20 +190,15 @@ def _normalised(pixels: Tensor, camera: Camera) -> Tensor:
 
 
 HORIZON_S = 0.15
-"""Longest time after the newest frame for which its motion is extrapolated, in seconds; then the
-model is static.
-"""
+"""Longest time after the newest frame for which its motion is extrapolated, in seconds; then the model is static."""
 LONGEST_GAP_S = 0.15
 """Longest interval between frames that gives a velocity, in seconds."""
 UNCERTAINTY = 0.05
-"""Variance of a Gaussian's predicted position, relative to the squared length of its last motion.
-"""
+"""Variance of a Gaussian's predicted position, relative to the squared length of its last motion."""
 MOST_WIDENED = 0.7
 """Largest change of a log-scale from one frame to the next."""
 SUDDEN = 5.0
-"""Ratio to the usual motion above which a motion of more than `SUDDEN_PX` pixels is a jump and is
-not extrapolated.
-"""
+"""Ratio to the usual motion above which a motion of more than `SUDDEN_PX` pixels is a jump and is not extrapolated."""
 SUDDEN_PX = 1.0
 USUAL_DECAY = 0.1
 """Weight of the newest motion in the usual motion."""
@@ -227,9 +213,8 @@ class MotionPrior(Protocol):
         """
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
-        """Return the rate of change of the raw parameters after the newest frame per second, [N,
-        16], or None for none. `deltas` are the field's raw deltas at that frame's time, if already
-        computed.
+        """Return the rate of change of the raw parameters after the newest frame per second, [N, 16], or None for none.
+        `deltas` are the field's raw deltas at that frame's time, if already computed.
         """
 
     @property
@@ -248,11 +233,10 @@ class MotionPrior(Protocol):
 
 
 class FlowPrior:
-    """Motion prior that continues the motion between the last two frames, damped by its observed
-    persistence. The motion is measured as optical flow of the tissue.
+    """Motion prior that continues the motion between the last two frames, damped by its observed persistence. The
+    motion is measured as optical flow of the tissue.
 
-    Flow is more accurate than the model's own past, since temporal basis functions average over
-    several frames.
+    Flow is more accurate than the model's own past, since temporal basis functions average over several frames.
     """
 
     def __init__(self, config: ReconstructorConfig) -> None:
@@ -338,12 +322,10 @@ class FlowPrior:
 
 
 def widened(log_scales: Tensor, moved: Tensor) -> Tensor:
-    """Return the increase of log-scales [N, 3] that accounts for the uncertainty of the next
-    motion.
+    """Return the increase of log-scales [N, 3] that accounts for the uncertainty of the next motion.
 
-    The least-squares prediction of an uncertain picture is its mean, and the mean of a Gaussian
-    over normally distributed positions is a wider Gaussian. The standard deviation is proportional
-    to the last motion `moved` [N, 3].
+    The least-squares prediction of an uncertain picture is its mean, and the mean of a Gaussian over normally
+    distributed positions is a wider Gaussian. The standard deviation is proportional to the last motion `moved` [N, 3].
     """
     variance = UNCERTAINTY * moved.square().sum(dim=1, keepdim=True)
     return (0.5 * torch.log1p(variance * torch.exp(-2 * log_scales))).clamp(max=MOST_WIDENED)
@@ -381,9 +363,8 @@ def motion_of(step: TrainingStep) -> EditableMotion:
 class Following:
     """Delivery of a stream's frames to its motion prior.
 
-    Processing a frame takes longer than some training steps, and a picture that was just trained on
-    needs no prior. Without `at_once`, the two newest trained frames are therefore delivered only
-    when a frame is skipped.
+    Processing a frame takes longer than some training steps, and a picture that was just trained on needs no prior.
+    Without `at_once`, the two newest trained frames are therefore delivered only when a frame is skipped.
     """
 
     def __init__(self, config: ReconstructorConfig, *, at_once: bool) -> None:
@@ -442,11 +423,10 @@ class Following:
 
 @contextmanager
 def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -> Iterator[None]:
-    """Set the prior's continuation on the field while a copy is published; training is not
-    affected.
+    """Set the prior's continuation on the field while a copy is published; training is not affected.
 
-    The scene is static after `learned_s`, the time of the newest trained frame, if the prior has
-    not processed that frame.
+    The scene is static after `learned_s`, the time of the newest trained frame, if the prior has not processed that
+    frame.
     """
     continuation = step.capabilities.continuation
     if prior is None or continuation is None:

@@ -1,8 +1,7 @@
 """Trajectories of Gaussians over a recording with depth in all frames, estimated before training.
 
-One eye's pictures hardly show motion along the line of sight, so the loss alone would leave each
-Gaussian near its initial distance. Optical flow tracks each surface point from frame to frame, and
-the depth is read at its position.
+One eye's pictures hardly show motion along the line of sight, so the loss alone would leave each Gaussian near its
+initial distance. Optical flow tracks each surface point from frame to frame, and the depth is read at its position.
 """
 
 from __future__ import annotations
@@ -55,9 +54,8 @@ class SurfaceTracks:
         self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
 
     def apply(self, step: TrainingStep, number: int, first_row: int) -> None:
-        """Set the trajectories of the Gaussians from `first_row` on, which are on the surface shown
-        by frame `number`. Nothing changes if the field does not support it or the frames do not
-        show the motion.
+        """Set the trajectories of the Gaussians from `first_row` on, which are on the surface shown by frame `number`.
+        Nothing changes if the field does not support it or the frames do not show the motion.
         """
         follow = step.capabilities.follow
         if follow is None or not self._show_motion:
@@ -70,9 +68,7 @@ class SurfaceTracks:
                 follow(rows, times, self.trajectories(points, number) - points[:, None])
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
-        """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by
-        frame `number`.
-        """
+        """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by frame `number`."""
         if self._at_rest:
             return self._across(points, number)
         pixels = self._pixels(points, number)
@@ -149,9 +145,7 @@ class SurfaceDepth:
     """Depth of one frame for reading at tracked points."""
 
     planes: Tensor
-    """Planes [3, H, W]: depth away from edges, 0 elsewhere; validity of it; surface extrapolated
-    everywhere.
-    """
+    """Planes [3, H, W]: depth away from edges, 0 elsewhere; validity of it; surface extrapolated everywhere."""
 
     @staticmethod
     def of(depth: NDArray[np.float32], device: torch.device) -> SurfaceDepth | None:
@@ -180,8 +174,7 @@ def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:
     """Interpolate unknown values linearly in time.
 
     Args:
-        values: [N, T], 0 where unknown. Values before the first and after the last known one are
-            constant.
+        values: [N, T], 0 where unknown. Values before the first and after the last known one are constant.
         otherwise: [N, T], used for rows without any known value.
         times: [T].
     """

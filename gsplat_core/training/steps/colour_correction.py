@@ -30,9 +30,7 @@ from gsplat_core.training.config import ReconstructorConfig
 MOST_RELAXATION = 2.0
 """Upper bound of the relaxation; from here on the iteration need not converge."""
 LEAST_WEIGHT_PX = 0.3
-"""Offset added to a splat's weight in pixels, so that barely visible splats take little of the
-residual.
-"""
+"""Offset added to a splat's weight in pixels, so that barely visible splats take little of the residual."""
 
 
 def colour_correction(colours: Tensor, residuals: Tensor, weights: Tensor, relaxation: float) -> Tensor:
@@ -45,8 +43,7 @@ def colour_correction(colours: Tensor, residuals: Tensor, weights: Tensor, relax
         relaxation: share of the mean residual to apply, above 0 and below `MOST_RELAXATION`.
 
     Returns:
-        [N, 3], at most `relaxation` times the largest residual of a pixel, and 0 for splats outside
-            the tissue.
+        [N, 3], at most `relaxation` times the largest residual of a pixel, and 0 for splats outside the tissue.
     """
     wanted = relaxation * residuals / (weights + LEAST_WEIGHT_PX)[:, None]
     return torch.maximum(wanted, -colours.clamp(min=0))
@@ -90,8 +87,7 @@ def check_colours(relaxation: float, config: ReconstructorConfig, device: torch.
 
 
 LEAST_WEIGHT = 1e-6
-"""Smallest weight of a Gaussian in the picture, in pixels; invisible ones have no gradient either.
-"""
+"""Smallest weight of a Gaussian in the picture, in pixels; invisible ones have no gradient either."""
 
 
 def colour_change(gaussians: Gaussians, camera: Camera, picture: Tensor, counts: Tensor, steps: int) -> Tensor:

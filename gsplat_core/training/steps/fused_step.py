@@ -45,9 +45,7 @@ class StepInputs:
         self._corrects = False
 
     def take(self, observation: Observation, corrects: bool) -> None:
-        """Queue the copy of an observation for a step with or without colour correction; skipped if
-        it is already here.
-        """
+        """Queue the copy of an observation for a step with or without colour correction; skipped if it is already here."""
         if corrects and self.target is None:
             self.target = ResidualTarget(self.image)
         if observation is self._taken and corrects == self._corrects:
@@ -66,12 +64,11 @@ class StepInputs:
 class FusedStep:
     """Training step for one set of tensors and one camera size, captured once and replayed.
 
-    Parameters, moments and the field's state are updated in place. If any tensor is replaced
-    (Gaussians added, the field's window moved), the next step captures a new graph.
+    Parameters, moments and the field's state are updated in place. If any tensor is replaced (Gaussians added, the
+    field's window moved), the next step captures a new graph.
 
-    A frame that overflows the tile lists changes no parameter or moment; the device checks this.
-    `settle` detects it, raises the capacity and returns the number of ineffective steps, which the
-    caller repeats.
+    A frame that overflows the tile lists changes no parameter or moment; the device checks this. `settle` detects it,
+    raises the capacity and returns the number of ineffective steps, which the caller repeats.
     """
 
     def __init__(
@@ -85,9 +82,7 @@ class FusedStep:
         self._weights = weights
         self._camera = camera
         self._inputs = {False: StepInputs(camera, device, with_depth=weights.depth > 0)}
-        """Graph inputs by whether they belong to the right eye, so alternating eyes are each copied
-        once.
-        """
+        """Graph inputs by whether they belong to the right eye, so alternating eyes are each copied once."""
         self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
         """Controls that include the learning rates of the Gaussians in the backward pass, of
         positions after it, and of the field, followed by the colour relaxation.
@@ -102,9 +97,8 @@ class FusedStep:
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
         self._captured: dict[tuple[bool, bool], CapturedSequence[Tensor]] = {}
-        """Graphs by whether colours are corrected and whether they are the right eye's. They share
-        memory, which is safe because they never run concurrently and read nothing from each other's
-        buffers.
+        """Graphs by whether colours are corrected and whether they are the right eye's. They share memory, which is
+        safe because they never run concurrently and read nothing from each other's buffers.
         """
         self._warm: set[tuple[bool, bool]] = set()
         self._of_right = False
@@ -126,9 +120,8 @@ class FusedStep:
             time: normalised time from `FrameDeltas.frame_time`.
             gaussian_rates: Adam's learning rates of the Gaussians' tensors by name.
             field_rates: learning rates of the field.
-            colour_relaxation: above 0, colours are corrected (`colour_correction`) and depth is not
-                compared, because the correction uses the channel of its gradient. Not possible for
-                a field without colours.
+            colour_relaxation: above 0, colours are corrected (`colour_correction`) and depth is not compared, because
+                the correction uses the channel of its gradient. Not possible for a field without colours.
 
         Returns:
             Loss before the update, [] on the device.
@@ -154,9 +147,7 @@ class FusedStep:
         return self._captured[kind].replay().clone()
 
     def restart(self) -> None:
-        """Restart Adam's step count after the tensors were overwritten with another scene. Graphs
-        stay valid.
-        """
+        """Restart Adam's step count after the tensors were overwritten with another scene. Graphs stay valid."""
         self._step.fill_(self._adam.steps)
 
     def settle(self) -> int:
@@ -230,9 +221,7 @@ class FusedStep:
 
     @property
     def _names(self) -> tuple[str, ...]:
-        """Names of the trained tensors in the order of the ops, with the colours of the current
-        eye.
-        """
+        """Names of the trained tensors in the order of the ops, with the colours of the current eye."""
         return (*GAUSSIAN_TENSORS[:-1], RIGHT if self._of_right else LEFT)
 
     def _moments(self) -> tuple[list[Tensor], list[Tensor]]:

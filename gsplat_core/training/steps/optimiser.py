@@ -13,15 +13,13 @@ from gsplat_core.scene.rows import RowMoves
 
 
 class FusedAdam:
-    """Adam (Kingma and Ba 2015) over named tensors with one learning rate each, numerically equal
-    to torch.optim.Adam.
+    """Adam (Kingma and Ba 2015) over named tensors with one learning rate each, numerically equal to torch.optim.Adam.
 
-    It holds moments but no parameters. Parameters are passed to every step, so they may be replaced
-    between steps as long as their rows match the moments (`select`, `append`).
+    It holds moments but no parameters. Parameters are passed to every step, so they may be replaced between steps as
+    long as their rows match the moments (`select`, `append`).
 
-    A non-finite gradient never changes a parameter or a moment. With `rows=True` (Gaussians along
-    dimension 0) it skips the whole row of that tensor, with `rows=False` (planes, weights) only its
-    element. `skipped` counts them.
+    A non-finite gradient never changes a parameter or a moment. With `rows=True` (Gaussians along dimension 0) it skips
+    the whole row of that tensor, with `rows=False` (planes, weights) only its element. `skipped` counts them.
 
     Args:
         parameters: float32 tensors to update; only their shapes and devices are kept.
@@ -31,8 +29,7 @@ class FusedAdam:
         rows: True if dimension 0 of every tensor counts Gaussians.
 
     Raises:
-        InvalidInput: if the names of rates and tensors differ, or the tensors have different
-            numbers of rows.
+        InvalidInput: if the names of rates and tensors differ, or the tensors have different numbers of rows.
     """
 
     def __init__(
@@ -63,9 +60,7 @@ class FusedAdam:
 
     @property
     def skipped(self) -> int:
-        """Number of rows (or elements) skipped so far because of non-finite gradients. Synchronises
-        on CUDA.
-        """
+        """Number of rows (or elements) skipped so far because of non-finite gradients. Synchronises on CUDA."""
         return int(self._skipped)
 
     def _checked_rates(self, learning_rates: Mapping[str, float]) -> dict[str, float]:
@@ -138,9 +133,7 @@ class FusedAdam:
         return rows - self._spare_rows
 
     def reserve(self, rows: int) -> None:
-        """Allocate memory for `rows` Gaussians, so that `append` and `close_gaps` move no tensor
-        below that number.
-        """
+        """Allocate memory for `rows` Gaussians, so that `append` and `close_gaps` move no tensor below that number."""
         added = rows - self.count - self._spare_rows
         if added > 0:
             for moments in (self.first_moments, self.second_moments):
@@ -194,8 +187,7 @@ class FusedAdam:
     def follow(self, parameters: Mapping[str, Tensor]) -> None:
         """Adapt the moments to replaced parameters of other shapes.
 
-        If only dimension 0 grew, moments of the new rows start at zero; otherwise all moments of
-        the tensor do.
+        If only dimension 0 grew, moments of the new rows start at zero; otherwise all moments of the tensor do.
         """
         for moments in (self.first_moments, self.second_moments):
             for name, moment in moments.items():

@@ -32,9 +32,7 @@ LEFT, RIGHT = "sh", "right_sh"
 
 
 def with_eye(gradients: Mapping[str, Tensor], of_right: bool) -> dict[str, Tensor]:
-    """Return the gradients of a picture extended to the colours of both eyes, with 0 for the other
-    eye.
-    """
+    """Return the gradients of a picture extended to the colours of both eyes, with 0 for the other eye."""
     nothing = torch.zeros_like(gradients[LEFT])
     colours = (nothing, gradients[LEFT]) if of_right else (gradients[LEFT], nothing)
     return {**gradients, **dict(zip((LEFT, RIGHT), colours, strict=True))}
@@ -42,9 +40,7 @@ def with_eye(gradients: Mapping[str, Tensor], of_right: bool) -> dict[str, Tenso
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the loss (1 - ssim) L1 + ssim (1 - SSIM) + depth * inverse-depth L1, each over
-    tissue pixels.
-    """
+    """Weights of the loss (1 - ssim) L1 + ssim (1 - SSIM) + depth * inverse-depth L1, each over tissue pixels."""
 
     ssim: float = 0.0
     depth: float = 0.0
@@ -65,9 +61,7 @@ class Compared(NamedTuple):
     gradients: dict[str, Tensor]
     """Gradients of the loss by each of the Gaussians' five raw tensors."""
     colour_change: Tensor | None = None
-    """Correction [N, 3] of the colours of degree 0, `sh[:, 0]`, whose gradient is then 0; None
-    without a correction.
-    """
+    """Correction [N, 3] of the colours of degree 0, `sh[:, 0]`, whose gradient is then 0; None without a correction."""
 
 
 @torch.no_grad()
@@ -82,8 +76,7 @@ def loss_and_gradients(
         gaussians: scene at the observation's time.
         observation: target.
         weights: weights of the loss terms.
-        colour_relaxation: above 0, the same passes also compute the colour correction
-            (`colour_correction`).
+        colour_relaxation: above 0, the same passes also compute the colour correction (`colour_correction`).
     """
     camera = observation.camera
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
@@ -135,9 +128,7 @@ def loss_and_gradients(
 def _loss_of_picture(
     splats: RenderedSplats, observation: Observation, weights: LossWeights, use_depth: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the loss, and its gradients by the blended channels [1, H, W, D] and alphas [1, H, W,
-    1].
-    """
+    """Return the loss, and its gradients by the blended channels [1, H, W, D] and alphas [1, H, W, 1]."""
     picture, alphas = splats.image, splats.alphas
     image, alpha = picture[0, ..., :3].contiguous(), alphas[0, ..., 0]
     expected = picture[0, ..., 3] / alpha.clamp(min=1e-10) if use_depth else None
@@ -177,11 +168,9 @@ def _composite(
 def _composite_backward(
     splats: RenderedSplats, v_picture: Tensor, v_alphas: Tensor, settings: RenderSettings, weighed: Tensor | None
 ) -> tuple[Tensor, ...]:
-    """Return gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities
-    [N].
+    """Return gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities [N].
 
-    With `weighed` [H, W, E], E channels are appended: sums over pixels of blending weight times
-    each of these pictures.
+    With `weighed` [H, W, E], E channels are appended: sums over pixels of blending weight times each of these pictures.
     """
     channels = splats.channels[0]
     if weighed is not None:

@@ -46,9 +46,7 @@ class AutogradTraining:
         return self._deformed.detach()
 
     def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
-        """Do one Adam step for the field's parameters and return the gradients of the canonical
-        Gaussians.
-        """
+        """Do one Adam step for the field's parameters and return the gradients of the canonical Gaussians."""
         assert self._canonical is not None and self._deformed is not None
         pairs = [(tensor, gradients[name]) for name, tensor in self._deformed.tensors().items() if tensor.requires_grad]
         torch.autograd.backward([tensor for tensor, _ in pairs], [gradient for _, gradient in pairs])
@@ -63,15 +61,11 @@ class AutogradTraining:
 
 
 SETTLE_EVERY = 32
-"""Captured steps after which the host synchronises to detect overflowing tile lists; also after the
-first step.
-"""
+"""Captured steps after which the host synchronises to detect overflowing tile lists; also after the first step."""
 
 
 def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
-    """Return world units per pixel at the scene's median distance, to convert learning rates in
-    pixels.
-    """
+    """Return world units per pixel at the scene's median distance, to convert learning rates in pixels."""
     if not gaussians.count:
         return 1 / float(camera.K[0, 0])
     distance = depth_of(gaussians.means, camera).abs().median()
@@ -81,9 +75,8 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
 class TrainingStep:
     """Scene being learned with its optimiser.
 
-    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it. Otherwise
-    the gradient is computed at the deformed Gaussians, and the field's training propagates it to
-    the field and the canonical Gaussians.
+    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it. Otherwise the gradient is
+    computed at the deformed Gaussians, and the field's training propagates it to the field and the canonical Gaussians.
     """
 
     def __init__(
@@ -140,13 +133,12 @@ class TrainingStep:
         Args:
             observation: target.
             rate_scale: factor of all learning rates.
-            colour_relaxation: above 0, colours at the observation's time are corrected
-                (`colour_correction`) instead of trained, if the field supports it. A captured step
-                then ignores depth.
+            colour_relaxation: above 0, colours at the observation's time are corrected (`colour_correction`) instead of
+                trained, if the field supports it. A captured step then ignores depth.
 
         Returns:
-            Loss before the update, [] on the device. A captured step is only queued; reading the
-                loss or `settle` waits for it.
+            Loss before the update, [] on the device. A captured step is only queued; reading the loss or `settle` waits
+            for it.
         """
         add_colours = self.capabilities.add_colours
         relaxation = 0.0 if add_colours is None else colour_relaxation
@@ -170,11 +162,10 @@ class TrainingStep:
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
-        """Move every Gaussian at all times to `factor` [N] times its distance from the camera's
-        centre, and scale it accordingly. The field must have `Capabilities.motion`.
+        """Move every Gaussian at all times to `factor` [N] times its distance from the camera's centre, and scale it
+        accordingly. The field must have `Capabilities.motion`.
 
-        The camera sees the same picture. Adam's moments are converted; learning rates follow with
-        `take_distance`.
+        The camera sees the same picture. Adam's moments are converted; learning rates follow with `take_distance`.
         """
         motion = self.capabilities.motion
         assert motion is not None
@@ -194,9 +185,8 @@ class TrainingStep:
         return self._adam.steps
 
     def shorten_rotations(self) -> None:
-        """Normalise all quaternions, including the field's part, without changing the scene.
-        Training lengthens quaternions, which slows further rotation. Nothing changes without
-        `Capabilities.motion`.
+        """Normalise all quaternions, including the field's part, without changing the scene. Training lengthens
+        quaternions, which slows further rotation. Nothing changes without `Capabilities.motion`.
         """
         motion = self.capabilities.motion
         if motion is None:
@@ -209,9 +199,7 @@ class TrainingStep:
         self._adam.second_moments["quats"][:count].div_(factor.square()[:, None])
 
     def idle(self, part: float) -> Tensor:
-        """Return which Gaussians have mean squared gradients below `part` times the usual ones,
-        bool [N].
-        """
+        """Return which Gaussians have mean squared gradients below `part` times the usual ones, bool [N]."""
         squared = self._adam.second_moments["logit_opacities"][: self.gaussians.count]
         return squared < part * squared.mean()
 
@@ -224,9 +212,7 @@ class TrainingStep:
         return order[among[order]]
 
     def take_distance(self, camera: Camera) -> None:
-        """Update learning rates given in pixels to the scene's distance from the camera.
-        Synchronises.
-        """
+        """Update learning rates given in pixels to the scene's distance from the camera. Synchronises."""
         self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
 
     def distance(self, camera: Camera) -> float:
@@ -234,9 +220,7 @@ class TrainingStep:
         return self._mm_per_px * float(camera.K[0, 0])
 
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
-        """Wait for captured steps, and repeat on `observation` those that had no effect because of
-        an overflow.
-        """
+        """Wait for captured steps, and repeat on `observation` those that had no effect because of an overflow."""
         self._unsettled_steps, self._has_settled = 0, True
         while self._captured is not None and (lost := self._captured.settle()):
             for _ in range(lost):
@@ -268,11 +252,10 @@ class TrainingStep:
         self._adam.append(added.count, usual=self._has_no_end)
 
     def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
-        """Replace each Gaussian at `parents` (int64 indices) by two made by `halves`, which move
-        like their parent.
+        """Replace each Gaussian at `parents` (int64 indices) by two made by `halves`, which move like their parent.
 
-        The second ones are appended. All start with fresh moments, except that in an endless stream
-        the first ones keep their parent's.
+        The second ones are appended. All start with fresh moments, except that in an endless stream the first ones keep
+        their parent's.
         """
         first, second = halves(self.gaussians.select(parents))
         for name, tensor in self.gaussians.tensors().items():
@@ -282,9 +265,7 @@ class TrainingStep:
         self.append(second, parents)
 
     def remove(self, leaving: Tensor) -> RowMoves:
-        """Remove the Gaussians marked in `leaving`, bool [N]. Returns the row moves of the others.
-        Synchronises.
-        """
+        """Remove the Gaussians marked in `leaving`, bool [N]. Returns the row moves of the others. Synchronises."""
         moves = RowMoves.without(leaving)
         if self._rows is not None:
             self._rows.close_gaps(moves)
