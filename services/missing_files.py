@@ -148,7 +148,7 @@ class StoredFilesWatch(Collector):
         except StoreUnavailable as error:
             return CheckResult(False, str(error))
         if not missing:
-            return CheckResult(True, "every file is there", needed=False)
+            return CheckResult(True, "no file is missing", needed=False)
         said = ", ".join(f"{count} of {kind}s" for kind, count in count_by_kind(missing).items() if count)
         return CheckResult(False, f"files are missing: {said}; the log names them; restore a backup", needed=False)
 

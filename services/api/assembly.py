@@ -189,7 +189,7 @@ def assembled(settings: ServiceSettings) -> Parts:
 
     async def clock_is_right() -> CheckResult:
         doubt = await asyncio.to_thread(lambda: clock.doubt)
-        return CheckResult(doubt is None, doubt or "it goes on evenly", needed=False)
+        return CheckResult(doubt is None, doubt or "no jump detected", needed=False)
 
     async def models_are_there() -> CheckResult:
         try:

@@ -50,7 +50,7 @@ async def _results(control: ControlState) -> dict[str, CheckResult]:
     results = await asyncio.gather(*(_result(check) for check in checks.values()))
     draining = control.draining.is_set()
     return {
-        "server": CheckResult(not draining, "ending" if draining else "taking requests"),
+        "server": CheckResult(not draining, "draining" if draining else "accepting requests"),
         **dict(zip(checks, results, strict=True)),
     }
 
