@@ -53,7 +53,7 @@ class Names:
         more: accepted names that are not in the registry.
     """
 
-    registry: Registry[Any]
+    registry: Registry[Any] | Mapping[str, Any]
     addresses: Mapping[str, str] = dataclasses.field(default_factory=dict)
     more: tuple[str, ...] = ()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import anyio
 from fastapi import Header, Path, Query, Response
@@ -13,11 +13,13 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse
 from starlette.websockets import WebSocket, WebSocketState
 
+from operators.options import Names
 from services.api.display import REFUSED, REFUSED_WHY, ViewerStalled, in_time, until_ended
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.models import check_soon, registry_of
 from services.api.problems import Conflicting, Missing, Unavailable, problem_answer
 from services.api.state import control_of, part
+from services.jobs.records import JobState
 from services.jobs.results import FILES
 from services.schemas.models import VersionView
 from services.schemas.replays import BatchView, ModelTarget, ReplayRequest, ReplayView, Submitted
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
 router = new_router("replays")
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5d7e8f20"])]
 BatchId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["8f20c9a35d7e1f0b"])]
-State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
 def jobs_of(connection: HTTPConnection) -> Replays:
@@ -78,7 +79,7 @@ async def replays(
     count: int = Query(100, ge=1, le=500),
     before: int | None = Query(None, ge=0, le=2**31 - 1, description="List only replays with a smaller number."),
     batch: str | None = Query(None, pattern=r"^[0-9a-f]{16}$", description="List only replays of this batch."),
-    state: State | None = Query(None, description="List only replays in this state."),
+    state: JobState | None = Query(None, description="List only replays in this state."),
 ) -> list[ReplayView]:
     """List replays, newest first."""
     jobs = jobs_of(request)
@@ -142,7 +143,7 @@ REPORT_POLICY = "; ".join(
 )
 """Content security policy for reports. A report embeds its style and pictures and has no script. It
 is sandboxed and may load nothing."""
-ResultFile = Literal["report.html", "report.json", "frames.jsonl", "reconstruction.mp4", "model.isplat"]
+ResultFile = Annotated[str, Names(FILES)]
 
 
 @router.get(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Path, Query
 from starlette.requests import Request
@@ -13,6 +13,7 @@ from starlette.responses import Response, StreamingResponse
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import MOST_TIMES, ExportWish
+from operators.options import Names
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.models import Number, check_soon, registry_of
 from services.api.problems import Forbidden, Unprocessable, problem_answer
@@ -97,7 +98,7 @@ async def delete_snapshot(request: Request, caller: CallerOf, name: ResourceName
 
 
 exports_router = new_router("exports")
-FormatName = Literal["ply", "splat", "glb", "ply-sequence", "mesh-ply", "mesh-glb", "points-ply", "isplat"]
+FormatName = Annotated[str, Names(ALL)]
 TimeS = Annotated[
     float | None,
     Query(
