@@ -187,8 +187,6 @@ class PairLook:
     """Row difference right minus left in pixels, [3]: value in the middle of the picture, and
     increments at its right and lower edges.
     """
-    row_error_px: float
-    """Median distance of the points from the fitted rows, in pixels."""
     doubt: str | None = None
 
 
@@ -217,8 +215,6 @@ def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[n
         return _doubt(
             "corresponding points of the two eyes are not in common rows; check the calibration used for rectification"
         )
-    error_px = float(np.median(np.abs(_off_rows(rows, here, there[:, 1] - here[:, 1], width, height)[agree])))
-    look = PairLook((here - there)[agree, 0], rows, error_px)
     slope, offset = float(np.abs(rows[1:]).max()), float(abs(rows[0]))
     if slope > MOST_SLOPE_PX:
         return _doubt(
@@ -229,11 +225,11 @@ def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[n
         return _doubt(
             f"the pair is not rectified: the right eye's rows are off by {rows[0]:.1f} px; check the calibration"
         )
-    return look
+    return PairLook((here - there)[agree, 0], rows)
 
 
 def _doubt(text: str) -> PairLook:
-    return PairLook(np.zeros(0, np.float32), np.zeros(3), 0.0, text)
+    return PairLook(np.zeros(0, np.float32), np.zeros(3), text)
 
 
 def _points_in_both(
@@ -283,10 +279,6 @@ def _coarse_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], at: Poi
 def _within_both(found: NDArray[np.float32], known: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     there = np.arange(found.shape[1], dtype=np.float32) - found
     return found, known & (there >= 0) & (there <= found.shape[1] - 1)
-
-
-def _off_rows(rows: NDArray[np.float64], here: Points, lower: Points, width: int, height: int) -> NDArray[np.float64]:
-    return np.asarray(lower - _basis(here, width, height) @ rows)
 
 
 def _basis(here: Points, width: int, height: int) -> NDArray[np.float64]:
