@@ -64,12 +64,6 @@ def test_a_look_that_is_not_followed_changes_nothing(solved):
     assert len(window.looks) == 1 and solved == [1]
 
 
-def test_a_look_without_a_solution_is_taken_only(solved):
-    window = LightWindow(None, look("key"))
-    assert window.add(look(1), solve=False)
-    assert len(window.looks) == 2 and solved == [1]
-
-
 def test_earlier_looks_are_taken_back_to_the_first_that_is_not_followed(solved):
     before = [look("a"), look("b", followed=False), look("c"), look("d")]
     window = LightWindow(None, look("key"), before)
