@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Builds with the machine's own compilers, runs the CUDA tests and then the benchmarks of suite.py on one NVIDIA GPU.
+# Build with the machine's compilers, then run the CUDA tests and the benchmarks of suite.py on one NVIDIA GPU.
 # Usage: benchmarks/gpu_all.sh [--built] [--no-tests] [OPTIONS OF suite.py]
-#   --built      the libraries in gsplat_core/ are there already
+#   --built      use the libraries in gsplat_core/
 #   --no-tests   do not run the CUDA tests
-# gsplat is compared where Python finds it (peers/build_gsplat.py). PYTHON names another interpreter than python3, INTRASPLAT_RECORDINGS the
-# folder of the real recordings. gpu_sanitize.sh runs compute-sanitizer.
+# gsplat is compared if it can be imported (peers/build_gsplat.py). PYTHON is the interpreter (default python3), INTRASPLAT_RECORDINGS the folder of the
+# real recordings. gpu_sanitize.sh runs compute-sanitizer.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 built= tests=1

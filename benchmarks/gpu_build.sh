@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Builds the CPU's and the CUDA kernels with what this machine has (nvcc, cmake, ninja, a python3 with torch >= 2.11), without
-# installing anything. PYTHON and CUDACXX name other programs; INTRASPLAT_CUDA_ARCHITECTURES names other GPUs than the one at hand.
+# Build the CPU and CUDA kernels with this machine's nvcc, cmake, ninja and python3 (torch >= 2.11), without installing anything. PYTHON and CUDACXX
+# select other programs, INTRASPLAT_CUDA_ARCHITECTURES other GPUs than the local one.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}

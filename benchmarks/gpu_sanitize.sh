@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
-# compute-sanitizer's four tools over the tests of sanitized_tests.txt, which together launch every kernel on small inputs
-# (gpu_kernels_reached.py chose them). Fails when a tool finds something in a kernel of ours, or a test fails, or a tool takes
-# longer than LIMIT seconds (240). Needs the built kernels (benchmarks/gpu_build.sh or `make cuda`), pytest and
-# compute-sanitizer; TOOLS names others than all tools, arguments go to pytest.
+# Run the four tools of compute-sanitizer on the tests of sanitized_tests.txt, which launch every kernel on small inputs (selected by
+# gpu_kernels_reached.py). Fails if a tool reports an error in a kernel of this project, a test fails, or a tool exceeds LIMIT seconds (240). Needs the
+# built kernels (benchmarks/gpu_build.sh or `make cuda`), pytest and compute-sanitizer. TOOLS selects tools; arguments are passed to pytest.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
@@ -13,7 +12,7 @@ failed=0
 for tool in ${TOOLS:-memcheck initcheck racecheck synccheck}; do
   cache=0
   [ "$tool" = memcheck ] || [ "$tool" = initcheck ] && cache=1
-  # torch's own kernels take time and are not ours to check, but initcheck has to see what they write.
+  # Torch's kernels are excluded to save time, except for initcheck, which must see what they write.
   skip="--kernel-name-exclude kernel_substring=_ZN2at6native"
   [ "$tool" = initcheck ] && skip=
   start=$SECONDS

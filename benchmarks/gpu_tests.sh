@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs the CUDA tests, split over several processes. Each process has its own folder for compiled extensions.
-# Usage: benchmarks/gpu_tests.sh [ARGUMENTS OF pytest]; PROCESSES is 8 unless the environment says otherwise. Logs go to out/gpu_tests.
+# Run the CUDA tests, split over several processes. Each process has its own folder for compiled extensions.
+# Usage: benchmarks/gpu_tests.sh [ARGUMENTS OF pytest]; PROCESSES defaults to 8. Logs are written to out/gpu_tests.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} FAIL_WITHOUT_CUDA=1 OMP_NUM_THREADS=2

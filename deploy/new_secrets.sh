@@ -1,7 +1,7 @@
 #!/bin/sh
-# Makes what compose.yaml asks for in secrets/: the administrator's key and Grafana's password, at random; what is there stays.
-# A container's user has to read them and has no name here: the files are open, and the folder is closed to all but its owner.
-# metrics.key holds nothing until the service has made a key for Prometheus (docs/operations.md).
+# Create the secrets of compose.yaml in secrets/: a random administrator's key and Grafana password. Existing files are kept.
+# The container's user has no name on the host, so the files are readable and the folder is accessible to its owner only.
+# metrics.key stays empty until the service has created a key for Prometheus (docs/operations.md).
 set -eu
 cd "$(dirname "$0")"
 mkdir -p secrets

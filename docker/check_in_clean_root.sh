@@ -1,8 +1,8 @@
 #!/bin/bash
-# Runs the steps of docker/Dockerfile's target `cpu`, in their order, where there is no Docker engine: in a root made by debootstrap in place of
-# the base image (Debian bookworm with its own Python 3.11 in place of the image's). Ends with the service as user 10001, and its health check.
+# Run the steps of docker/Dockerfile's target `cpu` without a Docker engine: in a root made by debootstrap instead of the base image (Debian bookworm with its own
+# Python 3.11). At the end the service runs as user 10001 with its health check.
 # Needs root, debootstrap, a network, 12 GB and half an hour. Usage: docker/check_in_clean_root.sh FOLDER [MIRROR]
-# TORCH_INDEX_URL and TORCH_SHA256 are those of the image; an empty TORCH_INDEX_URL takes torch of the lock.
+# TORCH_INDEX_URL and TORCH_SHA256 are those of the image; with an empty TORCH_INDEX_URL, torch comes from the lock.
 set -euo pipefail
 repository=$(cd "$(dirname "$0")/.." && pwd)
 root=${1:?give a folder that is not there yet}
@@ -12,7 +12,7 @@ torch_index=${TORCH_INDEX_URL-$(sed -n 's/^ARG TORCH_INDEX_URL=//p' "$repository
 
 step() { echo "== $*" >&2; }
 inside() { chroot "$root" /usr/bin/env -i PATH=/opt/intrasplat/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root PIP_NO_CACHE_DIR=1 "${settings[@]}" "$@"; }
-# Settings with which this machine reaches package registries, if it needs any.
+# Settings for access to package registries, if needed.
 settings=()
 for name in http_proxy https_proxy no_proxy PIP_CERT PIP_DEFAULT_TIMEOUT; do [ -z "${!name:-}" ] || settings+=("$name=${!name}"); done
 

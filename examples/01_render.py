@@ -1,6 +1,6 @@
 """Render a few hundred Gaussians to a picture.
 
-Places small, flat Gaussians on a sphere, colours them by where they are, and renders them once with `render` (one camera, our
+Places small, flat Gaussians on a sphere, colours them by position, and renders them once with `render` (one camera, our
 own dataclasses) and once with `rasterization` (gsplat's names, arguments and results). Both give the same pixels.
 
 Usage: python examples/01_render.py [--out out/examples/sphere.png]

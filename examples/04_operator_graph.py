@@ -1,7 +1,7 @@
 """Write an operator and run it in a graph.
 
-An operator of our own measures how much of each frame the tool covers. It runs in parallel with a second branch whose operator fails
-on one frame: its fault policy ends that branch, and the first branch goes on to the end of the recording.
+A custom operator measures how much of each frame the tool covers. It runs in parallel with a second branch whose operator fails
+on one frame: its fault policy ends that branch, and the first branch continues to the end of the recording.
 
 Usage: python examples/04_operator_graph.py [--engine embedded|holoscan]
 """

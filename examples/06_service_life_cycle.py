@@ -3,7 +3,7 @@
 Needs a running service (`intrasplat serve`) and its administrator's key. Makes two models of one colour each, uploads them as versions of one
 model, shows it as a stream, and changes what is shown: activate, roll back, stop, start. It exports the model, and a snapshot of a live
 reconstruction. It uploads a small recording, replays it as a job, follows its progress and reads its report. Then it rotates an API key, and
-reads the audit log and the metrics. What it has made it deletes, but for the version of the model that is active.
+reads the audit log and the metrics. It deletes everything it created, except the active version of the model.
 
 Usage: python examples/06_service_life_cycle.py --key-file ~/.local/share/intrasplat/admin.key [--url http://127.0.0.1:8000]
 """

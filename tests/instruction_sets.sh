@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Runs the numeric tests with each instruction set of this processor: that of torch's kernels (ATEN_CPU_CAPABILITY), of torch's BLAS
-# (MKL_ENABLE_INSTRUCTIONS; MKL ignores it on processors that are not Intel's), of numpy's BLAS (OPENBLAS_CORETYPE) and of our kernels
+# Run the numeric tests with each instruction set of this processor: of torch's kernels (ATEN_CPU_CAPABILITY), of torch's BLAS
+# (MKL_ENABLE_INSTRUCTIONS; ignored on other processors than Intel's), of NumPy's BLAS (OPENBLAS_CORETYPE) and of the kernels here
 # (INTRASPLAT_ISA). Usage: tests/instruction_sets.sh [TEST FILES OR FOLDERS]; without arguments the fast tests of the core and the operators.
-# The environment may set PROCESSES (default 2, the files are split over them) and PYTHON. Logs go to out/instruction_sets.
+# Environment: PROCESSES (default 2, over which the files are split) and PYTHON. Logs are written to out/instruction_sets.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}" OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1

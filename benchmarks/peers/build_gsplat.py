@@ -4,13 +4,13 @@
     python benchmarks/peers/build_gsplat.py build/peers/gsplat-1.5.3-py3-none-any.whl build/peers
     PYTHONPATH=build/peers python benchmarks/gpu_eager.py
 
-1.5.3 is the newest version on PyPI (November 2026); a later one is taken as gsplat-VERSION.tar.gz in the wheel's place. For a GPU machine
-without a network, put the archive into build/peers, which git ignores, and carry that folder there.
+1.5.3 is the newest version on PyPI (November 2026); for a later one give gsplat-VERSION.tar.gz instead of the wheel. For a GPU machine
+without a network, put the archive into build/peers, which git ignores, and copy that folder.
 
 Needs nvcc, ninja, a torch with CUDA, and jaxtyping and rich, which gsplat imports. The sources and the flags (-O3 -use_fast_math)
-are the wheel's; only where the result lies differs from gsplat's own compilation when it is first used: next to its Python files,
-so that the folder can be carried to another machine of the same kind. TORCH_CUDA_ARCH_LIST names another GPU than the one at
-hand, MAX_JOBS how many compilers run at a time. After an interruption the same command goes on.
+are the wheel's; the result is written next to gsplat's Python files, so that the folder can be copied to another machine of the same
+kind. TORCH_CUDA_ARCH_LIST selects another GPU than the local one, MAX_JOBS the number of compilers. After an interruption the
+same command continues.
 """
 
 from __future__ import annotations

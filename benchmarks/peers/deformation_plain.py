@@ -1,7 +1,7 @@
-"""Deformation fields in plain PyTorch, the peers of the fused ones.
+"""Deformation fields in plain PyTorch, as peers of the fused ones.
 
 `PlainHexPlane` is HexPlane (Cao and Johnson 2023) with a small network as in 4D Gaussian Splatting (Wu et al. 2024) and G-SHARP: six
-`grid_sample`s per level, their product, the levels side by side, a trunk, heads. `PlainBasis` is bumps in time per Gaussian, shared
+`grid_sample`s per level, their product, the levels concatenated, a trunk, heads. `PlainBasis` is bumps in time per Gaussian, shared
 by 13 channels (after Deform3DGS, Yang et al. 2024).
 """
 
@@ -58,12 +58,12 @@ class PlainHexPlane(nn.Module):
 
 
 def gsharp() -> PlainHexPlane:
-    """G-SHARP's size: 85.3 million parameters in the planes."""
+    """Return a field of G-SHARP's size: 85.3 million parameters in the planes."""
     return PlainHexPlane(64, (64, 64, 64, 100), (1, 2, 4, 8), (32,), deep_heads=True).cuda()
 
 
 def small() -> PlainHexPlane:
-    """The size of gsplat's surgical trainer."""
+    """Return a field of the size in gsplat's surgical trainer."""
     return PlainHexPlane(32, (64, 64, 64, 25), (1, 2), (64, 64, 64), deep_heads=False).cuda()
 
 

@@ -1,6 +1,6 @@
 """A training step as it is usually written on gsplat: deform, rasterize, masked L1, autograd, `torch.optim.Adam`.
 
-The pictures lie on the GPU as floats before the step, so that nothing is counted but the step.
+The pictures are on the GPU as floats before the step, so that only the step is measured.
 """
 
 from __future__ import annotations
@@ -77,6 +77,6 @@ def with_basis(field: PlainBasis) -> Callable[[Raw, float], Raw]:
 
 
 def first(raw: Sequence[Tensor], count: int, degree: int) -> Raw:
-    """The first `count` Gaussians with harmonics up to `degree`."""
+    """Return the first `count` Gaussians with harmonics up to `degree`."""
     means, quats, log_scales, logit_opacities, sh = (tensor[:count] for tensor in raw)
     return means, quats, log_scales, logit_opacities, sh[:, : (degree + 1) ** 2].contiguous()
