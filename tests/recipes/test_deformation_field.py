@@ -188,6 +188,12 @@ def test_a_bundle_with_a_field_that_is_not_registered_is_refused(registered, rec
         FIELDS.add("drift", DRIFT)
 
 
+def test_the_recipe_explains_every_capability():
+    guide = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    recipe = guide[guide.index("### A deformation field") : guide.index("### A renderer")]
+    assert [each.name for each in dataclasses.fields(Capabilities) if f"`{each.name}`" not in recipe] == []
+
+
 def test_a_name_can_be_taken_once_only(registered):
     registered(DRIFT)
     with pytest.raises(InvalidInput, match="a deformation field named 'drift' already exists"):
