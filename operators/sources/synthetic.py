@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from gsplat_core.io.recordings.synthetic.kept import kept_recording
-from gsplat_core.io.recordings.synthetic.rendered import RenderSettings
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, kept_recording
 from operators.sources.address import SourceOptions, SyntheticAddress
 from operators.sources.recording import RealtimeSource
 

@@ -13,12 +13,113 @@ from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.synthetic.air import Air
 from gsplat_core.io.recordings.synthetic.lamp import Lamp
-from gsplat_core.io.recordings.synthetic.shading import develop, shade_tissue, shade_tool
 from gsplat_core.io.recordings.synthetic.tissue import SurfacePoints, Tissue, Tug
-from gsplat_core.io.recordings.synthetic.tool import Part, trace
+from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, Part, distance, trace
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.floating]
+
+
+def shade_tissue(
+    tissue: Tissue,
+    u: Array,
+    v: Array,
+    points: SurfacePoints,
+    local: Array,
+    rays: Array,
+    parts: list[Part],
+    camera: Camera,
+    lamp: Lamp,
+) -> Array:
+    """Return the linear radiance [H, W, 3] of the tissue.
+
+    Combines scattering that bleeds red with a wet film over a fine relief.
+    """
+    reflectance, slope = tissue.texture.sample(u, v)
+    turn = camera.world_to_camera[:3, :3].T.astype(np.float32)
+    along_u = np.stack(points.along_u, axis=-1) @ turn
+    along_v = np.stack(points.along_v, axis=-1) @ turn
+    # The sheet spans the view, u to the right and v down, so u x v points away from the scope.
+    smooth = _unit(np.cross(along_v, along_u))
+    bumpy = _unit(np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32))
+    light_diffuse = np.zeros(u.shape, np.float32)
+    light_wet = np.zeros(u.shape, np.float32)
+    for to_light, power in lamp.rays_to(local):
+        facing = np.einsum("hwi,hwi->hw", bumpy, to_light)
+        half = _unit(to_light - rays)
+        shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
+        light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
+        light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
+    shade = _tool_shade(parts, camera, local, lamp)
+    diffuse = (light_diffuse * shade)[..., None]
+    # Light scattered inside tissue emerges red. Raise red where little direct light arrives.
+    bleed = np.array([0.060, 0.014, 0.010], np.float32) * np.sqrt(np.maximum(diffuse, 0))
+    wet = (light_wet * shade * reflectance[..., 3])[..., None] * np.array([1.0, 0.97, 0.93], np.float32)
+    return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)
+
+
+def _tool_shade(parts: list[Part], camera: Camera, local: Array, lamp: Lamp) -> Array:
+    """Return the share of light [H, W] that passes the tool on its way to the tissue.
+
+    The distance to the tool is sampled along the shadow rays on a coarse pixel grid.
+    """
+    step = 3
+    rotation = camera.world_to_camera[:3, :3].astype(np.float32)
+    coarse = local[::step, ::step].reshape(-1, 3)
+    to_light = lamp.shadow_from - coarse
+    shade = np.ones(len(coarse), np.float32)
+    for reach in (0.015, 0.05, 0.10, 0.17, 0.26, 0.37):
+        at = (coarse + np.float32(reach) * to_light) @ rotation + camera.position.astype(np.float32)
+        gap, _ = distance(parts, at)
+        blur = np.float32(1.0 + 22 * reach)
+        shade = np.minimum(shade, np.clip(0.5 + gap / blur, 0, 1))
+    rows, columns = local[::step, ::step].shape[:2]
+    return _upsample(0.30 + 0.70 * shade.reshape(rows, columns), local.shape[0], local.shape[1], step)
+
+
+def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
+    row, column = np.arange(rows) / step, np.arange(columns) / step
+    known_rows, known_columns = np.arange(coarse.shape[0]), np.arange(coarse.shape[1])
+    wide = np.stack([np.interp(column, known_columns, line) for line in coarse])
+    low = np.minimum(row.astype(int), len(known_rows) - 1)
+    high = np.minimum(low + 1, len(known_rows) - 1)
+    weight = (row - low)[:, None]
+    return np.asarray((1 - weight) * wide[low] + weight * wide[high], np.float32)
+
+
+def shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lamp: Lamp) -> Array:
+    """Return the linear radiance [N, 3] of the tool.
+
+    The shaft is dark polymer, the jaws are brushed steel reflecting pink surroundings.
+    """
+    metal = (material != SHAFT)[:, None]
+    base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
+    base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
+    gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
+    glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))
+    total = np.zeros((len(at), 3), np.float32)
+    for to_light, power in lamp.rays_to(at, nearest_mm2=400):
+        facing = np.clip(np.einsum("ni,ni->n", normal, to_light), 0, 1)
+        shine = np.clip(np.einsum("ni,ni->n", normal, _unit(to_light - rays)), 0, 1)
+        total += (power * facing)[:, None] * base + (power * glint * shine**gloss)[:, None]
+    mirrored = rays - 2 * np.einsum("ni,ni->n", rays, normal)[:, None] * normal
+    tissue_seen = (np.clip(0.45 + 0.65 * mirrored[:, 2], 0, 1) ** 2)[:, None]
+    fresnel = (1 - np.clip(-np.einsum("ni,ni->n", rays, normal), 0, 1))[:, None] ** 3
+    reflected = np.where(metal, 0.60 + 0.40 * fresnel, 0.05 + 0.45 * fresnel)
+    surroundings = np.array([0.250, 0.130, 0.110], np.float32)
+    return np.asarray(total + reflected * tissue_seen * surroundings, np.float32)
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.sqrt(np.einsum("...i,...i->...", vector, vector))[..., None], np.float32)
+
+
+def develop(radiance: Array) -> NDArray[np.uint8]:
+    """Convert radiance to a picture: soft-shoulder tone curve, then sRGB (IEC 61966-2-1)."""
+    exposed = 1 - np.exp(np.float32(-1.45) * radiance)
+    curve = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.asarray(np.clip(np.round(255 * curve), 0, 255), np.uint8)
+
 
 NEWTON_STEPS = 6
 

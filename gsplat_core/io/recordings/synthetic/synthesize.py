@@ -19,21 +19,290 @@ true_depth/                          noise-free depth if depth/ has noise
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.files import PartialFolder
-from gsplat_core.io.recordings.synthetic.description import describe
+from gsplat_core.io.files import PartialFolder, read_regular
+from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
-from gsplat_core.io.recordings.synthetic.files import FrameFiles
-from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
-from gsplat_core.io.recordings.synthetic.target import check_target
+from gsplat_core.io.recordings.synthetic.renderer import Eye
+from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
+from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM
+from gsplat_core.io.recordings.synthetic.truth import motion_to, seen_points
+from gsplat_core.io.recordings.truth import VIEWS_FILE, VIEWS_FORMAT, VIEWS_VERSION
 from gsplat_core.memory import available_bytes, in_gib
+from gsplat_core.scene.cameras import Camera
+
+GENERATOR = "intrasplat synthesize"
+_FRAME = r"frame-\d{6}\."
+_WRITTEN = re.compile(
+    rf"(views/third/)?(images/{_FRAME}color|masks/{_FRAME}mask|depth/{_FRAME}depth)\.png"
+    rf"|images_right/{_FRAME}color\.png|true_depth/{_FRAME}depth\.png|(scene_)?flow/\d{{6}}\.npy"
+    r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json"
+)
+"""Pattern of the files written by `synthesize`."""
+_FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for name in ("images", "masks", "depth")) | {
+    "images_right",
+    "true_depth",
+    "flow",
+    "scene_flow",
+    "views",
+    "views/third",
+}
+
+
+def check_target(target: Path) -> None:
+    """Check that `target` can be replaced without losing foreign files.
+
+    Raises:
+        InvalidSetting: if it contains anything that `synthesize` did not write.
+        OSError: if the name is impossible.
+    """
+    try:
+        os.lstat(target)
+    except FileNotFoundError:
+        return
+    if target.is_symlink():
+        raise InvalidSetting(f"{target} is a link; give the folder itself, or one that does not exist yet")
+    if not target.is_dir():
+        raise InvalidSetting(f"{target} is a file; give a folder that does not exist yet")
+    if os.path.ismount(target):
+        raise InvalidSetting(f"{target} is the root of a disk, which cannot be replaced; give a folder on it")
+    foreign = sorted(_foreign(target))
+    if foreign:
+        raise InvalidSetting(
+            f"{target} holds what synthesize did not write ({', '.join(foreign[:5])}); give a new or an empty folder"
+        )
+
+
+def _foreign(target: Path) -> Iterator[str]:
+    """Yield the names of entries that no earlier `synthesize` call wrote.
+
+    Every entry is foreign unless the folder contains a synthetic recording's description.
+    """
+    description = target / "recording.json"
+    ours = description.is_file() and _made_here(description)
+    folders = [target]
+    for folder in folders:
+        for entry in folder.iterdir():
+            name = entry.relative_to(target).as_posix()
+            if not ours or entry.is_symlink():
+                yield name
+            elif name in _FOLDERS and entry.is_dir() and not os.path.ismount(entry):
+                folders.append(entry)
+            elif not (_WRITTEN.fullmatch(name) and entry.is_file()):
+                yield name
+
+
+def _made_here(description: Path) -> bool:
+    try:
+        content = json.loads(read_regular(description, 1 << 20))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.get("generator") == GENERATOR
+
+
+DEPTH_UNIT_MM = 0.01
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """Values of one frame that are collected into files of the whole recording."""
+
+    pose_bounds: NDArray[np.float64]
+    track: NDArray[np.float32]
+    seen: NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """Writer of the files of one frame at a time, in any order."""
+
+    scene: SyntheticScene
+    folder: Path
+    fps: float
+    seed: int
+    stereo: bool
+    extras: Extras
+
+    def make_folders(self) -> None:
+        """Create the folders of the files."""
+        names = ["images", "masks", "depth"]
+        names += ["images_right"] if self.stereo else []
+        names += [f"views/third/{name}" for name in ("images", "masks", "depth")] if self.extras.third else []
+        names += ["behind/images", "behind/depth"] if self.extras.behind else []
+        names += ["flow", "scene_flow"] if self.extras.flow else []
+        names += ["true_depth"] if self.extras.depth_noise_mm else []
+        for name in names:
+            (self.folder / name).mkdir(parents=True)
+
+    def write(self, index: int) -> FrameRow:
+        """Write one frame; the result depends only on its index."""
+        scene, extras, time_s = self.scene, self.extras, index / self.fps
+        left = scene.render(time_s)
+        self._view(self.folder, index, left)
+        if extras.depth_noise_mm:
+            save_depth(self.folder / "true_depth" / _name(index, "depth"), left.depth)
+            save_depth(self.folder / "depth" / _name(index, "depth"), self._noisy(left.depth, index))
+        if extras.behind:
+            bare = scene.render(time_s, transparent=True)
+            save_image(self.folder / "behind/images" / _name(index, "color"), bare.image)
+            save_depth(self.folder / "behind/depth" / _name(index, "depth"), bare.depth)
+        if self.stereo:
+            save_image(self.folder / "images_right" / _name(index, "color"), scene.render(time_s, "right").image)
+        if extras.third:
+            self._view(self.folder / "views/third", index, scene.render(time_s, "third"))
+        if extras.flow:
+            motion = motion_to(scene, left, time_s, (index + 1) / self.fps)
+            np.save(self.folder / "flow" / f"{index:06d}.npy", motion.flow)
+            np.save(self.folder / "scene_flow" / f"{index:06d}.npy", motion.scene_flow)
+        view = scene.camera_at(time_s)
+        row = np.zeros((3, 5))
+        row[:, :3], row[:, 3] = view.world_to_camera[:3, :3].T, view.position
+        row[:, 4] = view.height_px, view.width_px, view.K[0, 0]
+        pose_bounds = np.concatenate([row.ravel(), [left.depth.min(), left.depth.max()]])
+        return FrameRow(pose_bounds, scene.track(time_s), seen_points(scene, left, time_s) if extras.tracks else None)
+
+    def finish(self, rows: list[FrameRow]) -> None:
+        """Write the files shared by all frames."""
+        np.save(self.folder / "poses_bounds.npy", np.stack([row.pose_bounds for row in rows]))
+        np.save(self.folder / "tracks.npy", np.stack([row.track for row in rows]).astype(np.float32))
+        if self.extras.tracks:
+            np.save(
+                self.folder / "tracks_seen.npy",
+                np.stack([row.seen for row in rows if row.seen is not None]).astype(np.uint8),
+            )
+
+    def _view(self, folder: Path, index: int, eye: Eye) -> None:
+        save_image(folder / "images" / _name(index, "color"), eye.image)
+        encoded = np.where(eye.tool, 255, 0).astype(np.uint8)
+        _save(folder / "masks" / _name(index, "mask"), encoded)
+        save_depth(folder / "depth" / _name(index, "depth"), eye.depth)
+
+    def _noisy(self, depth: NDArray[Any], index: int) -> NDArray[Any]:
+        """Add noise to the depth as from a stereo matcher: it grows with the squared distance."""
+        random = np.random.default_rng((self.seed, index, 3))
+        spread = self.extras.depth_noise_mm * np.square(depth / np.float32(TISSUE_DISTANCE_MM))
+        return np.maximum(depth + spread * random.standard_normal(depth.shape, np.float32), np.float32(DEPTH_UNIT_MM))
+
+
+def save_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """An RGB image as PNG."""
+    _save(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def save_depth(path: Path, depth: NDArray[Any]) -> None:
+    """Depth in mm as 16 bit PNG in units of DEPTH_UNIT_MM."""
+    _save(path, np.round(depth / np.float32(DEPTH_UNIT_MM)).astype(np.uint16))
+
+
+def _name(index: int, what: str) -> str:
+    return f"frame-{index:06d}.{what}.png"
+
+
+def _save(path: Path, pixels: NDArray[Any]) -> None:
+    encoded, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 2])
+    assert encoded
+    path.write_bytes(data.tobytes())
+
+
+_ALWAYS = {
+    "images": "sRGB, one ray for each pixel centre (column + 0.5, row + 0.5)",
+    "images_right": "rendered from the right eye, rectified: disparity = fx * stereo_baseline_mm / depth",
+    "masks": "255 = every pixel that the tool covers in part, 0 = tissue alone",
+    "depth": "z of the first surface on the ray, tool or tissue, in units of depth_unit_mm",
+    "poses_bounds.npy": "camera-to-world, OpenCV axes; (height, width, f); nearest and farthest depth in mm",
+    "tracks.npy": "float32 [frames, points, 3]: material points of the tissue in the world, mm",
+}
+_THIRD = {"views": "cameras that are never given to training (views.json): images, masks and depth as of the left eye"}
+_FLOW = {
+    "flow": "float32 [H, W, 2], pixels: what is at pixel p of a frame is at p + flow in the next one; NaN where the tool is",
+    "scene_flow": "float32 [H, W, 3], mm: how far that tissue moves in the world; NaN where the tool is",
+}
+_SEEN = {"tracks_seen.npy": "uint8 [frames, points]: 1 where the left eye sees the point"}
+_NOISY = {
+    "depth": "true_depth with noise that grows with the square of the distance",
+    "true_depth": _ALWAYS["depth"],
+}
+
+
+_BEHIND = {
+    "behind/images": "the left eye's picture through the tool: tissue that it hides, in its shadow",
+    "behind/depth": "z of that tissue",
+}
+
+
+def describe(files: FrameFiles, frames: int) -> None:
+    """Write `recording.json`, and `views.json` if the recording has a third camera."""
+    extras, scene = files.extras, files.scene
+    meaning = dict(_ALWAYS)
+    for wanted, more in (
+        (extras.third, _THIRD),
+        (extras.flow, _FLOW),
+        (extras.tracks, _SEEN),
+        (extras.behind, _BEHIND),
+    ):
+        meaning |= more if wanted else {}
+    meaning |= _NOISY if extras.depth_noise_mm else {}
+    description: dict[str, Any] = {
+        "format": RECORDING_FORMAT,
+        "version": RECORDING_VERSION,
+        "generator": GENERATOR,
+        "seed": files.seed,
+        "frames": frames,
+        "fps": files.fps,
+        "units": "mm",
+        "camera": _intrinsics(scene.camera),
+        "camera_moves": scene.moving,
+        "depth_unit_mm": DEPTH_UNIT_MM,
+        "stereo_baseline_mm": BASELINE_MM if files.stereo else None,
+        "ground_truth": meaning,
+    }
+    if extras != CLEAR:
+        description["made_with"] = extras.described()
+    if extras.exposure_changes and scene.air is not None:
+        description["exposure"] = [scene.air.exposure_at(index / files.fps) for index in range(frames)]
+    _write_json(files.folder / "recording.json", description)
+    if extras.third:
+        third = {
+            "name": "third",
+            "folder": "views/third",
+            "camera": _intrinsics(scene.camera),
+            "left_to_view": scene.left_to("third").tolist(),
+        }
+        _write_json(
+            files.folder / VIEWS_FILE,
+            {"format": VIEWS_FORMAT, "version": VIEWS_VERSION, "depth_unit_mm": DEPTH_UNIT_MM, "views": [third]},
+        )
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
+    return {
+        "model": "pinhole",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "fx": float(camera.K[0, 0]),
+        "fy": float(camera.K[1, 1]),
+        "cx": float(camera.K[0, 2]),
+        "cy": float(camera.K[1, 2]),
+    }
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
 
 MAX_SEED = 2**63 - 1
 SCENE_BYTES = 1120
@@ -75,7 +344,7 @@ def synthesize(
     with PartialFolder(target) as partial:
         # The flow of the last frame points to a frame that is not written.
         scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving", extras)
-        _write(FrameFiles(scene, partial.path, fps, seed, stereo, extras), frames, progress, threads)
+        _write_frames(FrameFiles(scene, partial.path, fps, seed, stereo, extras), frames, progress, threads)
         check_target(target)  # another process may have created files meanwhile
         earlier = partial.finish()
         if earlier is not None:
@@ -115,7 +384,7 @@ def threads_that_fit(width_px: int, height_px: int) -> int:
     return max(1, min(threads, (available - texture) // frame))
 
 
-def _write(files: FrameFiles, frames: int, progress: Callable[[int, int], None] | None, threads: int) -> None:
+def _write_frames(files: FrameFiles, frames: int, progress: Callable[[int, int], None] | None, threads: int) -> None:
     files.make_folders()
     rows = []
     # A frame depends on its index alone, so the order in which threads finish does not matter.

@@ -1,4 +1,4 @@
-"""Rendered recordings that are kept."""
+"""Rendered recordings that are kept on disk."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.synthetic import kept
-from gsplat_core.io.recordings.synthetic.kept import kept_recording
-from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
+from gsplat_core.io.recordings.synthetic import rendered as module
+from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, kept_recording, render_recording
 
 SMALL = RenderSettings(frames=2, width_px=40, height_px=32, camera="moving", stereo=True)
 ONE = 2 * (40 * 32 * (3 + 3 + 4 + 1) + 128)
@@ -26,14 +25,14 @@ def rendered(monkeypatch):
         asked.append(what)
         return render_recording(what, progress)
 
-    monkeypatch.setattr(kept, "render_recording", render)
+    monkeypatch.setattr(module, "render_recording", render)
     return asked
 
 
 def same(one, other) -> None:
     for a, b in zip(one, other, strict=True):
         assert (a.seq, a.pts_ns) == (b.seq, b.pts_ns)
-        for name in kept.PLANES:
+        for name in module.PLANES:
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), strict=True)
 
 
@@ -59,7 +58,7 @@ def test_each_argument_makes_another_file(tmp_path, rendered, other):
 
 def test_another_renderer_makes_another_file(tmp_path, rendered, monkeypatch):
     kept_recording(SMALL, tmp_path / "kept")
-    monkeypatch.setattr(kept, "_renderer", lambda: "changed")
+    monkeypatch.setattr(module, "_renderer", lambda: "changed")
     kept_recording(SMALL, tmp_path / "kept")
     assert len(rendered) == 2
 
