@@ -206,8 +206,8 @@ class JoinedSource(LiveSource):
     def state_sentence(self) -> str:
         """State messages of both eyes."""
         eyes = [("left", self._left), ("right", self._right)]
-        said = [f"{name} eye: {eye.state_sentence}" for name, eye in eyes if isinstance(eye, ReportingSource)]
-        return "; ".join(said) or super().state_sentence
+        sentences = [f"{name} eye: {eye.state_sentence}" for name, eye in eyes if isinstance(eye, ReportingSource)]
+        return "; ".join(sentences) or super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
         """Return the counts of this source, and those of both eyes prefixed by `left` or `right`."""

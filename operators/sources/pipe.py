@@ -112,17 +112,17 @@ class Y4mHeader:
             raise InvalidSetting(
                 f"this is no YUV4MPEG2 stream (it begins with {line[:16]!r}); for raw frames say ?size=640x512&format=rgb24"
             )
-        said = {word[0]: word[1:] for word in reversed(words[1:]) if word and word[0] in "WHFCI"}
+        tags = {word[0]: word[1:] for word in reversed(words[1:]) if word and word[0] in "WHFCI"}
         full = "XCOLORRANGE=FULL" in words
-        width, height = (said.get(side, "") for side in "WH")
+        width, height = (tags.get(side, "") for side in "WH")
         if not (width.isdecimal() and height.isdecimal() and len(width) < 6 and len(height) < 6):
             raise InvalidSetting(f"the header names no size: {line[:80]!r}")
-        name = _FORMATS.get(said.get("C", "420"))
+        name = _FORMATS.get(tags.get("C", "420"))
         if name is None:
             raise InvalidSetting(
-                f"pictures of the kind C{said['C'][:20]} are not read; known are {', '.join(_FORMATS)}"
+                f"pictures of the kind C{tags['C'][:20]} are not read; known are {', '.join(_FORMATS)}"
             )
-        rate = _RATE.fullmatch(said.get("F", ""))
+        rate = _RATE.fullmatch(tags.get("F", ""))
         over, under = (int(part) for part in rate.groups()) if rate else (0, 0)
         return cls(
             int(width),

@@ -212,13 +212,13 @@ class Served:
             self._changed.wait_for(lambda: self._wanted or self.ended.is_set())
         source.open()
         try:
-            said_s = 0.0
+            reported_s = 0.0
             while not self.ended.is_set():
                 frame = source.read(_REPORT_S)
                 if frame is not None:
                     self._hand_over(frame)
-                if frame is None or time.monotonic() - said_s > _REPORT_S:
-                    said_s = time.monotonic()
+                if frame is None or time.monotonic() - reported_s > _REPORT_S:
+                    reported_s = time.monotonic()
                     self._report(source)
                 if frame is None and source.state.value == "ended":
                     self.send("ended", sentence=getattr(source, "state_sentence", ""))
@@ -346,17 +346,17 @@ class ChildProcess:
         self.connection: Connection = ours
         self.frames = FrameReader(memory_fd)
         self._memory_fd = memory_fd
-        self.heard_s = time.monotonic()
+        self.message_s = time.monotonic()
         """Time of the last received message, by `time.monotonic`."""
         content = {"opener": opening.opener, "address": opening.address, "options": asdict(opening.options)}
-        self.say("ask", **content)
+        self.send("ask", **content)
 
-    def say(self, kind: str, **content: object) -> None:
+    def send(self, kind: str, **content: object) -> None:
         """Send a message to the process. No effect if it has ended."""
         with contextlib.suppress(OSError):
             self.connection.send_bytes(message(kind, **content))
 
-    def hear(self, timeout_s: float) -> dict[str, Any] | None:
+    def receive(self, timeout_s: float) -> dict[str, Any] | None:
         """Receive the next message.
 
         Args:
@@ -376,7 +376,7 @@ class ChildProcess:
             raise ChildLost(self._how_it_ended()) from error
         except InvalidMessage as error:
             raise ChildLost(f"it sent an invalid message: {error}") from error
-        self.heard_s = time.monotonic()
+        self.message_s = time.monotonic()
         return received
 
     def end(self) -> None:
@@ -476,7 +476,7 @@ class ProcessSource(LiveSource):
         state, reported, child = super().state, self._child_state, self._child
         if state is not SourceState.LIVE or self._ready:
             return state
-        if child is not None and time.monotonic() - child.heard_s > STALLED_AFTER_S:
+        if child is not None and time.monotonic() - child.message_s > STALLED_AFTER_S:
             return SourceState.STALLED
         return reported[0] if reported is not None and reported[0] is not SourceState.ENDED else state
 
@@ -546,23 +546,23 @@ class ProcessSource(LiveSource):
         """Yield the frames of the current process until its source ends. Raises ChildLost."""
         child = self._child
         assert child is not None
-        child.say("open")
+        child.send("open")
         last_s = time.monotonic()
         while not self.wait(0):
-            message = child.hear(LOOK_S)
+            message = child.receive(LOOK_S)
             if message is None:
-                if time.monotonic() - child.heard_s > self._hung_after_s:
+                if time.monotonic() - child.message_s > self._hung_after_s:
                     raise ChildLost(f"it has sent nothing for {self._hung_after_s:g} s")
                 continue
             if message["kind"] == "frame":
-                last_s = child.heard_s
+                last_s = child.message_s
                 yield self._frame(child, message)
             elif message["kind"] == "ended":
                 return
             else:
                 self._note(message)
                 stalls = self._child_state is not None and self._child_state[0] is SourceState.STALLED
-                if stalls and child.heard_s - last_s > self._stuck_after_s:
+                if stalls and child.message_s - last_s > self._stuck_after_s:
                     raise ChildLost(f"it has given no frame for {self._stuck_after_s:g} s")
 
     def _frame(self, child: ChildProcess, message: dict[str, Any]) -> Frame:
@@ -570,7 +570,7 @@ class ProcessSource(LiveSource):
             frame = decode(child.frames.read(message.get("offset"), message.get("sizes")))
         except InvalidMessage as error:
             raise ChildLost(f"its frame cannot be read: {error}") from error
-        child.say("free", slot=message.get("slot"))
+        child.send("free", slot=message.get("slot"))
         self._child_state = None  # the last reported state is older than this frame
         return frame
 
@@ -608,7 +608,7 @@ class ProcessSource(LiveSource):
     def _described(self, child: ChildProcess) -> SourceDescription:
         until_s = time.monotonic() + self._open_timeout_s
         while not self.wait(0):
-            message = child.hear(LOOK_S)
+            message = child.receive(LOOK_S)
             if message is None:
                 if time.monotonic() > until_s:
                     raise ChildLost(f"it has not opened the source within {self._open_timeout_s:g} s")

@@ -145,15 +145,15 @@ def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout 
     """Return the address without its `stereo` option, and the stereo layout from it or from the options."""
     if _exists(address) or not _ADDRESS.fullmatch(address):
         return address, options.stereo
-    said = _STEREO.search(address)
-    if said is None:
+    found = _STEREO.search(address)
+    if found is None:
         return address, options.stereo
-    layout = said["layout"]
+    layout = found["layout"]
     if layout not in get_args(StereoLayout):
         raise InvalidSetting(f"stereo is {layout!r:.60}; choose {' or '.join(get_args(StereoLayout))}")
     # `?stereo=x&more` becomes `?more`, and `&stereo=x` is removed.
-    before, after = address[: said.start()], address[said.end() :]
-    if said["before"] == "?" and after.startswith("&"):
+    before, after = address[: found.start()], address[found.end() :]
+    if found["before"] == "?" and after.startswith("&"):
         after = "?" + after[1:]
     return before + after, cast(StereoLayout, layout)
 
