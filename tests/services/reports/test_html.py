@@ -120,3 +120,12 @@ def test_the_file_is_written_whole(tmp_path, report, scored):
     write_html(report, [keyframe_pictures(scored)], tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text().endswith("</html>\n")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_scores_are_placed_on_their_rail_in_proportion(text):
+    """The lowest score is one decibel from the left end, the highest one from the right end."""
+    rows = re.findall(r'<td class="n">([0-9.]+)</td><td class="track">.*?left:([0-9.-]+)%', text)
+    values, places = ([float(row[part]) for row in rows] for part in (0, 1))
+    low, high = min(values) - 1, max(values) + 1
+    assert len(rows) >= 3 and low < high - 2
+    assert places == pytest.approx([100 * (value - low) / (high - low) for value in values], abs=0.2)
