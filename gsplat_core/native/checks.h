@@ -1,8 +1,8 @@
-// Errors of the core: one sentence with what was expected and what came, thrown as std::runtime_error.
+// Argument checks and errors of the core, thrown as std::runtime_error with the expected and the actual value.
 //
-// torch_abi.h hands the sentence to torch, and Python gets a RuntimeError. It is put together without iostreams: in a library
-// that was linked with a static libstdc++ they are a second, uninitialised copy, and formatting a number with them crashes the
-// process.
+// torch_abi.h passes the message to torch, and Python raises RuntimeError. Messages are formatted without iostreams: a
+// library linked with a static libstdc++ has a second, uninitialised copy of them, and formatting a number with that
+// copy crashes the process.
 #pragma once
 
 #include <cstdio>
@@ -33,7 +33,7 @@ template <class... Parts>
   throw std::runtime_error(sentence);
 }
 
-// Throws the sentence made of `parts` (texts and numbers) unless `holds`.
+// Throw std::runtime_error with the concatenated `parts` (texts and numbers) unless `holds`.
 template <class... Parts>
 inline void check(bool holds, const Parts&... parts) {
   if (__builtin_expect(!holds, false)) fail(parts...);

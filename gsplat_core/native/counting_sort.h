@@ -1,5 +1,5 @@
-// Stable counting sort over chunks of the items, in parallel. The result is that of a serial stable sort, whatever the number of
-// chunks, so it does not depend on the number of threads.
+// Parallel stable counting sort over chunks of items. The result equals a serial stable sort for any number of chunks,
+// so it does not depend on the number of threads.
 #pragma once
 
 #include <algorithm>
@@ -9,19 +9,19 @@
 
 #include "torch_abi.h"
 
-// Storage for results that are written before they are read: no time is spent on zeros.
+// Uninitialised storage for results that are written before they are read; avoids the time to zero it.
 template <class T>
 std::unique_ptr<T[]> uninitialised(int64_t count) {
   return std::unique_ptr<T[]>(new T[size_t(std::max<int64_t>(count, 1))]);
 }
 
-// count(begin, end, counts): adds to counts[b] for every output of items [begin, end) that belongs to bucket b.
-// emit(begin, end, cursor): writes each of those outputs at cursor[b]++, in the same order.
-// starts, where given, receives the first position of every bucket. Returns the number of outputs.
-// `chunk` is the number of items worth a thread of its own: below it, handing them out costs more than doing them.
+// Sort the outputs of `items` items into buckets and return the number of outputs. count(begin, end, counts) adds to
+// counts[b] for every output of items [begin, end) in bucket b. emit(begin, end, cursor) writes each of those outputs
+// at cursor[b]++, in the same order. `starts`, if not null, receives the first position of every bucket. `chunk` is the
+// minimum number of items per task; smaller tasks cost more to schedule than to run.
 template <class Count, class Emit>
 int64_t counting_sort(int64_t items, int64_t chunk, int64_t buckets, int32_t* starts, const Count& count, const Emit& emit) {
-  // A chunk also costs a row of counters, so there are no more counters than a few per item.
+  // Every chunk also needs a row of counters; limit their total to a few per item.
   const int64_t by_counters = std::max<int64_t>(1, 4 * items / std::max<int64_t>(buckets, 1));
   const int64_t chunks =
       std::max<int64_t>(1, std::min<int64_t>({int64_t(torch::stable::get_num_threads()), items / chunk, by_counters}));

@@ -1,4 +1,4 @@
-// The memory of one call of an op on the CPU, and its checks: the counterpart of cuda_call.h.
+// Memory and argument checks of one op call on the CPU; the counterpart of cuda_call.h.
 #pragma once
 
 #include <vector>
@@ -9,7 +9,7 @@ class CpuCall final : public CallArguments<CpuCall> {
  public:
   explicit CpuCall(const Tensor&) {}
 
-  // A contiguous tensor of this type on the CPU.
+  // Return `t` as a contiguous CPU tensor, after checking its dtype.
   Tensor take(const Tensor& t, ScalarType type, const char* name) const {
     check(t.is_cpu(), name, " must be on the CPU like the other tensors");
     return contiguous(t, type, name);
@@ -23,14 +23,14 @@ class CpuCall final : public CallArguments<CpuCall> {
     return torch::stable::zero_(t);
   }
 
-  // Scratch memory, not initialised, as long as this object.
+  // Uninitialised scratch memory, freed with this object.
   template <class T>
   T* array(int64_t count) {
     scratch_.push_back(empty({count * int64_t(sizeof(T))}, ScalarType::Byte));
     return static_cast<T*>(scratch_.back().mutable_data_ptr());
   }
 
-  void finish(const char*) const {}  // CUDA asks here whether the launches of the op went well
+  void finish(const char*) const {}  // the CUDA version reports launch errors here
 
  private:
   std::vector<Tensor> scratch_;

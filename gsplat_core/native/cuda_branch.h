@@ -1,5 +1,5 @@
-// A second stream beside that of a call, for work that does not wait for each other: each fills what the other leaves idle. In a
-// CUDA graph it becomes a second branch.
+// A second stream for work that is independent of the call's stream, so that both can overlap. In a CUDA graph it
+// becomes a second branch.
 #pragma once
 
 #include <memory>
@@ -7,21 +7,23 @@
 
 #include "cuda_resources.h"
 
-// What is queued on `stream` comes after what the main stream had when the branch was made. The branch joins the main stream at
-// its end at the latest: make it after the memory that it uses.
+// Work queued on `stream` starts after the work that the main stream had when the branch was constructed. The
+// destructor joins the branch into the main stream at the latest. Construct it after allocating the memory it uses, so
+// that it is destroyed first.
 class CudaBranch {
  public:
   explicit CudaBranch(cudaStream_t main) : CudaBranch(main, of_this_thread()) {}
-  // The end may come while an exception is thrown, so it throws none: CUDA keeps the error, and the call's finish() reports it.
+  // The destructor may run during stack unwinding, so it does not throw. CUDA keeps the error, and the call's finish()
+  // reports it.
   ~CudaBranch() { follow(main_, stream); }
   CudaBranch(const CudaBranch&) = delete;
   CudaBranch& operator=(const CudaBranch&) = delete;
 
   const cudaStream_t stream;
 
-  // What the branch gets from now on waits for what the main stream has so far.
+  // Make later work of the branch wait for all work queued so far on the main stream.
   void fork() const { check_cuda(follow(stream, main_), "starting work beside a stream"); }
-  // What the main stream gets from now on waits for what the branch has so far.
+  // Make later work of the main stream wait for all work queued so far on the branch.
   void join() const { check_cuda(follow(main_, stream), "waiting for work beside a stream"); }
 
  private:
@@ -32,8 +34,8 @@ class CudaBranch {
 
   CudaBranch(cudaStream_t main, const Resources& own) : stream(own.stream.get()), event_(own.event.get()), main_(main) { fork(); }
 
-  // Of this thread and the current device, made when first used and gone when the thread ends: another thread may be capturing a
-  // graph on its own.
+  // Resources of this thread and the current device, created on first use and destroyed with the thread. They are not
+  // shared because another thread may be capturing a graph.
   static const Resources& of_this_thread() {
     thread_local std::vector<std::unique_ptr<Resources>> by_device;
     int device = 0;

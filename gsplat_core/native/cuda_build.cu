@@ -1,5 +1,5 @@
-// What this library was built for, and whether the GPU at hand is among it: read through ctypes by gsplat_core/ops/native.py, so
-// that the answer is the library's own and not that of a file beside it.
+// CUDA architectures this library was compiled for, and a check that the current GPU is among them.
+// gsplat_core/ops/native.py reads both through ctypes from the loaded library, not from build metadata.
 #include <cuda_runtime.h>
 
 #include "cuda_resources.h"
@@ -12,18 +12,18 @@ namespace {
 __global__ void probe() {}
 }  // namespace
 
-// The compiler's version, a semicolon, and the architectures that it compiled for as it names them: "13.0;800,900".
+// Return the compiler version and the compiled architectures, in the compiler's notation: "13.0;800,900".
 VISIBLE const char* gsplat_core_cuda_build() {
   return TEXT(__CUDACC_VER_MAJOR__) "." TEXT(__CUDACC_VER_MINOR__) ";" TEXT(__CUDA_ARCH_LIST__);
 }
 
-// Null if the current device can run this library's kernels, otherwise what CUDA says.
+// Return null if the current device can run this library's kernels, otherwise CUDA's error message.
 VISIBLE const char* gsplat_core_cuda_refusal() {
   cudaFuncAttributes attributes;
   const cudaError_t error = cudaFuncGetAttributes(&attributes, probe);
-  cudaGetLastError();  // or the next call of anybody would report it
+  cudaGetLastError();  // clear the error; otherwise the next CUDA call in the process would report it
   return error == cudaSuccess ? nullptr : cudaGetErrorString(error);
 }
 
-// How many streams and events this library owns at the moment.
+// Return the number of CUDA streams and events that this library currently owns.
 VISIBLE int gsplat_core_cuda_resources() { return gsplat::cuda_resources_alive.load(); }

@@ -1,4 +1,4 @@
-// The device, the stream and the memory of one call of a CUDA op, and its checks: the counterpart of cpu_call.h.
+// Device, stream, memory and argument checks of one CUDA op call; the counterpart of cpu_call.h.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -11,8 +11,8 @@
 
 extern "C" AOTITorchError aoti_torch_get_current_cuda_stream(int32_t device_index, void** ret_stream);
 
-// Makes the device of a tensor current and takes torch's current stream there. Scratch memory comes from torch's allocator, which
-// reuses it in the order of the stream, and lasts as long as this object.
+// Makes the device of a tensor current and uses torch's current stream there. Scratch memory comes from torch's
+// stream-ordered caching allocator and is freed with this object.
 class CudaCall final : public CudaScratch, public CallArguments<CudaCall> {
  public:
   explicit CudaCall(const Tensor& on) : on_(on), guard_(on.get_device_index()) {
@@ -23,7 +23,7 @@ class CudaCall final : public CudaScratch, public CallArguments<CudaCall> {
 
   cudaStream_t stream;
 
-  // A contiguous tensor of this type on the device of the call.
+  // Return `t` as a contiguous tensor, after checking its dtype and that it is on the call's device.
   Tensor take(const Tensor& t, ScalarType type, const char* name) const {
     check(t.is_cuda() && t.get_device_index() == on_.get_device_index(), name,
           " must be on the same CUDA device as the other tensors");
@@ -45,7 +45,7 @@ class CudaCall final : public CudaScratch, public CallArguments<CudaCall> {
     return scratch_.back().mutable_data_ptr<uint8_t>();
   }
 
-  // Throws what CUDA says about the launches of `op` so far.
+  // Throw CUDA's error message if a launch of `op` has failed.
   void finish(const char* op) const { check_cuda(cudaGetLastError(), op); }
 
  private:

@@ -1,4 +1,5 @@
-// CUDA's return codes: what failed, and what CUDA says. Without torch's headers, for device code too.
+// Checks of CUDA return codes; the exception names the operation and CUDA's error. Uses no torch headers, so that
+// device code can include it.
 #pragma once
 
 #include <cuda_runtime.h>

@@ -1,4 +1,4 @@
-// CUDA streams and events with an owner: they end with the object. cuda_build.cu says how many there are, for the tests.
+// Owning wrappers of CUDA streams and events. cuda_build.cu exports their number for the tests.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -17,7 +17,8 @@ class CudaStream {
     check_cuda(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "creating a stream");
     ++cuda_resources_alive;
   }
-  // A failure here would be that of work queued before, which the next check reports. What is still queued runs to its end.
+  // Errors are ignored: they would belong to work queued earlier, and the next check reports them. Work still queued on
+  // the stream runs to its end.
   ~CudaStream() {
     cudaStreamDestroy(stream_);
     --cuda_resources_alive;
@@ -30,7 +31,7 @@ class CudaStream {
   cudaStream_t stream_ = nullptr;
 };
 
-// An event that only orders streams; it has no time.
+// An event without timing, used only to order streams.
 class CudaEvent {
  public:
   CudaEvent() {

@@ -1,10 +1,11 @@
-// What device code needs of the op that calls it, without torch's headers: scratch memory, and the size of a launch.
+// Interface through which device code requests scratch memory from the op, and helpers for launch sizes. Uses no torch
+// headers.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 
-// Device memory that lasts until the end of the op.
+// Allocates device memory that lasts until the end of the op.
 class CudaScratch {
  public:
   virtual void* bytes(size_t count) = 0;
@@ -17,13 +18,13 @@ class CudaScratch {
   ~CudaScratch() = default;
 };
 
-constexpr int kThreads = 256;  // of a block, where a thread does one item
+constexpr int kThreads = 256;  // per block, for kernels with one item per thread
 
 constexpr unsigned blocks_for(int64_t items, int64_t per_block = kThreads) {
   return unsigned((items + per_block - 1) / per_block);
 }
 
-// The bits that hold the numbers 0 to n - 1, one at least.
+// Return the number of bits needed to store 0 to n - 1; at least one.
 constexpr int bits_below(int64_t n) {
   int bits = 1;
   while (bits < 63 && (int64_t(1) << bits) < n) ++bits;

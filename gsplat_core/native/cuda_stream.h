@@ -1,4 +1,4 @@
-// CUDA's stream type and what functions for host and device are marked with, for headers that are compiled for the CPU too.
+// CUDA's stream type and host/device qualifiers, for headers that are also compiled for the CPU.
 #pragma once
 
 using cudaStream_t = struct CUstream_st*;

@@ -10,14 +10,15 @@
 
 namespace {
 
-// What the preceding kernels wrote is visible after this. Every thread of a kernel started by `launch_dependent` calls it.
+// Wait until the results of the preceding kernels are visible. Every thread of a kernel started by `launch_dependent`
+// must call it.
 __device__ inline void wait_for_preceding_kernel() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-// The next kernel may be scheduled as soon as all blocks of this one have called this or ended.
+// Allow the next kernel to be scheduled once every block of this kernel has called this or exited.
 __device__ inline void allow_dependent_launch() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.launch_dependents;");
@@ -38,7 +39,7 @@ void launch_dependent(void (*kernel)(Parameters...), unsigned blocks, int thread
   config.dynamicSmemBytes = shared_bytes;
   config.stream = stream;
   config.attrs = &attribute;
-  config.numAttrs = code.ptxVersion >= 90 ? 1 : 0;  // code for earlier GPUs has no wait in it
+  config.numAttrs = code.ptxVersion >= 90 ? 1 : 0;  // code compiled for earlier GPUs does not contain the wait
   check_cuda(cudaLaunchKernelEx(&config, kernel, parameters...), "launching a dependent kernel");
 }
 

@@ -1,5 +1,6 @@
-// What the host file of an op, <op>_host.cpp, is written against. It is compiled twice: into the CPU library, and with
-// GSPLAT_CUDA into the CUDA library. `Call` is one call of the op on that device; GSPLAT_DEVICE is torch's dispatch key.
+// Common header of an op's host file, <op>_host.cpp. Each host file is compiled twice: for the CPU library, and with
+// GSPLAT_CUDA for the CUDA library. `Call` is the type of an op call on that device; GSPLAT_DEVICE is torch's dispatch
+// key.
 #pragma once
 
 #if defined(GSPLAT_CUDA)

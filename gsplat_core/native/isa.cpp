@@ -1,4 +1,4 @@
-// Detects the processor's vector instructions once, and tells Python which of our sets is in use.
+// Detects the processor's vector extensions once, and exports the selected instruction set to Python.
 #include "isa.h"
 
 #include <cstdlib>

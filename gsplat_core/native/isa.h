@@ -1,9 +1,10 @@
-// Run-time choice of the instruction set: every kernel file is compiled once per set, in a namespace of that name.
+// Run-time selection of the instruction set. Every kernel file is compiled once per set, in a namespace of that name.
 #pragma once
 
 enum class Isa { baseline = 0, avx2 = 1, avx512 = 2 };
 
-// The widest set that this processor has, or the one that INTRASPLAT_ISA names (baseline, avx2, avx512) when it has it.
+// Return the widest supported set, or the one named by INTRASPLAT_ISA (baseline, avx2, avx512) if the processor
+// supports it.
 Isa active_isa();
 
 // An op's kernels for the CPU are functions in the table of each set. The op's header declares it once, outside of any namespace:

@@ -1,11 +1,12 @@
-// Matrix products of one warp: 16 rows times 8 columns, in half precision, or in float32 as three products of tf32 parts.
+// Warp-level matrix products of 16 rows by 8 columns, in half precision or in float32 emulated by three tf32 products.
 #pragma once
 
 #include <cuda_fp16.h>
 
 #include <cstdint>
 
-// The lane's place: row `group` (and group + 8) of the operand on the left, `quad` of four along the summed dimension.
+// Position of a lane in the operands: rows `group` and `group + 8` of the left operand, and index `quad` of four along
+// the summed dimension.
 struct WarpPlace {
   int group, quad;
   __device__ WarpPlace() {
@@ -14,7 +15,8 @@ struct WarpPlace {
   }
 };
 
-// sums += a b for 16 summed values: a holds (row, k 0..1), (row + 8, k 0..1), (row, k 2..3), (row + 8, k 2..3) of the lane.
+// sums += a b over 16 summed values. The lane's a holds (row, k 0..1), (row + 8, k 0..1), (row, k 2..3), (row + 8, k
+// 2..3).
 __device__ __forceinline__ void multiply_half(float (&sums)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
       : "+f"(sums[0]), "+f"(sums[1]), "+f"(sums[2]), "+f"(sums[3])
@@ -27,7 +29,7 @@ __device__ __forceinline__ void multiply_tf32(float (&sums)[4], const uint32_t (
       : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
 
-// A float as the sum of two numbers of tf32's 11 bits each; what is left over is below 2^-21 of it.
+// A float split into two tf32 numbers of 11 significant bits each; the relative remainder is below 2^-21.
 struct Split {
   uint32_t high, low;
   __device__ explicit Split(float x) {
@@ -38,7 +40,7 @@ struct Split {
 
 struct SplitLeft {
   uint32_t high[4], low[4];
-  // (row, k 0), (row + 8, k 0), (row, k 1), (row + 8, k 1) of the lane
+  // Elements of the lane: (row, k 0), (row + 8, k 0), (row, k 1), (row + 8, k 1).
   __device__ SplitLeft(float a0, float a1, float a2, float a3) {
     const Split s0(a0), s1(a1), s2(a2), s3(a3);
     high[0] = s0.high, high[1] = s1.high, high[2] = s2.high, high[3] = s3.high;
@@ -46,7 +48,7 @@ struct SplitLeft {
   }
 };
 
-// sums += a b for 8 summed values, to nearly float32: the product of the two low parts is left out.
+// sums += a b over 8 summed values at nearly float32 accuracy; the product of the two low parts is omitted.
 __device__ __forceinline__ void multiply_split(float (&sums)[4], const SplitLeft& a, float b0, float b1) {
   const Split s0(b0), s1(b1);
   multiply_tf32(sums, a.low, s0.high, s1.high);
@@ -59,15 +61,15 @@ __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
   return *reinterpret_cast<const uint32_t*>(&pair);
 }
 
-// Not `x > 0`, so that NaN stays and shows.
+// `x < 0` instead of `x > 0`, so that NaN propagates.
 __device__ __forceinline__ float rectified(float x) { return x < 0.0f ? 0.0f : x; }
 
-// 16 bytes from device to shared memory while the thread goes on.
+// Start an asynchronous copy of 16 bytes from device to shared memory.
 __device__ __forceinline__ void copy_16(void* shared, const void* from) {
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(uint32_t(__cvta_generic_to_shared(shared))), "l"(from));
 }
 
-// The same where `inside`; otherwise 16 bytes of zeros. `from` must be readable either way.
+// As above if `inside`; otherwise write 16 zero bytes. `from` must be readable in both cases.
 __device__ __forceinline__ void copy_16(void* shared, const void* from, bool inside) {
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(uint32_t(__cvta_generic_to_shared(shared))), "l"(from),
                "r"(inside ? 16 : 0));
@@ -75,10 +77,10 @@ __device__ __forceinline__ void copy_16(void* shared, const void* from, bool ins
 
 __device__ __forceinline__ void wait_for_copies() { asm volatile("cp.async.wait_all;" ::: "memory"); }
 
-// Ends a group of the copies so far.
+// Close the current group of asynchronous copies.
 __device__ __forceinline__ void commit_copies() { asm volatile("cp.async.commit_group;" ::: "memory"); }
 
-// Waits until all but the last `kGroups` groups are there.
+// Wait until all but the last `kGroups` groups have completed.
 template <int kGroups>
 __device__ __forceinline__ void wait_for_copies() {
   asm volatile("cp.async.wait_group %0;" ::"n"(kGroups) : "memory");

@@ -1,5 +1,5 @@
-// The layout of a Gaussian's row of raw parameters: deformation deltas [N, 16] are added in it, and their gradient has it too.
-// gsplat_core/scene/gaussians.py has the same numbers for Python; a test compares them.
+// Column layout of a Gaussian's raw parameters in deformation deltas [N, 16] and their gradients.
+// gsplat_core/scene/gaussians.py defines the same numbers for Python; a test compares them.
 #pragma once
 
 constexpr int kRawColumns = 16;
@@ -8,14 +8,14 @@ constexpr int kRawRotation = 3;  // quaternion: w, x, y, z
 constexpr int kRawLogScale = 7;
 constexpr int kRawColor = 10;    // red, green, blue of the first spherical-harmonics coefficient
 constexpr int kRawOpacity = 13;  // logit
-constexpr int kRawUsed = 14;     // columns from here on are unused and zero
+constexpr int kRawUsed = 14;     // later columns are unused and zero
 
-// The basis-function field moves the columns in front of the opacity.
+// The basis-function field changes the columns before the opacity.
 constexpr int kRawBasisChannels = kRawOpacity;
 
-// The HexPlane field's network puts out position, log-scale, rotation and opacity, in this order.
+// Outputs of the HexPlane field's network, in the order position, log-scale, rotation, opacity.
 constexpr int kHeadOutputs = 11;
-// The network's output for a raw column, or -1 where it has none.
+// Return the network output of a raw column, or -1 for a column without one.
 constexpr int head_output(int column) {
   if (column < kRawRotation) return column;
   if (column < kRawLogScale) return column - kRawRotation + 6;

@@ -1,23 +1,23 @@
-// Every op's schema, in one place. Autograd and fake kernels are attached in Python (gsplat_core/ops/*/).
+// Schemas of all ops. Autograd and fake kernels are registered in Python (gsplat_core/ops/*/).
 #include "torch_abi.h"
 
 STABLE_TORCH_LIBRARY(gsplat_core, m) {
-  // The instruction set in use: 0 baseline, 1 AVX2, 2 AVX-512.
+  // Selected instruction set: 0 baseline, 1 AVX2, 2 AVX-512.
   m.def("active_isa() -> int");
 
-  // Adam over one dense tensor, in place; `step` counts from 1. Rows of row_size values whose gradient is not finite are left
-  // alone and counted in the result (int64 scalar).
+  // In-place Adam step of one dense tensor; `step` counts from 1. Rows of row_size values with a non-finite gradient
+  // are skipped. Returns the number of skipped rows (int64 scalar).
   m.def(
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
-  // The same with learning rate (float32) and step (int64) read on the device; the rows left alone are added to `skipped`
-  // (int64).
+  // As above, with the learning rate (float32) and step (int64) read from device memory. The number of skipped rows is
+  // added to `skipped` (int64).
   m.def(
       "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
       "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
 
-  // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
+  // Projection of N Gaussians in B batches to C cameras. The covariance is given as [B, N, 6] or as quats and scales.
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
       "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
@@ -29,13 +29,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "float eps2d, int camera_model, bool needs_viewmats, float compensation_floor=0.005) -> (Tensor v_means, Tensor v_covars, "
       "Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
 
-  // R rows of directions [R, M, 3] with coefficients [M, K, 3] that the rows share; where the mask is false the sum is 0.
+  // Colours of R rows of directions [R, M, 3]; all rows share the coefficients [M, K, 3]. The result is 0 where the
+  // mask is false.
   m.def("spherical_harmonics(int degree, Tensor dirs, Tensor coeffs, Tensor? masks) -> Tensor");
   m.def(
       "spherical_harmonics_backward(int degree, Tensor dirs, Tensor coeffs, Tensor? masks, Tensor v_colors, bool needs_dirs) "
       "-> (Tensor v_dirs, Tensor v_coeffs)");
 
-  // Covariance and precision of M rotations and scales, as upper triangles [M, 6] or matrices [M, 3, 3]; empty if not asked.
+  // Covariance and precision of M rotations and scales, as upper triangles [M, 6] or matrices [M, 3, 3]. Outputs that
+  // are not requested are empty.
   m.def(
       "quat_scale_to_covar_preci(Tensor quats, Tensor scales, bool compute_covar, bool compute_preci, bool triu) -> "
       "(Tensor covars, Tensor precis)");
@@ -43,7 +45,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "quat_scale_to_covar_preci_backward(Tensor quats, Tensor scales, Tensor? v_covars, Tensor? v_precis, bool triu) -> "
       "(Tensor v_quats, Tensor v_scales)");
 
-  // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
+  // Tile intersection: the splats of each tile, in depth order. `images` is batches x cameras; image_ids is given for
+  // packed splats.
   m.def(
       "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int "
       "images, "
@@ -52,16 +55,17 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
-  // The same in a list of `capacity` entries, without waiting for how many are needed: the unused ones, -1, are in front of the
-  // first tile's, and splats that do not fit, the farthest ones, are in no list. `needed` is int64 [1].
+  // As above with a fixed list length `capacity`, so that the host does not wait for the required length. Unused
+  // entries are -1 and precede the first tile's list. If the list overflows, the farthest splats are dropped. `needed`
+  // (int64 [1]) is the required length.
   m.def(
       "bin_splats_within(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, "
       "int images, int tile_size, int tile_width, int tile_height, int capacity) -> (Tensor tiles_per_gauss, "
       "Tensor flatten_ids, Tensor isect_offsets, Tensor needed)");
   m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
 
-  // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
-  // `absgrad_probe` is not read: its gradient is the sum over pixels of |dL/dmeans2d|.
+  // Alpha compositing of splats. `last` is the position in flatten_ids of each pixel's last blended splat, or -1.
+  // `absgrad_probe` is an unread input; its gradient is the sum over pixels of |dL/dmeans2d|.
   m.def(
       "composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, Tensor flatten_ids, "
       "Tensor? backgrounds, Tensor? masks, Tensor? absgrad_probe, int width, int height, int tile_size, float max_alpha=0.99) -> "
@@ -72,7 +76,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
       "Tensor v_colors, Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
-  // The whole of `rasterization()`, CUDA only: gsplat_core/ops/rasterization/rasterization.py names what is in the lists.
+  // Fused `rasterization()`, CUDA only; gsplat_core/ops/rasterization/rasterization.py documents the list arguments.
   m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
   m.def(
       "rasterize_splats_backward(Tensor?[] saved, Tensor? v_image, Tensor? v_alphas, int[] image_dims, int[] options, "
@@ -81,22 +85,24 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "rasterize_inputs_backward(Tensor?[] inputs, Tensor radii, Tensor? row_of, Tensor?[] gradients, int[] image_dims, "
       "int[] options, float[] ranges, bool[] needs) -> Tensor[]");
 
-  // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs. gaussians: means, quats,
-  // log_scales, logit_opacities, sh. mode: 0 tile lists in one buffer, 1 the same for training, 2 a segment per tile.
+  // Render one frame from raw Gaussians, CUDA only: image [H, W, 4] with depth, and the tensors needed for its
+  // gradient. gaussians: means, quats, log_scales, logit_opacities, sh. mode: 0 tile lists in one shared buffer, 1 the
+  // same for training, 2 one fixed segment per tile.
   m.def(
       "render_frame(Tensor[] gaussians, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, int width, int height, "
       "float eps2d, float near_plane, float far_plane, int camera_model, int capacity, int mode) -> (Tensor image, "
       "Tensor alphas, Tensor last, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
       "Tensor instance_splats, Tensor status)");
-  // The gradient of render_frame: of the raw parameters as rows of raw_layout.h, and of sh if it has more than one basis.
-  // forward: the results of render_frame in training mode, after the image.
+  // Gradient of render_frame: of the raw parameters in the layout of raw_layout.h, and of sh if it has more than one
+  // basis. forward: the results of render_frame in training mode, without the image.
   m.def(
       "render_frame_backward(Tensor[] gaussians, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, "
       "Tensor[] forward, Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, bool deterministic) -> "
       "(Tensor v_raw, Tensor v_sh)");
-  // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
-  // unchanged are added to skipped [5]. v_raw is empty if not asked for. With residuals [H, W, 4] and relaxation [1] its colours
-  // are what to add to them, and sh stays as it is.
+  // Gradient of render_frame followed by one in-place Adam step of the Gaussians. rates [5] and step [1] are read from
+  // device memory; the numbers of skipped rows are added to skipped [5]. v_raw is empty unless requested. With
+  // residuals [H, W, 4] and relaxation [1], the colour columns of v_raw hold colour corrections to be added, and sh is
+  // unchanged.
   m.def(
       "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor "
       "rates, "
@@ -106,13 +112,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "beta2, float epsilon, bool needs_raw, "
       "bool deterministic) -> Tensor v_raw");
 
-  // Folds a frame's status [4] into `totals`: the maximum of every entry, but the number of frames that overflowed. Unless this
-  // frame overflowed, step is incremented and fits [1] is 1, otherwise 0.
+  // Accumulate a frame's status [4] in `totals`: the maximum of every entry, except that overflows are counted. If this
+  // frame did not overflow, increment step and return fits [1] = 1, otherwise 0.
   m.def("accumulate_status_(Tensor status, Tensor(a!) totals, Tensor(b!) step) -> Tensor fits");
 
-  // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
-  // tau and the six rates (position, rotation, log-scale, colour, centres, widths) are float32 on the device of the field. Deltas
-  // and gradients may be padded to the frame path's 16 columns.
+  // Deformation by per-Gaussian basis functions of time: deltas [N, 13] at tau, their gradients, and gradients with
+  // lazy Adam. tau and the six learning rates (position, rotation, log-scale, colour, centres, widths) are float32 on
+  // the field's device. Deltas and gradients may be padded to the frame path's 16 columns.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded=False) -> Tensor");
   m.def(
       "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, Tensor tau) "
@@ -123,44 +129,47 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
   m.def("basis_field_add_colours_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor change) -> ()");
 
-  // Changes the weights as little as possible so that the deltas at tau are `target` [N, 13].
+  // Minimum-norm change of the weights such that the deltas at tau equal `target` [N, 13].
   m.def("basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor target) -> ()");
 
-  // How points [N, 3] move in the world as flow [h, w, 2] says, where they are in its first picture, or `arrived` in its second
-  // one. A camera is 18 numbers: three rows of world-to-camera, fx, fy, cx, cy, width, height. CPU only.
+  // World-space motion of points [N, 3] under optical flow [h, w, 2] between two images. The points are given at the
+  // time of the first image, or of the second if `arrived`. A camera is 18 numbers: three rows of world-to-camera, fx,
+  // fy, cx, cy, width, height. CPU only.
   m.def("surface_motion(Tensor points, Tensor flow, float[] before, float[] after, bool arrived) -> Tensor");
 
-  // Semi-global matching of two grey pictures uint8 [H, W] whose rows correspond, for the disparities lowest .. lowest + count -
-  // 1: (sixteenths of a pixel int32 [H, W], the least int32 where unknown; uint8 [H, W], 1 where neither a jump nor a hole is
-  // near).
+  // Semi-global matching of two rectified grey images uint8 [H, W] over the disparities lowest .. lowest + count - 1.
+  // Returns the disparity in 1/16 pixel, int32 [H, W], with INT32_MIN where unknown; and uint8 [H, W], 1 for pixels
+  // with neither a disparity jump nor a hole nearby.
   m.def("match_disparities(Tensor left, Tensor right, int lowest, int count) -> (Tensor, Tensor)");
-  // Such disparities moved to where the pictures agree best around them: (pixels, their standard deviation) [H, W] each; 0 and
-  // infinite where unknown.
+  // Subpixel refinement of match_disparities: disparity and its standard deviation in pixels, [H, W] each; 0 and
+  // infinity where unknown.
   m.def("fit_disparities(Tensor left, Tensor right, Tensor sixteenths) -> (Tensor, Tensor)");
 
-  // Planes [C, H, W] smoothed where a guide uint8 [H, W] or [H, W, channels] does not change by grey_step grey values or more.
+  // Edge-aware smoothing of planes [C, H, W]. Smoothing stops where the guide, uint8 [H, W] or [H, W, channels],
+  // changes by grey_step grey values or more.
   m.def("smooth_within_edges(Tensor planes, Tensor guide, float strength, float grey_step) -> Tensor");
 
-  // Structural similarity of each pixel and channel of [H, W, C] images.
+  // Structural similarity per pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");
 
-  // Loss over tissue and its gradients in one go: (loss, [l1 or squared error, 1 - ssim, inverse-depth l1], dL/dimage, dL/ddepth
-  // or empty).
+  // Loss over tissue pixels and its gradients: (loss, [l1 or squared error, 1 - ssim, inverse-depth l1], dL/dimage,
+  // dL/ddepth or empty).
   m.def(
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
-  // The same of the frame path: image [H, W, 4] with colours and the sum of weight times z, alphas [H, W]; (loss, terms,
-  // dL/dimage, dL/dalphas).
+  // As above for the frame path: image [H, W, 4] with colours and the weighted sum of z, alphas [H, W]. Returns (loss,
+  // terms, dL/dimage, dL/dalphas).
   m.def(
       "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
       "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
-  // Writes up to 64 values, which travel with the launch.
+  // Write up to 64 values, passed as kernel arguments.
   m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");
 
-  // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
+  // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the two halves of
+  // factorised inference.
   m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def(
       "hexplane_features_backward(Tensor gradient, Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, "
@@ -168,14 +177,14 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
   m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
-  // The field at `time`, from space features [N, C] of float32 or float16 (row i is Gaussian order[i]): deltas [N, 16]. CUDA
-  // only.
+  // Deltas [N, 16] of the field at `time`, from cached space features [N, C] in float32 or float16; row i is Gaussian
+  // order[i]. CUDA only.
   m.def(
       "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
       "Tensor[] biases) -> Tensor");
-  // Training of the whole field without autograd, CUDA only; ops/hexplane_training/hexplane_training.py describes what is passed
-  // between them: state is what hexplane_train returns after the deltas, gradient what its backward pass returns after the
-  // network's, and starts.
+  // Training of the whole field without autograd, CUDA only; ops/hexplane_training/hexplane_training.py documents the
+  // lists. `state` is the tensors that hexplane_train returns after the deltas. `gradient` is the tensors that its backward
+  // pass returns after the network's gradient, plus starts.
   m.def(
       "hexplane_train(Tensor means, Tensor box, Tensor time, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
       "(Tensor deltas, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden, Tensor order, Tensor starts)");

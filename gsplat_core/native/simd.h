@@ -1,8 +1,9 @@
-// Small vectors of floats for the CPU kernels: GCC/Clang vector extensions, width chosen by the instruction set compiled for.
+// Float vectors for the CPU kernels: GCC/Clang vector extensions with the width of the instruction set compiled for.
 //
-// Only kernel files (*_cpu.cpp) include this. Everything is static inside the per-set namespace, and kernel files include no
-// standard header with inline code: a shared inline function compiled with AVX-512 would crash older processors.
-// Headers with the maths of an op include it too, and are shared with CUDA, where a "vector" is the one float of a thread.
+// Kernel files (*_cpu.cpp) include this header. All functions are static in the set's namespace, and kernel files
+// include no standard header with inline code: the linker could pick an AVX-512 copy of a shared inline function, which
+// crashes on older processors. Headers with an op's maths include it too. CUDA compiles them with simd_cuda.h, where a
+// vector is one float per thread.
 #pragma once
 
 #if defined(__CUDACC__)
@@ -28,7 +29,7 @@ constexpr int kLanes = 4;
 #endif
 
 typedef float vfloat __attribute__((vector_size(kLanes * 4)));
-typedef int32_t vint __attribute__((vector_size(kLanes * 4)));  // also the type of a comparison: all ones where true
+typedef int32_t vint __attribute__((vector_size(kLanes * 4)));  // also the result of a comparison: all bits set where true
 
 GSPLAT_INLINE vfloat splat(float x) { return x - vfloat{}; }
 GSPLAT_INLINE vint splat_int(int32_t x) { return x - vint{}; }
@@ -51,7 +52,7 @@ GSPLAT_INLINE vfloat select(vint mask, vfloat a, vfloat b) { return mask ? a : b
 GSPLAT_INLINE vfloat min(vfloat a, vfloat b) { return a < b ? a : b; }
 GSPLAT_INLINE vfloat max(vfloat a, vfloat b) { return a > b ? a : b; }
 
-// One bit per lane of a comparison.
+// Return one bit per lane of a comparison result.
 GSPLAT_INLINE uint32_t bits(vint mask) {
 #if defined(__AVX512F__)
   return _mm512_movepi32_mask((__m512i)mask);
@@ -89,7 +90,8 @@ GSPLAT_INLINE vfloat exp2(vfloat x) {
   return (vfloat)((vint)p + ((vint)shifted << 23));
 }
 
-// a * b + c, rounded once where the set has it: two kernels that compute the same thing then agree to the bit.
+// a * b + c, rounded once if the instruction set has FMA. Two kernels that compute the same expression then agree
+// bitwise.
 GSPLAT_INLINE vfloat fma(vfloat a, vfloat b, vfloat c) {
 #if defined(__AVX512F__)
   return (vfloat)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
@@ -113,7 +115,7 @@ GSPLAT_INLINE vfloat sqrt(vfloat x) {
 #endif
 }
 
-// 1 / x to a relative 2e-7 or so, for x in [1e-30, 1e30].
+// 1 / x with a relative error of about 2e-7, for x in [1e-30, 1e30].
 GSPLAT_INLINE vfloat reciprocal(vfloat x) {
 #if defined(__AVX512F__)
   const vfloat r = (vfloat)_mm512_rcp14_ps((__m512)x);
@@ -129,7 +131,7 @@ GSPLAT_INLINE vfloat log2(vfloat x) {
   const vint exponent = shifted >> 23;
   const vfloat m = (vfloat)((vint)x - (exponent << 23));
   const vfloat t = (m - 1.0f) / (m + 1.0f), t2 = t * t;
-  vfloat p = splat(0.32059890f);  // 2 / (9 ln 2), then 7, 5, 3, 1
+  vfloat p = splat(0.32059890f);  // 2 / (9 ln 2); then the coefficients with divisors 7, 5, 3, 1
   p = fma(p, t2, splat(0.41219859f));
   p = fma(p, t2, splat(0.57707802f));
   p = fma(p, t2, splat(0.96179669f));
@@ -138,10 +140,10 @@ GSPLAT_INLINE vfloat log2(vfloat x) {
 }
 
 GSPLAT_INLINE vint to_int(vfloat x) { return __builtin_convertvector(x, vint); }
-// Towards zero, for |x| < 2^31.
+// Round towards zero, for |x| < 2^31.
 GSPLAT_INLINE vfloat truncate(vfloat x) { return __builtin_convertvector(to_int(x), vfloat); }
 
-// A set of lanes: a mask register where there are such (GCC turns a vector comparison into a vector and back there).
+// A lane mask. With AVX-512 it is a mask register, because GCC converts vector comparisons to vectors and back.
 #if defined(__AVX512F__)
 typedef __mmask16 vmask;
 GSPLAT_INLINE vmask at_least(vfloat a, vfloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
@@ -184,7 +186,7 @@ GSPLAT_INLINE vmask no_lanes() { return vint{}; }
 GSPLAT_INLINE vint or_where(vmask m, vint a, int32_t bit) { return a | (m & bit); }
 #endif
 
-// Lane by lane, for any float.
+// Valid for any float.
 GSPLAT_INLINE vfloat ceil(vfloat x) {
   for (int i = 0; i < kLanes; ++i) x[i] = __builtin_ceilf(x[i]);
   return x;
@@ -200,7 +202,8 @@ GSPLAT_INLINE vfloat ceiling(vfloat x) {
   return below + where(above(x, below), splat(1.0f), vfloat{});
 }
 
-// out[i] = sum of the lanes of v[i]: additions in a fixed order, shared between the vectors where the set allows it.
+// out[i] = sum of the lanes of v[i], in a fixed order of additions. Vectors are reduced together where the set has the
+// shuffles.
 template <int kCount>
 GSPLAT_INLINE void sums(const vfloat* v, float* out) {
 #if defined(__AVX512F__)

@@ -1,4 +1,4 @@
-// simd.h for CUDA: a thread is a lane, so that the headers with an op's maths are the same for the processor and the GPU.
+// CUDA version of simd.h: a thread is a lane, so the CPU and the GPU share the headers with an op's maths.
 #pragma once
 
 #include <cstdint>
@@ -11,12 +11,12 @@ namespace GSPLAT_ISA {
 constexpr int kLanes = 1;
 
 typedef float vfloat;
-typedef int32_t vint;  // a comparison: not 0 where true
+typedef int32_t vint;  // result of a comparison: non-zero where true
 
 GSPLAT_INLINE vfloat splat(float x) { return x; }
 GSPLAT_INLINE vint splat_int(int32_t x) { return x; }
 GSPLAT_INLINE vfloat select(vint mask, vfloat a, vfloat b) { return mask ? a : b; }
-// Not fminf and fmaxf: a NaN takes the same way as on the processor.
+// Not fminf and fmaxf, so that NaN is handled as on the CPU.
 GSPLAT_INLINE vfloat min(vfloat a, vfloat b) { return a < b ? a : b; }
 GSPLAT_INLINE vfloat max(vfloat a, vfloat b) { return a > b ? a : b; }
 GSPLAT_INLINE vfloat sqrt(vfloat x) { return ::sqrtf(x); }

@@ -8,7 +8,7 @@ namespace GSPLAT_ISA {
 // -1 in the first `count` lanes, 0 in the others.
 GSPLAT_INLINE vint first_lanes(int64_t count) { return ramp() < float(count); }
 
-// The first `count` floats at p, zero in the other lanes; nothing past them is read.
+// Load the first `count` floats at p and zero the other lanes, without reading past them.
 GSPLAT_INLINE vfloat load_first(const float* p, int64_t count) {
 #if defined(__AVX512F__)
   return (vfloat)_mm512_maskz_loadu_ps(__mmask16(count >= 16 ? 0xffff : (1u << count) - 1), p);

@@ -1,4 +1,4 @@
-// Checks of tensors and typed access to them, shared by the host files of the ops.
+// Tensor checks and typed access to tensor data, shared by the ops' host files.
 #pragma once
 
 #include <initializer_list>
@@ -28,8 +28,8 @@ inline const char* name_of(ScalarType type) {
   }
 }
 
-// What a call of an op takes, on either device. `Call` has take(tensor, type, name): the tensor, contiguous, checked to be of
-// this type and on the device of the call.
+// Argument conversion of an op call, for both devices. `Call` provides take(tensor, type, name): the contiguous tensor,
+// checked for its dtype and device.
 template <class Call>
 class CallArguments {
  public:
@@ -42,7 +42,8 @@ class CallArguments {
     return self().take(*t, type, name);
   }
 
-  // For a tensor that the op updates: it cannot be copied to be contiguous.
+  // Check a tensor that the op updates in place. It must be contiguous already, because a copy would receive the
+  // update.
   void in_place(const Tensor& t, ScalarType type, const char* name) const {
     check(t.is_contiguous(), name, " is updated in place and must be contiguous");
     self().take(t, type, name);

@@ -1,12 +1,12 @@
-// How host code of the CPU spreads work over torch's threads.
+// Parallel loops over torch's CPU threads.
 #pragma once
 
 #include <algorithm>
 
 #include "torch_abi.h"
 
-// Calls work(row, begin, end) for the items 0 to `items` - 1 of every row, in blocks of `block` items. The blocks are the same
-// for any number of threads, and so are sums over them.
+// Call work(row, begin, end) for the items 0 to `items` - 1 of every row, in blocks of `block` items. The blocks, and
+// therefore sums over them, do not depend on the number of threads.
 template <class Work>
 void for_blocks(int64_t rows, int64_t items, int64_t block, const Work& work) {
   const int64_t blocks = (items + block - 1) / block;

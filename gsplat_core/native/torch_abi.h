@@ -1,8 +1,8 @@
-// torch's stable ABI without its iostreams; include this instead of <torch/csrc/stable/...> (checks.h says why).
+// torch's stable ABI without its iostreams; include this instead of <torch/csrc/stable/...> (checks.h explains why).
 //
-// Three things in torch's headers would put iostreams into our objects: the messages of STD_TORCH_CHECK inside TORCH_BOX, the
-// functions behind the two macros that check torch's error codes, and the static initialiser that <iostream> brings along.
-// tests/gsplat_core/test_linkage.py fails when a new version of torch brings in another one.
+// Three parts of torch's headers pull iostreams into the object files: the messages of STD_TORCH_CHECK inside
+// TORCH_BOX, the functions behind the two macros that check torch's error codes, and the static initialiser of
+// <iostream>. tests/gsplat_core/test_linkage.py fails if a new version of torch adds another one.
 #pragma once
 
 #define STRIP_ERROR_MESSAGES 1  // STD_TORCH_CHECK then throws the text of its condition
@@ -20,7 +20,8 @@
 
 namespace gsplat {
 
-// What torch says about a call of its C interface that has failed, without a backtrace; torch has a message from 2.13 on.
+// Throw torch's error message for a failed call of its C interface, without the backtrace. torch provides the message
+// from 2.13 on.
 [[noreturn]] __attribute__((noinline, cold)) inline void torch_call_failed(const char* call) {
   using What = const char* (*)();
   const auto what = reinterpret_cast<What>(dlsym(RTLD_DEFAULT, "torch_exception_get_what_without_backtrace"));
@@ -50,9 +51,9 @@ namespace gsplat {
 
 namespace gsplat {
 
-// A function as torch's dispatcher calls it, in place of TORCH_BOX: no exception of ours leaves this library. One that does is
-// caught by the C++ runtime of torch, which aborts when the exception was thrown by another copy of it. torch throws instead,
-// through a frame that has nothing to clean up.
+// Boxed function for torch's dispatcher, in place of TORCH_BOX, that lets no C++ exception leave this library. torch's
+// copy of the C++ runtime aborts on exceptions thrown by another copy. torch throws instead, from a frame without
+// destructors to run.
 template <auto function>
 struct Boxed {
   static void call(StableIValue* stack, uint64_t arguments, uint64_t results) {
@@ -60,7 +61,7 @@ struct Boxed {
   }
 
  private:
-  // Null, or why the call failed.
+  // Run the function; return null, or the error message if it failed.
   __attribute__((noinline)) static const char* sentence_of(StableIValue* stack, uint64_t arguments, uint64_t results) noexcept {
     static thread_local char sentence[2048];
     try {

@@ -1,11 +1,12 @@
-// Between arrays of structures (rows of K floats, torch's layout) and one vector per column.
+// Conversion between rows of K floats (torch's layout) and one vector per column.
 #pragma once
 
 #include "simd.h"
 
 namespace GSPLAT_ISA {
 
-// Rows `first` to `first + count - 1`, one per lane; lanes beyond repeat the last row, so that they hold ordinary numbers.
+// Load rows `first` to `first + count - 1`, one per lane. Lanes beyond `count` repeat the last row, so that they hold
+// ordinary numbers.
 template <int K>
 GSPLAT_INLINE void load_rows(const float* p, int64_t first, int count, vfloat* columns) {
   p += first * K;
@@ -34,7 +35,7 @@ GSPLAT_INLINE void store_rows(float* p, int64_t first, int count, const vfloat* 
     for (int k = 0; k < K; ++k) p[i * K + k] = transposed[k][i];
 }
 
-// As store_rows, but adds to what is there.
+// As store_rows, but add to the memory contents.
 template <int K>
 GSPLAT_INLINE void add_rows(float* p, int64_t first, int count, const vfloat* columns) {
   p += first * K;

@@ -1,5 +1,6 @@
-// Include this before headers of others that include <iostream>: it leaves a static initialiser of iostreams in every object, and
-// checks.h says why there must be none. What such headers use of <iostream> is declared here; it is discarded as unused.
+// Include this before third-party headers that include <iostream>. That header adds a static initialiser of iostreams
+// to every object file (checks.h explains the problem). The names that those headers use from <iostream> are declared
+// here; the linker discards them as unused.
 #pragma once
 
 #include <ostream>

@@ -4,15 +4,15 @@
 namespace gsplat::adam {
 namespace {
 
-constexpr int kMostRows = 1024;            // of a block
-constexpr int64_t kChunk = 4 * kThreads;   // values of a block, unless a row is longer
-constexpr int64_t kFew = 1024 * kThreads;  // up to so many values, a block has one for each thread: more blocks wait at once
+constexpr int kMostRows = 1024;            // per block
+constexpr int64_t kChunk = 4 * kThreads;   // values per block, unless a row is longer
+constexpr int64_t kFew = 1024 * kThreads;  // up to this size one value per thread, for more memory requests in flight
 
-// The step as the host computed it.
+// Step whose factors were computed on the host.
 __device__ __forceinline__ AdamStep step_of(const AdamStep& step) { return step; }
 
-// The step from numbers in device memory. One thread of a block takes the powers, in double: -expm1 keeps 1 - beta^t accurate for
-// a beta near 1 and a small t. Ends in a barrier.
+// Step computed from device memory. One thread per block computes the powers in double; -expm1 keeps 1 - beta^t
+// accurate for beta near 1 and small t. Ends with a barrier.
 __device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
   __shared__ float rate, inv_bias2;
   if (threadIdx.x == 0) {
@@ -24,7 +24,7 @@ __device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
   return {rate, inv_bias2, at.fresh1, at.fresh2, at.epsilon, at.row_size};
 }
 
-// A block looks through all values of its rows for one whose square is not finite, and then updates the rows that have none.
+// Each block first flags its rows that contain a non-finite squared gradient, then updates the other rows.
 template <class Step>
 __global__ void __launch_bounds__(kThreads)
     adam_rows(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t rows,
@@ -38,7 +38,8 @@ __global__ void __launch_bounds__(kThreads)
   __syncthreads();
   for (int64_t i = threadIdx.x; i < size; i += kThreads) {
     const float x = g[at + i];
-    if (!isfinite(x * x)) unusable[count == 1 ? 0 : int(i) / int(step.row_size)] = 1;  // every thread that writes writes the same
+    if (!isfinite(x * x))
+      unusable[count == 1 ? 0 : int(i) / int(step.row_size)] = 1;  // a benign race: all threads write the same value
   }
   __syncthreads();
   for (int64_t i = threadIdx.x; i < size; i += kThreads) {
@@ -51,7 +52,7 @@ __global__ void __launch_bounds__(kThreads)
     p[k] -= step.rate * m_new / (sqrtf(v_new) * step.inv_bias2 + step.epsilon);
   }
   for (int r = threadIdx.x; r < count; r += kThreads)
-    if (unusable[r]) atomicAdd(skipped, 1ULL);  // whole numbers: their sum does not depend on the order
+    if (unusable[r]) atomicAdd(skipped, 1ULL);  // integer sums do not depend on the order
 }
 
 template <class Step>

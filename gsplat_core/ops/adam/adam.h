@@ -13,7 +13,7 @@ struct AdamStep {
   float inv_bias2;       // 1 / sqrt(1 - beta2^t)
   float fresh1, fresh2;  // 1 - beta1, 1 - beta2, subtracted in double: 1 - 0.999f is off by 5e-5
   float epsilon;
-  int64_t row_size;  // values of a row: one gradient that is not finite leaves the whole row as it is
+  int64_t row_size;  // values per row; one non-finite gradient leaves the whole row unchanged
 };
 
 // AdamStep with rate and step in device memory.
@@ -25,13 +25,13 @@ struct AdamAt {
   int64_t row_size;
 };
 
-// CPU.
+// CPU kernels.
 struct Kernels {
-  // Parameter, gradient, first and second moment of `rows` rows; returns how many rows were left alone.
+  // Updates parameters with gradients, first and second moments of `rows` rows; returns the number of skipped rows.
   int64_t (*step)(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step);
 };
 
-// CUDA: the same; the number of rows left alone is added to `skipped`. Every pointer is to device memory.
+// CUDA version; adds the number of skipped rows to `skipped`. All pointers are device memory.
 void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
                     cudaStream_t stream);
 void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamAt& at, int64_t* skipped,

@@ -5,9 +5,9 @@ namespace GSPLAT_ISA::adam {
 
 using gsplat::adam::AdamStep;
 
-constexpr int64_t kBlock = 2048;  // values checked and then updated while they are in the first-level cache
+constexpr int64_t kBlock = 2048;  // values per block; checked and updated while in the L1 cache
 
-// Whether every gradient, squared, is finite: an infinite second moment would stop its parameter for good.
+// Return true if every squared gradient is finite: an infinite second moment would freeze its parameter.
 static bool usable(const float* g, int64_t n) {
   vfloat nan_if_unusable{};
   int64_t i = 0;

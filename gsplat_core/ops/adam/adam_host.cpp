@@ -33,7 +33,7 @@ struct Rows {
   }
 };
 
-// What the kernels multiply by, computed in double.
+// Compute the factors of the update in double.
 AdamStep step_of(int64_t step, double learning_rate, const Options& o) {
   return {float(learning_rate / (1 - std::pow(o.beta1, double(step)))),
           float(1 / std::sqrt(1 - std::pow(o.beta2, double(step)))),
@@ -43,7 +43,7 @@ AdamStep step_of(int64_t step, double learning_rate, const Options& o) {
           o.row_size};
 }
 
-// Both add the rows left alone to `skipped`, in memory of the device.
+// Both versions add the number of skipped rows to `skipped` in device memory.
 #if defined(GSPLAT_CUDA)
 
 void update(const Call& call, const Rows& rows, const AdamStep& step, int64_t* skipped) {

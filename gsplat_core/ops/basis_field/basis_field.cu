@@ -3,9 +3,9 @@
 namespace gsplat::basis_field {
 namespace {
 
-constexpr int kFlight = 5;  // pairs of rows that a warp reads at once: bumps of width 1, one per spacing, have 8 or 9 active
+constexpr int kFlight = 5;  // row pairs in flight per warp; bumps of width 1, spaced by 1, have 8 or 9 active rows
 
-// The lane's channel of what the Gaussian's bumps add up to; the same in both halves of the warp.
+// Return the lane's channel of the sum over the Gaussian's bumps; both halves of the warp receive it.
 __device__ __forceinline__ float delta_of(const DeviceBumps& field, const Place& at, float tau) {
   const int64_t first = at.gaussian * field.bumps;
   Timing next = timing_at(field.centers, field.log_widths, first, at.lane, field.bumps);
@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kBlock)
   }
 }
 
-// The sum of the squared heights of the Gaussian's bumps, for all lanes.
+// Return the sum of the squared bump heights of the Gaussian to all lanes.
 __device__ __forceinline__ float squared_heights(const DeviceBumps& field, const Place& at, float tau) {
   const int64_t first = at.gaussian * field.bumps;
   float squared = 0;
@@ -90,14 +90,14 @@ __device__ __forceinline__ float squared_heights(const DeviceBumps& field, const
   return squared;
 }
 
-// The smallest change of the weights that does it: in proportion to the heights, over the sum of their squares.
+// Minimum-norm change of the colour weights: proportional to the heights, divided by the sum of their squares.
 __global__ void __launch_bounds__(kBlock)
     add_colours(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ change) {
   const Place at;
   if (at.gaussian >= field.count) return;
   const float* const c = change + 3 * at.gaussian;
   const float red = c[0], green = c[1], blue = c[2], size = red * red + green * green + blue * blue;
-  if (!(size > 0 && isfinite(size))) return;  // the same for the whole warp
+  if (!(size > 0 && isfinite(size))) return;  // uniform over the warp
   const float tau = *field.tau, squared = squared_heights(field, at, tau);
   if (!(squared > kLeastSquaredHeights)) return;
   const int64_t first = at.gaussian * field.bumps;
@@ -113,7 +113,7 @@ __global__ void __launch_bounds__(kBlock)
   }
 }
 
-// The same for all channels, by what is missing to `target` [N, 13].
+// As above for all channels, with the difference to `target` [N, 13] as the change.
 __global__ void __launch_bounds__(kBlock)
     move_to(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ target) {
   const Place at;

@@ -1,4 +1,5 @@
-// Truncated bumps in time per Gaussian, 13 channels each (position 3, rotation 4, log-scale 3, colour 3).
+// Deformation field of truncated bumps in time per Gaussian, with 13 channels each (position 3, rotation 4, log-scale
+// 3, colour 3).
 #pragma once
 
 #include <cstdint>
@@ -11,58 +12,59 @@ namespace gsplat::basis_field {
 
 constexpr int64_t kBasisChannels = kRawBasisChannels;
 constexpr int64_t kBasisPadded =
-    kRawColumns;                     // columns of deltas and gradients as whole raw rows; the field has no part in the last
-constexpr float kBasisReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH in Python)
+    kRawColumns;                     // row length of padded deltas and gradients; the field leaves the remaining columns zero
+constexpr float kBasisReach = 4.0f;  // in widths; bumps farther away are inactive (BUMP_REACH in Python)
 constexpr float kLeastSquaredHeights =
-    1e-2f;  // sum of squared heights below which bumps cannot move a Gaussian (LEAST_SQUARED_HEIGHTS in Python)
+    1e-2f;  // minimum sum of squared heights for a change of the deltas (LEAST_SQUARED_HEIGHTS in Python)
 
-// Learning rates in their order: position, rotation, log-scale, colour; centres, widths.
+// Order of the learning rates: position, rotation, log-scale, colour, centres, widths.
 constexpr int kBasisRates = 6, kBasisCenterRate = 4, kBasisWidthRate = 5;
 constexpr int basis_rate_of(int64_t channel) {
   return channel < kRawRotation ? 0 : channel < kRawLogScale ? 1 : channel < kRawColor ? 2 : 3;
 }
 
-// CPU: one field at one time: centres and log-widths [N, B], weights [N, B, 13].
+// CPU view of a field at one time: centres and log-widths [N, B], weights [N, B, 13].
 struct BasisBumps {
   const float *centers, *log_widths, *weights;
   int64_t bumps;
   float tau;
-  int64_t row;  // columns of deltas and gradients: kBasisChannels or kBasisPadded
+  int64_t row;  // columns per row of deltas and gradients: kBasisChannels or kBasisPadded
 };
 
-// The same, updated in place by Adam, with moments of the same shapes and the updates counted per bump.
+// Parameters that Adam updates in place, their moments of the same shapes, and the number of updates per bump.
 struct BasisAdam {
   float *centers, *log_widths, *weights;
   float *m_centers, *m_log_widths, *m_weights, *v_centers, *v_log_widths, *v_weights;
   int32_t* steps;
   int64_t bumps;
   float tau;
-  int64_t row;                       // columns of the gradient
-  float channel_rates[kRawColumns];  // by channel; the last three are unused
+  int64_t row;                       // columns per row of the gradient
+  float channel_rates[kRawColumns];  // per channel; the last three are unused
   float center_rate, width_rate, beta1, beta2, epsilon;
-  // Bias corrections after k updates, k < table_size: 1 / (1 - beta1^k) and 1 / sqrt(1 - beta2^k); later ones are the last.
+  // Bias corrections after k updates, k < table_size: 1 / (1 - beta1^k) and 1 / sqrt(1 - beta2^k). Later updates use
+  // the last entry.
   const float *inverse_bias1, *inverse_root_bias2;
   int64_t table_size;
 };
 
 struct Kernels {
   void (*forward)(const BasisBumps& field, float* deltas, int64_t begin, int64_t end);
-  // Writes every element of the three gradients, zero where a bump is inactive.
+  // Writes every element of the three gradients; inactive bumps have zeros.
   void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
                    int64_t begin, int64_t end);
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
-  // Changes `weights`, those of the field, so that its deltas become `target` [N, row].
+  // Changes the field's `weights` such that its deltas equal `target` [N, row].
   void (*move_to)(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end);
-  // Changes `weights`, which are those of the field, by what adds `change` [N, 3] to the colours.
+  // Changes the field's `weights` such that the colour deltas increase by `change` [N, 3].
   void (*add_colours)(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end);
 };
 
-// CUDA: the same with numbers in device memory, as every pointer here.
+// CUDA versions of the structs above; all pointers, including the scalars, are device memory.
 struct DeviceBumps {
   const float *centers, *log_widths, *weights;
   const float* tau;  // [1]
   int64_t count, bumps;
-  int32_t row;  // columns of deltas and gradients: kBasisChannels or kBasisPadded
+  int32_t row;  // columns per row of deltas and gradients: kBasisChannels or kBasisPadded
 };
 
 struct DeviceBasisAdam {
@@ -79,7 +81,7 @@ struct DeviceBasisAdam {
 };
 
 void basis_field_on_device(const DeviceBumps& field, float* deltas, cudaStream_t stream);
-// Writes every element of the three gradients, zero where a bump is inactive.
+// Write every element of the three gradients; inactive bumps have zeros.
 void basis_field_backward_on_device(const DeviceBumps& field, const float* gradient, float* centers, float* log_widths,
                                     float* weights, cudaStream_t stream);
 void basis_field_adam_on_device(const DeviceBasisAdam& field, const float* gradient, cudaStream_t stream);

@@ -3,13 +3,13 @@
 namespace gsplat::basis_field {
 namespace {
 
-constexpr int kFlight = 5;  // pairs of rows that a warp reads at once, of parameters and of both moments
+constexpr int kFlight = 5;  // row pairs in flight per warp, of parameters and of both moments
 
 struct Update {
   float parameter, first, second;
 };
 
-// To 1 and 2 units in the last place; Adam's step needs no more.
+// Approximate functions with errors of 1 and 2 ulp, which is sufficient for Adam.
 __device__ __forceinline__ float root(float x) {
   float y;
   asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -28,7 +28,7 @@ __device__ __forceinline__ Update adam_update(Update old, float g, float rate, f
   return {old.parameter - rate * m * reciprocal(root(v) * inverse_root_bias2 + a.epsilon), m, v};
 }
 
-// The same for a lane's own bump: a centre or a log-width.
+// As above for a lane's own bump parameter: a centre or a log-width.
 __device__ __forceinline__ void update_own(float* p, float* m, float* v, int64_t own, const Update& old, float g, float rate,
                                            float inverse_root_bias2, const DeviceBasisAdam& a) {
   const Update now = adam_update(old, g, rate, inverse_root_bias2, a);
@@ -43,12 +43,12 @@ __device__ __forceinline__ float bias(float log_beta, int updates) { return -exp
 __global__ void __launch_bounds__(kBlock, 4) adam(DeviceBasisAdam field, const float* __restrict__ gradient) {
   const Place at;
   if (at.gaussian >= field.count) return;
-  // All that does not depend on another read is asked for at once.
+  // Issue all independent loads first.
   const float g = at.has_channel ? gradient[at.gaussian * field.row + at.channel] : 0.0f;
   const int64_t first = at.gaussian * field.bumps;
   Timing next = timing_at(field.centers, field.log_widths, first, at.lane, field.bumps);
   const float tau = *field.tau, channel_rate = field.rates[basis_rate_of(at.channel)];
-  // The frame does not show this Gaussian, or its gradient is not finite.
+  // Skip Gaussians that are not visible in the frame or have a non-finite gradient.
   if (!__any_sync(kAll, g != 0.0f) || __any_sync(kAll, !isfinite(g * g))) return;
   for (int from = 0; from < field.bumps; from += 32) {
     const bool exists = from + at.lane < field.bumps;
@@ -74,7 +74,7 @@ __global__ void __launch_bounds__(kBlock, 4) adam(DeviceBasisAdam field, const f
         old[i].first = reads ? firsts[2 * i * kBasisChannels] : 0.0f;
         old[i].second = reads ? seconds[2 * i * kBasisChannels] : 0.0f;
       }
-      if (pair == span.first && b.active) {  // comes with the rows
+      if (pair == span.first && b.active) {  // loaded together with the rows
         updates = field.steps[own] + 1;
         own_center.first = field.m_centers[own], own_center.second = field.v_centers[own];
         own_width.first = field.m_log_widths[own], own_width.second = field.v_log_widths[own];
@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(kBlock, 4) adam(DeviceBasisAdam field, const f
 #pragma unroll
       for (int i = 0; i < kFlight; ++i) {
         const int bump = pair + 2 * i + at.half;
-        if (pair + 2 * i > span.last) break;  // for the whole warp
+        if (pair + 2 * i > span.last) break;  // uniform over the warp
         const float dot = sum_of_half(g * old[i].parameter);
         const float height = __shfl_sync(kAll, b.height, bump & 31);
         const float by1 = __shfl_sync(kAll, bias1, bump & 31), by2 = __shfl_sync(kAll, bias2, bump & 31);

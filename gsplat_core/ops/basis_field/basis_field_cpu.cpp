@@ -1,4 +1,5 @@
-// One Gaussian at a time: its bumps side by side in a vector to find the active ones, then a row of 13 channels per active bump.
+// Processes one Gaussian at a time: a vector of bumps to find the active ones, then one row of 13 channels per active
+// bump.
 #include "basis_field.h"
 #include "simd_partial.h"
 
@@ -11,7 +12,7 @@ namespace {
 constexpr int kRowVectors = 16 / kLanes;
 constexpr float kLog2e = 1.44269504f;
 
-// 13 channels in as few vectors as hold 16; the last three lanes are zero.
+// 13 channels in the vectors of 16 floats; the last three lanes are zero.
 struct Row {
   vfloat v[kRowVectors];
 };
@@ -49,21 +50,21 @@ GSPLAT_INLINE bool is_finite(const Row& r) {
   return sum(nan_if_not) == 0.0f;
 }
 
-// Whether every square is finite: an infinite second moment would stop its parameter for good.
+// Return true if every square is finite: an infinite second moment would freeze its parameter.
 GSPLAT_INLINE bool is_usable(const Row& r) {
   vfloat nan_if_unusable = r.v[0] * r.v[0] * 0.0f;
   for (int i = 1; i < kRowVectors; ++i) nan_if_unusable += r.v[i] * r.v[i] * 0.0f;
   return sum(nan_if_unusable) == 0.0f;
 }
 
-// A vector of neighbouring bumps of one Gaussian at one time.
+// Consecutive bumps of one Gaussian at one time, one per lane.
 struct Bumps {
   vfloat u, inverse_width, height;  // height is exp(-u^2), zero where inactive
   vint active;
   uint32_t mask;  // `active`, one bit per bump
 };
 
-// NaN in a centre or width is active, so that it shows in the result.
+// A bump with a NaN centre or width counts as active, so that the NaN propagates.
 GSPLAT_INLINE Bumps bumps_at(const float* centers, const float* log_widths, int64_t count, float tau) {
   Bumps b;
   const vfloat log_width = load_first(log_widths, count);
@@ -79,8 +80,9 @@ GSPLAT_INLINE Bumps bumps_at(const float* centers, const float* log_widths, int6
 
 constexpr int64_t kAhead = 8;  // Gaussians
 
-// Neighbouring Gaussians have nearly the same active bumps, but their rows lie too far apart for the processor to foresee: ask
-// for the rows that the Gaussian `kAhead` further on will want. A prefetch past the end of the tensor does nothing.
+// Prefetch the rows of the Gaussian `kAhead` positions later. Neighbouring Gaussians have nearly the same active bumps,
+// but the stride between their rows is too large for the hardware prefetcher. A prefetch past the end of the tensor has
+// no effect.
 template <bool kWrite>
 GSPLAT_INLINE void prefetch_rows(const float* weights, int64_t row, int64_t bumps, uint32_t mask) {
   const int64_t first = row + kAhead * bumps + __builtin_ctz(mask), last = row + kAhead * bumps + 31 - __builtin_clz(mask);
@@ -138,7 +140,7 @@ void backward(const BasisBumps& field, const float* gradient, float* centers, fl
   }
 }
 
-// Two passes over a Gaussian's bumps: what they add up to, then the change. The second finds their rows in the cache.
+// Two passes over a Gaussian's bumps: the sum of the deltas, then the change. The second pass hits the cache.
 void move_to(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
     const int64_t first = n * field.bumps;
@@ -183,7 +185,7 @@ GSPLAT_INLINE void adam_update(vfloat& p, vfloat& m, vfloat& v, vfloat g, vfloat
   p -= rate * m / (square_root(v) * inverse_root_bias2 + a.epsilon);
 }
 
-// The same for the active lanes of one [N, B] tensor.
+// As above for the active lanes of one [N, B] tensor.
 GSPLAT_INLINE void adam_update_active(float* p, float* m, float* v, vfloat g, vint active, vfloat rate, vfloat inverse_root_bias2,
                                       int64_t count, const BasisAdam& a) {
   const vfloat p0 = load_first(p, count), m0 = load_first(m, count), v0 = load_first(v, count);
@@ -199,7 +201,7 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
   for (int i = 0; i < kRowVectors; ++i) rates.v[i] = load(field.channel_rates + i * kLanes);
   for (int64_t n = begin; n < end; ++n) {
     const Row g = load_row(gradient + n * field.row);
-    if (is_zero(g) || !is_usable(g)) continue;  // not shown in this frame, or not finite
+    if (is_zero(g) || !is_usable(g)) continue;  // not visible in this frame, or not finite
     const int64_t first = n * field.bumps;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const int64_t at = first + from, count = lanes_left(from, field.bumps);
@@ -234,12 +236,12 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
   }
 }
 
-// The smallest change of the weights that does it: in proportion to the heights, over the sum of their squares.
+// Minimum-norm change of the colour weights: proportional to the heights, divided by the sum of their squares.
 void add_colours(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
     const float* const c = change + 3 * n;
     const float size = c[0] * c[0] + c[1] * c[1] + c[2] * c[2];
-    if (!(size > 0 && size * 0.0f == 0.0f)) continue;  // none, or not finite
+    if (!(size > 0 && size * 0.0f == 0.0f)) continue;  // zero or not finite
     const int64_t first = n * field.bumps;
     float squared = 0;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {

@@ -18,7 +18,7 @@ void check_shapes(const Tensor& centers, const Tensor& log_widths, const Tensor&
         "basis_field takes centers [N, B], log_widths [N, B] and weights [N, B, 13]");
 }
 
-// The field and a time, checked.
+// Checked tensors of the field and the time.
 struct Field {
   Tensor centers, log_widths, weights, tau;
   int64_t count, bumps;
@@ -41,7 +41,7 @@ Tensor gradient_of(const Call& call, const Tensor& gradient, int64_t count) {
   return call.floats(gradient, "gradient");
 }
 
-// What Adam updates in place: three tensors of the field, and their two moments.
+// Tensors that Adam updates in place: three field parameters and their two moments.
 struct State {
   float *centers, *log_widths, *weights;
 
@@ -105,7 +105,7 @@ void move_to(const Call& call, const Field& f, float* weights, const float* targ
 #else
 
 using Adam = BasisAdam;
-constexpr int64_t kGrain = 1024;  // Gaussians worth a thread
+constexpr int64_t kGrain = 1024;  // minimum Gaussians per task
 
 BasisBumps bumps_of(const Field& f, int64_t row) {
   return {data(f.centers), data(f.log_widths), data(f.weights), f.bumps, data(f.tau)[0], row};
@@ -124,7 +124,7 @@ void backward(const Call&, const Field& f, const Tensor& gradient, float* center
   });
 }
 
-// Adam's bias corrections by number of updates, up to where they are 1 in float32.
+// Adam's bias corrections by number of updates, up to the update at which they equal 1 in float32.
 struct BiasTable {
   double beta1, beta2;
   std::vector<float> inverse_bias1, inverse_root_bias2;

@@ -1,6 +1,6 @@
-// A warp and the bumps of its Gaussian: 32 bumps side by side to find the active ones, then two neighbouring rows of 13 channels
-// at a time, one for each half of the warp. Active bumps are nearly always neighbours, so all rows from the first active one to
-// the last are gone through, and those between that are not active are not read.
+// Per-warp processing of one Gaussian. 32 bumps, one per lane, are tested for activity; then two consecutive rows of 13
+// channels are processed at a time, one per half warp. Active bumps are nearly always consecutive, so the loop covers
+// all rows from the first active bump to the last; inactive rows in between are not read.
 #pragma once
 
 #include "basis_field.h"
@@ -17,25 +17,25 @@ struct Bump {
   bool active;
 };
 
-// 2^x to 2 units in the last place, for x of -126 to 126.
+// 2^x to 2 ulp, for x from -126 to 126.
 __device__ __forceinline__ float power_of_two(float x) {
   float y;
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
 }
 
-// NaN in a centre or width is active, so that it shows in the result.
+// A bump with a NaN centre or width counts as active, so that the NaN propagates.
 __device__ __forceinline__ Bump bump_at(float center, float log_width, float tau, bool exists) {
   Bump b;
   b.inverse_width = power_of_two(fminf(fmaxf(log_width * -kLog2e, -126.0f), 126.0f));
   if (log_width != log_width) b.inverse_width = log_width;
   b.u = (tau - center) * b.inverse_width;
   b.active = exists && !(fabsf(b.u) > kBasisReach);
-  b.height = b.active ? power_of_two(b.u * b.u * -kLog2e) : 0.0f;  // of a NaN it is one
+  b.height = b.active ? power_of_two(b.u * b.u * -kLog2e) : 0.0f;  // NaN if u is NaN
   return b;
 }
 
-// Centre and log-width of the lane's bump of 32; asked for ahead of their use.
+// Centre and log-width of the lane's bump; loaded ahead of their use.
 struct Timing {
   float center, log_width;
 };
@@ -46,7 +46,7 @@ __device__ __forceinline__ Timing timing_at(const float* centers, const float* l
   return {centers[first + bump], log_widths[first + bump]};
 }
 
-// This warp's Gaussian, and the part of a row that a lane has.
+// The warp's Gaussian and the lane's channel of a row.
 struct Place {
   int64_t gaussian;
   int lane, half, channel;
@@ -60,7 +60,7 @@ struct Place {
         has_channel(channel < int(kBasisChannels)) {}
 };
 
-// The rows from the first active bump to the last.
+// Range of rows from the first active bump to the last.
 struct Span {
   int first, last;
 };
@@ -69,7 +69,7 @@ __device__ __forceinline__ Span span_of(unsigned active) { return {__ffs(int(act
 
 __device__ __forceinline__ bool is_set(unsigned mask, int bit) { return (mask >> (bit & 31)) & 1u; }
 
-// Sum over the channels of a row, for all lanes of its half.
+// Sum over the channels of a row, returned to all lanes of the half warp.
 __device__ __forceinline__ float sum_of_half(float x) {
 #pragma unroll
   for (int offset = 8; offset > 0; offset /= 2) x += __shfl_xor_sync(kAll, x, offset);

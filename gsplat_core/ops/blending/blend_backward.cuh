@@ -1,4 +1,4 @@
-// Back-to-front gradient of blending one window, by one block of kBlockThreads threads; formulas of
+// Back-to-front gradient of blending one window with one block of kBlockThreads threads. The formulas are derived in
 // ../compositing/backward_cpu.cpp.
 #pragma once
 
@@ -8,17 +8,20 @@ namespace gsplat::blending {
 namespace {
 
 constexpr int kShapeMoments = 6;    // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
-constexpr int kBackwardBatch = 64;  // splats that are staged at once
+constexpr int kBackwardBatch = 64;  // splats staged per batch
 
-// A row: the moments, |dL/dx| and |dL/dy| (with absgrad, or for any number of channels), colours; in whole float4s.
+// A gradient row: the moments, |dL/dx| and |dL/dy| (with absgrad, or for any number of channels), then the colours.
+// Padded to whole float4s.
 constexpr int shape_size(int D, bool absgrad) { return kShapeMoments + (D == 0 || absgrad ? 2 : 0); }
 constexpr int quads_of(int shape, int channels) { return (shape + channels + 3) / 4; }
 
-// The state of a pixel, going from the back to the front.
+// State of a pixel during the back-to-front traversal.
 struct Pixel {
-  float through;  // transmittance in front of the splats seen so far; at first what the pixel lets through in the end
-  float behind;   // sum of w g of what is behind, g = <dL/dcolour, colour>; at first -through dL/dalpha, and the background's
-  int last;       // position of the last splat that was blended, -1 where there is none
+  float through;  // transmittance in front of the splats visited so far; initially the pixel's final transmittance
+  // Sum of w g of the splats behind, with g = <dL/dcolour, colour>. Initially -through dL/dalpha plus the background's
+  // term.
+  float behind;
+  int last;  // position of the last blended splat, or -1
 };
 
 __device__ inline int block_furthest(int warp_furthest) {
@@ -35,14 +38,15 @@ template <int D, bool kAbs>
 struct BackwardStage {
   static constexpr int kQuads = quads_of(shape_size(D, kAbs), D);
   static constexpr int kSums = (shape_size(D, kAbs) + D + 1) / 2 * 2;
-  StagedSplat<D> splats[kBackwardBatch + 1];  // the last one reaches no pixel
-  uint4 reached[kWarps];                      // by quadrant: bits of the batch's splats
+  StagedSplat<D> splats[kBackwardBatch + 1];  // the last entry reaches no pixel
+  uint4 reached[kWarps];                      // bits of the batch's splats that reach each quadrant
   SplatTerms terms[kWarps];
-  float sums[kWarps][kBackwardBatch][kSums];  // of the quadrants, about their middles: the moments, |.| with absgrad, colours
+  float sums[kWarps][kBackwardBatch][kSums];  // per quadrant, relative to its centre: moments, |.| with absgrad, colours
   alignas(16) uint32_t hits[kWarps][kBackwardBatch + kSlots];  // byte offsets of the splats that reach the warp's quadrant
 };
 
-// Lists the splats of the batch that reach this warp's pixels, back to front; returns how many. Eight entries beyond can be read.
+// List the splats of the batch that reach this warp's pixels, back to front, and return their number. Eight more
+// entries are readable.
 template <int D>
 __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32], uint32_t* hits) {
   const int lane = threadIdx.x & 31;
@@ -58,13 +62,13 @@ __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32]
   return count;
 }
 
-// A pixel's terms in a splat's gradient; advances the pixel to in front of the splat.
+// A pixel's terms of a splat's gradient; computing them advances the pixel to in front of the splat.
 struct Terms {
   float s, w;  // both in units of 1 / AlphaLimit::most
 };
 struct PixelState {
-  float through;  // transmittance in front of the splats seen so far
-  float behind;   // <dL/dcolour, what is seen behind the splats in front>
+  float through;  // transmittance in front of the splats visited so far
+  float behind;   // <dL/dcolour, colour behind the splats in front>
 };
 template <int D>
 __device__ inline Terms terms_of(const StagedSplat<D>& r, float power, bool drawn, const float (&v_color)[D],
@@ -81,7 +85,8 @@ __device__ inline Terms terms_of(const StagedSplat<D>& r, float power, bool draw
   return {power <= 0 ? w * gain : 0, w};
 }
 
-// The sums over the window of one of the batch's splats whose mean is (x, y), from those of the quadrants, into its row.
+// Add up the quadrants' sums of one of the batch's splats and write them as its row, relative to the splat's mean (x,
+// y).
 template <int D, bool kAbs, class Row>
 __device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Window& w, int i, float x, float y, float most,
                                  const Row& row) {
@@ -108,10 +113,10 @@ __device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Wind
     row[quad] = make_float4(most * v[4 * quad], most * v[4 * quad + 1], most * v[4 * quad + 2], most * v[4 * quad + 3]);
 }
 
-// `fetch(position)` gives the splat at a position in [w.begin, w.end), `row(position)` where its row goes: the sums over the
-// window's pixels, in quads_of(shape_size(D, kAbs), D) float4s. Every row of the window is written, in a fixed order of
-// additions. `v_color` is dL/dcolour of the thread's pixels, 0 outside of the image; `summed` is what a row's colours are sums
-// of, by weight: dL/dcolour for its gradient.
+// Compute the gradient rows of a window's splats. `fetch(position)` returns the splat at a position in [w.begin,
+// w.end); `row(position)` returns the destination of its row of quads_of(shape_size(D, kAbs), D) float4s. Every row of
+// the window is written, with a fixed order of additions. `v_color` is dL/dcolour of the thread's pixels, 0 outside of
+// the image. `summed` are the values whose weighted sums become the row's colours; for gradients it equals `v_color`.
 template <int D, bool kAbs, bool kCapped, class Fetch, class Row>
 __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const Pixel (&pixels)[kPixelsEach],
                                       const float (&v_color)[kPixelsEach][D], const float (&summed)[kPixelsEach][D],
@@ -135,8 +140,8 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
     y[p] = float(w.y[p]) + 0.5f - middle_y;
     states[p] = {pixels[p].through, pixels[p].behind / pixels[p].through};
   }
-  // The splat of the batch that this thread stages and whose row it writes. A batch has fewer splats than the block has threads;
-  // blocks alternate which warps do it, since every warp of a block has its own scheduler.
+  // Index of the splat in the batch that this thread stages and whose row it writes. A batch has fewer splats than the
+  // block has threads. Blocks alternate the warps that stage, to balance the multiprocessor's four schedulers.
   const int mine = int(threadIdx.x) ^ (__popc(blockIdx.x) % 2 * kBatch);
   const auto fetch_ahead = [&](int first) {
     const int position = first + mine;
@@ -146,16 +151,16 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
   int first = w.begin + (end - 1 - w.begin) / kBatch * kBatch;
   Record<D> next = fetch_ahead(first);
   for (; first >= w.begin; first -= kBatch) {
-    __syncwarp();  // the warp's lanes have finished reading what is overwritten now
+    __syncwarp();  // wait until all lanes have read the data that is overwritten next
     const float mean_x = next.xyab.x, mean_y = next.xyab.y;
     if (mine < kBatch) stage_splat<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached, limit);
     __syncthreads();
     next = fetch_ahead(first - kBatch);  // prefetched
     unsigned groups[kBatch / 32];
-    uint32_t limits[kPixelsEach];  // pixels blended nothing at these offsets or beyond
+    uint32_t limits[kPixelsEach];  // no pixel blended a splat at these offsets or later
 #pragma unroll
     for (int g = 0; g < kBatch / 32; ++g) {
-      const int most = warp_furthest - first - 32 * g;  // the last of the group's splats that any of the warp's pixels blended
+      const int most = warp_furthest - first - 32 * g;  // last splat of the group that any of the warp's pixels blended
       groups[g] = reinterpret_cast<const unsigned*>(&stage.reached[warp])[g] & (most < 0     ? 0
                                                                                 : most >= 31 ? ~0u
                                                                                              : (2u << most) - 1);

@@ -1,4 +1,4 @@
-// Front-to-back blending of one window by one block of kBlockThreads threads.
+// Front-to-back blending of one window with one block of kBlockThreads threads.
 #pragma once
 
 #include "splats.cuh"
@@ -6,20 +6,21 @@
 namespace gsplat::blending {
 namespace {
 
-// Of a thread's two pixels: the transmittance behind the last splat, the sums of the channels, and the position of the last splat
-// that was blended, -1 where there is none.
+// State of a thread's two pixels: the transmittance after the last blended splat, the channel sums, and the position of
+// the last blended splat, or -1.
 template <int D>
 struct BlendedPixels {
   float through[kPixelsEach], sum[kPixelsEach][D];
   int last[kPixelsEach];
 };
 
-// A pixel is closed once the transmittance behind all its splats, including the one that closed it, is at most kMinTransmittance.
+// A pixel is closed once the transmittance after all its splats, including the one that closed it, is at most
+// kMinTransmittance.
 template <int D, bool kCapped, bool kLast>
 struct FloatPixels {
-  float front[kPixelsEach];  // the transmittance in front of the next splat
+  float front[kPixelsEach];  // transmittance in front of the next splat
   float through[kPixelsEach], sum[kPixelsEach][D];
-  uint32_t last[kPixelsEach];  // address of the splat that was blended last
+  uint32_t last[kPixelsEach];  // address of the last blended splat
   AlphaLimit limit;
 
   __device__ FloatPixels(const Window& w, const AlphaLimit& limit_) : limit(limit_) {
@@ -51,19 +52,19 @@ struct FloatPixels {
   }
 };
 
-constexpr int kForwardBatch = kBlockThreads;  // splats that are staged at once, one per thread
-constexpr int kUnrolled = 4;                  // splats that a warp blends between two checks of whether all its pixels are closed
+constexpr int kForwardBatch = kBlockThreads;  // splats staged per batch, one per thread
+constexpr int kUnrolled = 4;                  // splats that a warp blends between two tests for closed pixels
 
 // Shared memory of blend_forward; double-buffered.
 template <int D>
 struct ForwardStage {
-  StagedSplat<D> splats[2][kForwardBatch + 1];  // the last one reaches no pixel
-  uint4 reached[2][2 * kWarps];                 // by half of a quadrant: bits of the batch's splats
-  uint4 hits[2 * kWarps][kForwardBatch / 4];    // shared-memory addresses of the splats that reach the half
+  StagedSplat<D> splats[2][kForwardBatch + 1];  // the last entry reaches no pixel
+  uint4 reached[2][2 * kWarps];                 // per half quadrant: bits of the batch's splats
+  uint4 hits[2 * kWarps][kForwardBatch / 4];    // shared-memory addresses of the splats that reach the half quadrant
 };
 
-// Lists, for both halves of this warp's quadrant, the splats that reach it. Returns the length of the longer list; both are
-// padded to it, and to a multiple of kUnrolled, with a splat that reaches no pixel.
+// List the splats that reach each half of this warp's quadrant. Return the length of the longer list. Both lists are
+// padded to that length, rounded up to a multiple of kUnrolled, with a splat that reaches no pixel.
 template <int D>
 __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* splats, uint4* hits) {
   const int lane = threadIdx.x & 31;
@@ -91,8 +92,8 @@ __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* spla
   return most;
 }
 
-// `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped: there may be
-// splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. All threads of the block take part.
+// Blend a window. `fetch(position)` returns the splat at a position in [w.begin, w.end), in depth order. kCapped:
+// splats may have a finite `cap` (an indefinite conic). kLast: compute `last`. All threads of the block must call it.
 template <int D, bool kCapped, bool kLast = true, class Fetch>
 __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage,
                                                  const AlphaLimit& limit = {}) {
@@ -109,7 +110,7 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
     out.last[p] = -1;
   }
 
-  const auto fetch_ahead = [&](int left) {  // this thread's splat in the batch that has `left` more and what follows it
+  const auto fetch_ahead = [&](int left) {  // Fetch this thread's splat of the batch that begins `left` splats before the end.
     return int(threadIdx.x) < left ? fetch(w.end - left + int(threadIdx.x)) : faint_record<D>();
   };
   if (threadIdx.x < 2) stage.splats[threadIdx.x][kBatch] = staged(faint_record<D>(), middle_x, middle_y, limit);

@@ -1,4 +1,4 @@
-// Front-to-back blending of one window by one block of kBlockThreads threads, in half precision on the tensor cores.
+// Front-to-back blending of one window with one block of kBlockThreads threads, in half precision on tensor cores.
 #pragma once
 
 #include "blend_forward.cuh"
@@ -7,11 +7,11 @@
 namespace gsplat::blending {
 namespace {
 
-constexpr int kHalfBatch = 3 * kBlockThreads;  // splats that are staged at once
-constexpr int kHalfTiles = 4;                  // tiles of eight splats that are blended in one step
+constexpr int kHalfBatch = 3 * kBlockThreads;  // splats staged per batch
+constexpr int kHalfTiles = 4;                  // tiles of eight splats blended per step
 constexpr int kHalfStep = 8 * kHalfTiles;
 
-// A staged splat: first the record as it was fetched, then, in its place, the operands of the matrix products.
+// A staged splat: the fetched record, later overwritten by the operands of the matrix products.
 union HalfSlot {
   Record<4> record;
   HalfSplat splat;
@@ -25,15 +25,15 @@ struct PixelSums {
 // Shared memory of blend_half.
 struct HalfStage {
   HalfSlot slots[kHalfBatch];
-  HalfSplat none;                                          // reaches no pixel
-  uint4 reaching[2 * kWarps][kHalfBatch / kBlockThreads];  // by half of a quadrant: bits of the batch's splats
+  HalfSplat none;                                          // a splat that reaches no pixel
+  uint4 reaching[2 * kWarps][kHalfBatch / kBlockThreads];  // per half quadrant: bits of the batch's splats
   union {
-    uint16_t hits[kHalfBatch + kHalfStep / 2];  // shared-memory addresses of the splats that reach the half
-    PixelSums sums[kQuadrant * kQuadrant];      // when all splats have been blended
+    uint16_t hits[kHalfBatch + kHalfStep / 2];  // shared-memory addresses of the splats that reach the half quadrant
+    PixelSums sums[kQuadrant * kQuadrant];      // used after all splats are blended
   } of_warp[kWarps];
 };
 
-// Half of a warp's quadrant, 8x4 pixels.
+// Half of a warp's quadrant: 8x4 pixels.
 struct HalfPart {
   HalfPixels pixels[2];
   bool open;
@@ -50,8 +50,8 @@ struct HalfPart {
     open = w.quadrant_x < w.right && top < w.bottom;
   }
 
-  // Blends the splats whose addresses are at `hits`: `count` of them, a multiple of half a step. (basis, y): the upper left
-  // pixel.
+  // Blend the `count` splats whose addresses are at `hits`; `count` is a multiple of half a step. (basis, y) is the
+  // upper left pixel.
   __device__ void blend(const PixelBasis& basis, float y, uint32_t hits, int count) {
     uint32_t rows[2][4];
     basis.fill(y, rows[0]);
@@ -61,7 +61,7 @@ struct HalfPart {
     if (count > 0 && open) blend_step<kHalfTiles / 2>(rows, hits);
   }
 
-  // Stores the sums for the threads that write the pixels.
+  // Store the sums in shared memory for the threads that write the pixels.
   __device__ void store_sums(PixelSums* sums) const {
     const WarpPlace place;
     if (place.quad == 3) return;
@@ -88,8 +88,8 @@ struct HalfPart {
   }
 };
 
-// Lists at `hits` the splats of a batch of `count` that reach a part of the window, padded with `none` to a multiple of half a
-// step. Returns how many. `first` is where the batch's first splat is.
+// List at `hits` the splats of a batch of `count` that reach a part of the window, padded with `none` to a multiple of
+// half a step. Return their number. `first` is the address of the batch's first splat.
 __device__ inline int list_reaching(const uint4* reaching, int count, uint32_t first, uint32_t none, uint32_t hits) {
   const int lane = threadIdx.x & 31;
   const unsigned mine = 1u << lane;
@@ -113,7 +113,8 @@ __device__ inline int list_reaching(const uint4* reaching, int count, uint32_t f
   return listed + missing;
 }
 
-// Starts asynchronous copies of the records of `count` splats from position `begin` on; record_of(position) is a pointer or null.
+// Start asynchronous copies of the records of `count` splats from position `begin` on. record_of(position) returns a
+// pointer or null.
 template <class Find>
 __device__ inline void fetch_batch(const Find& record_of, int begin, int count, HalfSlot* slots) {
   for (int i = threadIdx.x; i < count; i += kBlockThreads) {
@@ -125,7 +126,8 @@ __device__ inline void fetch_batch(const Find& record_of, int begin, int count, 
   }
 }
 
-// Waits for the records that this thread fetched, stages them, and stores the masks of splats that reach each part of the window.
+// Wait for the records that this thread fetched, stage them, and store the masks of the splats that reach each part of
+// the window.
 __device__ inline void stage_batch(const Window& w, int count, float per_depth, HalfStage& stage) {
   const int lane = threadIdx.x % 32;
   wait_for_copies();
@@ -142,8 +144,9 @@ __device__ inline void stage_batch(const Window& w, int count, float per_depth, 
   }
 }
 
-// `record_of(position)` points to the splat at a position in [w.begin, w.end), in the order of depth (the last channel), or is
-// null where there is none. Called by all threads of the block. Does not compute `last`.
+// Blend a window. `record_of(position)` returns a pointer to the splat at a position in [w.begin, w.end), in depth
+// order, or null if there is no splat. The last channel is the depth. All threads of the block must call it. `last` is
+// not computed.
 template <class Find>
 __device__ inline BlendedPixels<4> blend_half(const Window& w, const Find& record_of, HalfStage& stage) {
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32, part = warp / 2 * 4 + warp % 2;
@@ -152,7 +155,7 @@ __device__ inline BlendedPixels<4> blend_half(const Window& w, const Find& recor
   const PixelBasis basis(lane % 4, float(w.quadrant_x - w.left - kQuadrant + lane / 4) + 0.5f);
   const float y = float(w.quadrant_y - w.top - kQuadrant) + 0.5f;
   HalfPart upper(w, 0), lower(w, 1);
-  float unit = 0;  // of the depth, so that half precision reaches far enough
+  float unit = 0;  // scale of the depth, to fit the range of half precision
   if (threadIdx.x == 0) stage.none = {{pack_halves(-kGreatestHalf, 0), 0, 0, 0}, {}, {}};
   for (int begin = w.begin; begin < w.end; begin += kHalfBatch) {
     if (begin > w.begin && !__syncthreads_or(upper.open || lower.open)) break;

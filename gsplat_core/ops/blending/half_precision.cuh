@@ -1,6 +1,6 @@
-// Half precision on the tensor cores for front-to-back blending: splats staged as matrix operands, and groups of sixteen pixels.
-// The powers of many splats at all the pixels are one matrix product, and so are the sums of the colours, as in attention (Dao et
-// al. 2022).
+// Front-to-back blending in half precision on tensor cores: splats staged as matrix operands, and groups of sixteen
+// pixels. One matrix product evaluates the exponents of many splats at all pixels, another sums the colours, as in
+// attention (Dao et al. 2022).
 #pragma once
 
 #include <cuda_fp16.h>
@@ -13,8 +13,8 @@
 namespace gsplat::blending {
 namespace {
 
-// Opacities are scaled so that half precision's smallest normal number is the cut-off: flushing denormals to zero then implements
-// it. They are in units of 1 / kHalfUnits until then.
+// Opacities are scaled so that the smallest normal half-precision number corresponds to the alpha cut-off. Flushing
+// denormals to zero then implements the cut-off. Before that step they are in units of 1 / kHalfUnits.
 constexpr float kHalfUnits = 64.875f;  // 2^-14 of them are 1/255 of 1 / 0.99, to within 4e-4
 constexpr float kLog2HalfUnits = 6.0195907f;
 constexpr float kGreatestHalf = 65504;
@@ -22,15 +22,17 @@ constexpr float kLowScale = 2048;
 
 __device__ inline uint32_t bits_of(__half2 x) { return reinterpret_cast<const uint32_t&>(x); }
 
-// The coefficients of `StagedSplat`, each as the sum of two halves, in the order of PixelBasis: 22 bits. Then the colours and
-// a 1, whose sum over the splats is that of their weights. Each of the three is a row of a matrix for `ldmatrix`.
+// Matrix operands of one splat: three rows for `ldmatrix`. Two rows hold the coefficients of `StagedSplat` in the order
+// of PixelBasis, each as a sum of two halves (22 bits). The third holds the colours and a 1, whose weighted sum is the
+// sum of the weights.
 struct alignas(16) HalfSplat {
   uint4 high, low, colors;
 };
 static_assert(sizeof(HalfSplat) == sizeof(Record<4>));
 
-// What the coefficients are multiplied by at (x, y), as pairs: 0 is (1, x), 1 is (y, x^2), 2 is (x y, y^2), 3 is nothing; exact
-// in half precision at pixel centres. The factors extend the range of the coefficients. A lane has one pair, of one column.
+// Monomials of the pixel coordinates that the coefficients are multiplied by, as pairs: 0 is (1, x), 1 is (y, x^2), 2
+// is (x y, y^2), 3 is unused. They are exact in half precision at pixel centres. The scale factors extend the range of
+// the coefficients. A lane holds one pair of one column.
 struct PixelBasis {
   __half2 constant, by_y, by_yy;
 
@@ -39,7 +41,8 @@ struct PixelBasis {
     by_y = __floats2half2_rn(pair == 1 ? 4 : pair == 2 ? x : 0, 0);
     by_yy = __floats2half2_rn(0, pair == 2 ? 1 : 0);
   }
-  // For a pixel and the one below it; first for the coefficients' high parts, then for the low ones.
+  // Compute the basis of a pixel and of the pixel below it; first for the high parts of the coefficients, then for the
+  // low parts.
   __device__ void fill(float y, uint32_t (&basis)[4]) const {
 #pragma unroll
     for (int i = 0; i < 2; ++i) {
@@ -50,16 +53,16 @@ struct PixelBasis {
   }
 };
 
-// Two numbers as sums of two halves each, the second of which counts in units of 1 / kLowScale, so that it does not get too
-// small.
+// Split each of two numbers into a sum of two halves. The second half is in units of 1 / kLowScale, which keeps it in
+// the normal range.
 __device__ inline void split(float2 pair, uint32_t& high, uint32_t& low) {
   const __half2 upper = __floats2half2_rn(pair.x, pair.y);
   high = bits_of(upper);
   low = pack_halves(kLowScale * (pair.x - __low2float(upper)), kLowScale * (pair.y - __high2float(upper)));
 }
 
-// `per_depth` brings the last channel into the range of half precision. Returns false, and the splat must not be drawn, where it
-// is so thin (a hundredth of a pixel) that half precision does not reach. `out` may be where `r` came from.
+// Convert a record to matrix operands. `per_depth` scales the last channel into the range of half precision. Returns
+// false if the splat is too thin for half precision (about 0.01 pixel) and must not be drawn. `out` may alias `r`.
 __device__ inline bool stage_half_splat(const Record<4>& r, float x, float y, float per_depth, HalfSplat& out) {
   const StagedSplat<4> s = staged(r, x, y);
   const float2 pairs[3] = {{(s.k - kLog2HalfUnits) / 16, s.by_x / 4}, {s.by_y / 4, s.by_xx}, {s.by_xy, s.by_yy}};
@@ -76,8 +79,8 @@ __device__ inline bool stage_half_splat(const Record<4>& r, float x, float y, fl
   return size < kGreatestHalf;
 }
 
-// Loads 8x8 matrices of halves from shared memory: lane l gives the address of row l % 8 of matrix l / 8. Lane 4 r + c gets the
-// elements [r][2 c] and [r][2 c + 1] of each, or of each transposed.
+// Load 8x8 matrices of halves from shared memory. Lane l supplies the address of row l % 8 of matrix l / 8. Lane 4 r +
+// c receives the elements [r][2 c] and [r][2 c + 1] of each matrix, or of its transpose.
 __device__ inline void load_matrices(uint32_t (&to)[4], uint32_t address) {
   asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
                : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
@@ -96,7 +99,7 @@ __device__ inline void load_transposed(uint32_t (&to)[2], uint32_t address) {
                : "r"(address)
                : "memory");
 }
-// 16-bit shared-memory addresses of splats, which are in shared memory themselves.
+// Load a 16-bit shared-memory address of a splat from a list in shared memory.
 __device__ inline uint32_t load_hit(uint32_t address) {
   uint16_t hit;
   asm volatile("ld.shared.u16 %0, [%1];" : "=h"(hit) : "r"(address) : "memory");
@@ -106,14 +109,14 @@ __device__ inline void store_hit(uint32_t address, uint32_t hit) {
   asm volatile("st.shared.u16 [%0], %1;" ::"r"(address), "h"(uint16_t(hit)) : "memory");
 }
 
-// 8 kTiles splats as right-hand operands of matrix products. Rows are assigned to tiles so that lane q of a group of four gets
-// the powers of the 2 kTiles splats from 2 kTiles q on, in their order.
+// Right-hand matrix operands of 8 kTiles splats. Rows are assigned to tiles such that lane q of a group of four
+// receives the exponents of the 2 kTiles consecutive splats from 2 kTiles q on.
 template <int kTiles>
 struct HalfSplats {
-  uint32_t shapes[kTiles / 2][4];  // of two tiles: high, low, high, low
+  uint32_t shapes[kTiles / 2][4];  // for two tiles: high, low, high, low
   uint32_t colors[kTiles];
 
-  // `hits`: where the addresses of the splats are in shared memory.
+  // `hits`: shared-memory address of the list of the splats' addresses.
   __device__ explicit HalfSplats(uint32_t hits) {
     constexpr uint32_t kEachTile = 2 * sizeof(uint16_t);
     const int row = threadIdx.x % 8, matrix = threadIdx.x / 8 % 4;
@@ -125,7 +128,7 @@ struct HalfSplats {
   }
 };
 
-// Two opacities in units of 1 / kMaxAlpha; 0 below the cut-off.
+// Return two opacities in units of 1 / kMaxAlpha; 0 below the cut-off.
 __device__ inline __half2 opacity(float power0, float power1) {
   const uint32_t units = pack_halves(exp2_fast(power0), exp2_fast(power1));
   uint32_t alpha;
@@ -133,22 +136,23 @@ __device__ inline __half2 opacity(float power0, float power1) {
   return reinterpret_cast<const __half2&>(alpha);
 }
 
-// Two rows of eight pixels. A group of four lanes has two pixels, one above the other, and a share of the splats each.
+// Two rows of eight pixels. A group of four lanes holds two pixels, one above the other, and each lane processes a
+// quarter of the splats.
 struct HalfPixels {
-  __half2 front;  // the transmittance in front of the next splat; 0 once the pixel is closed
+  __half2 front;  // transmittance in front of the next splat; 0 once the pixel is closed
   float sums[4];  // of the upper pixel and of the lower: lane 0 has red and green, 1 blue and depth, 2 the weights (in units of 1
                   // / kMaxAlpha)
 
   __device__ bool open() const { return bits_of(front) != 0; }
 };
 
-// The weights of the splats of a lane at its two pixels.
+// Weights of a lane's splats at its two pixels.
 template <int kTiles>
 struct HalfWeights {
   __half2 weights[2 * kTiles];
-  __half2 in_front, behind;  // the transmittance in front of the lane's splats, and behind those of all four lanes
+  __half2 in_front, behind;  // transmittance in front of the lane's splats, and behind those of all four lanes
 
-  // The weights are as if nothing were in front of the lane's splats.
+  // Compute the weights with full transmittance in front of the lane's splats.
   __device__ HalfWeights(const HalfPixels& pixels, const uint32_t (&basis)[4], const HalfSplats<kTiles>& splats) {
     const __half2 most = __float2half2_rn(kMaxAlpha);
     __half2 through;
@@ -171,11 +175,11 @@ struct HalfWeights {
     if (threadIdx.x & 1) in_front = __hmul2(in_front, beside);
   }
 
-  // Whether a pixel that was open is not open behind these splats.
+  // Return true if a pixel that was open becomes closed behind these splats.
   __device__ bool closes(const HalfPixels& pixels) const {
     return !__hbge2(behind, __hmin2(pixels.front, __float2half2_rn(kMinTransmittance)));
   }
-  // Takes out the splats that would close a pixel, and what is behind them.
+  // Remove the splats that would close a pixel, and all splats behind them.
   __device__ void cut() {
     const __half2 most = __float2half2_rn(kMaxAlpha), stop = __float2half2_rn(kMinTransmittance);
     __half2 through = __float2half2_rn(1);

@@ -1,8 +1,8 @@
-// Sums over the 64 pixels of a warp's quadrant for eight splats at a time, as small matrix products on the tensor cores.
+// Sums over the 64 pixels of a warp's quadrant for eight splats at a time, as small matrix products on tensor cores.
 //
-// A pixel's terms in a splat's gradient are s = alpha dL/dalpha for the shape and w for the colours. The moments are S Phi with
-// Phi = (1, x, y, x^2, xy, y^2) of every pixel, exact in tf32; the colours' gradients are W V with V = dL/dcolour. Values that
-// are not exact in tf32 are split into two tf32 numbers, which makes the products as accurate as float32's.
+// A pixel's terms of a splat's gradient are s = alpha dL/dalpha for the shape and w for the colours. The moments are S
+// Phi with Phi = (1, x, y, x^2, xy, y^2) of every pixel, exact in tf32. The colours' gradients are W V with V =
+// dL/dcolour. Values that are not exact in tf32 are split into two tf32 numbers, which gives float32 accuracy.
 #pragma once
 
 #include "splats.cuh"
@@ -10,14 +10,14 @@
 namespace gsplat::blending {
 namespace {
 
-constexpr int kSlots = 8;       // splats that are summed at once
+constexpr int kSlots = 8;       // splats summed per product
 constexpr int kTermLanes = 36;  // the lanes' terms of one splat, padded against bank conflicts
-constexpr int kSteps = 4;       // a product sums over 8 of the 32 lanes at a time
+constexpr int kSteps = 4;       // a product sums over 8 of the 32 lanes
 
 // A lane's terms of a splat: s and w of its two pixels.
 using SplatTerms = float4[kSlots][kTermLanes];
 
-__device__ inline float upper_bits(float x) { return __uint_as_float(__float_as_uint(x) & 0xffffe000u); }  // tf32, truncated
+__device__ inline float upper_bits(float x) { return __uint_as_float(__float_as_uint(x) & 0xffffe000u); }  // truncated to tf32
 
 // sums += a b, where a is 16x8 and b is 8x8; lane 4 r + c holds a[r][c], a[r + 8][c], a[r][c + 4], a[r + 8][c + 4], b[c][r],
 // b[c + 4][r] and the sums of [r][2 c], [r][2 c + 1], [r + 8][2 c], [r + 8][2 c + 1].
@@ -28,14 +28,14 @@ __device__ inline void multiply_add(float (&sums)[4], float a0, float a1, float 
         "r"(__float_as_uint(b[0])), "r"(__float_as_uint(b[1])));
 }
 
-// The right-hand operands of a warp: what its pixels contribute per unit of s and of w.
+// Right-hand operands of a warp: the contributions of its pixels per unit of s and of w.
 template <int D>
 struct PixelFactors {
-  static constexpr int kColorTiles = (2 * D + 7) / 8;  // columns: the upper and the lower part of every channel
-  float moments[kSteps][2];                            // of the lanes' first pixels, about their rows' middle
+  static constexpr int kColorTiles = (2 * D + 7) / 8;  // columns: the upper and lower parts of every channel
+  float moments[kSteps][2];                            // of the lanes' first pixels, relative to the centre of their rows
   float colors[kColorTiles][kSteps][kPixelsEach][2];
 
-  // Called by the whole warp with dL/dcolour of each lane's pixels; uses `terms` as scratch.
+  // Build the operands from dL/dcolour of each lane's pixels. The whole warp must call it; `terms` is used as scratch.
   __device__ PixelFactors(const float (&v_color)[kPixelsEach][D], SplatTerms& terms) {
     static_assert(sizeof(float[kPixelsEach][32][D]) <= sizeof(SplatTerms));
     auto& colors_of_lanes = reinterpret_cast<float (&)[kPixelsEach][32][D]>(terms);
@@ -70,15 +70,15 @@ struct PixelFactors {
   }
 };
 
-// Sums the terms of eight splats over the warp. Lane 4 r + c gets of splat r: in `moments` two of the sums of s (1, x | y, x^2 |
-// xy, y^2 for c = 0, 1, 2; nothing for c = 3) about the quadrant's middle, in `colors` the sums of w dL/dcolour of channel c,
-// then c + 4.
+// Sum the terms of eight splats over the warp. Lane 4 r + c receives for splat r: in `moments` two of the sums of s (1,
+// x | y, x^2 | xy, y^2 for c = 0, 1, 2; unused for c = 3) relative to the quadrant's centre, in `colors` the sums of w
+// dL/dcolour of channels c and c + 4.
 template <int D>
 __device__ inline void sum_terms(const SplatTerms& terms, const PixelFactors<D>& factors, float (&moments)[2],
                                  float (&colors)[PixelFactors<D>::kColorTiles]) {
   constexpr int kTiles = PixelFactors<D>::kColorTiles;
   const int row = (threadIdx.x & 31) / 4, column = threadIdx.x % 4;
-  float shape[4] = {}, color[kTiles][4] = {};  // shape: of the first pixels, then of the second
+  float shape[4] = {}, color[kTiles][4] = {};  // shape: of the first pixels, then of the second pixels
 #pragma unroll
   for (int step = 0; step < kSteps; ++step) {
     const float4 a = terms[row][8 * step + column], b = terms[row][8 * step + 4 + column];
@@ -92,7 +92,7 @@ __device__ inline void sum_terms(const SplatTerms& terms, const PixelFactors<D>&
       multiply_add(color[tile], upper_a.w, a.w - upper_a.w, upper_b.w, b.w - upper_b.w, factors.colors[tile][step][1]);
     }
   }
-  // The middles of the first and of the second pixels' rows lie one pixel above and below the quadrant's: y = y' -+ 1.
+  // The centres of the first and second pixels' rows are one pixel above and below the quadrant's centre.
   const float more = shape[2] - shape[0], more_x = shape[3] - shape[1], all = shape[0] + shape[2];
   const float more_of_s = __shfl_sync(kAll, more, 4 * row), more_of_x = __shfl_sync(kAll, more_x, 4 * row);
   const float more_of_y = __shfl_sync(kAll, more, 4 * row + 1), all_of_s = __shfl_sync(kAll, all, 4 * row);

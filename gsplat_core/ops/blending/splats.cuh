@@ -1,5 +1,5 @@
-// Splats and windows for blending on CUDA, forward and backward, wherever the splats come from: a splat's record and its falloff,
-// the window of a thread block, and splats staged in shared memory for all pixels of a window.
+// Splats and windows of CUDA blending, forward and backward: a splat's record and its falloff, the window of a thread
+// block, and splats staged in shared memory.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -13,9 +13,10 @@ namespace {
 
 constexpr float kLn2 = 0.69314718f, kLog2E = 1.44269504f;
 
-// log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with dx, dy from the mean to the pixel. A splat with a value that is not finite has
-// l = -infinity, so that it reaches no pixel. log2(alpha) beyond `cap` is skipped: l where the conic is indefinite (sigma would
-// be negative), else infinity. With D > 0 its colours come along, in the rest of the last 16 bytes and on.
+// log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with (dx, dy) from the mean to the pixel. A splat with a non-finite value
+// has l = -infinity, so that it reaches no pixel. Pixels where log2(alpha) exceeds `cap` are skipped: `cap` is l for an
+// indefinite conic (sigma would be negative), else infinity. With D > 0 the colours follow, from the end of the last 16
+// bytes on.
 template <int D>
 struct alignas(16) Record {
   float4 xyab;
@@ -31,8 +32,8 @@ __device__ inline Record<D> faint_record() {
   return r;
 }
 
-// Sets everything but the colours: mean (x, y), conic (a, b, c) and log2 of the opacity. Without a cap the conic is positive
-// definite.
+// Set all fields but the colours from the mean (x, y), the conic (a, b, c) and log2 of the opacity. Without a cap the
+// conic is positive definite.
 template <int D>
 __device__ inline void set_shape(Record<D>& r, float x, float y, const float* conic, float log2_opacity, float cap = INFINITY) {
   r.xyab = make_float4(x, y, -0.5f * kLog2E * conic[0], -kLog2E * conic[1]);
@@ -43,23 +44,24 @@ __device__ inline void set_shape(Record<D>& r, float x, float y, const float* co
 
 constexpr int kBlockThreads = 128;
 constexpr int kWarps = kBlockThreads / 32;
-constexpr int kQuadrant = 8;  // pixels on a side
+constexpr int kQuadrant = 8;  // pixels per side
 constexpr int kPixelsEach = 2;
 constexpr unsigned kAll = 0xffffffffu;
 
-// Lane i has column i % 8 of its warp's quadrant, and two rows: the lower 16 lanes have the upper half of the quadrant.
+// Lane i has column i % 8 of its warp's quadrant and two rows. The lower 16 lanes have the upper half of the quadrant.
 __device__ constexpr int row_of_lane(int lane, int p) { return lane / 16 * 4 + lane / 8 % 2 + 2 * p; }
 
-// A block's window of 16x16 pixels: the positions of its splats in the caller's lists, and where its warps and threads are.
+// A block's window of 16x16 pixels: the range of its splats in the caller's lists, and the pixels of its warps and
+// threads.
 struct Window {
   int begin, end;
   int left, top;               // first pixel of the window
-  int right, bottom;           // past its last pixel in the picture
+  int right, bottom;           // one past the last pixel inside the image
   int quadrant_x, quadrant_y;  // first pixel of the warp's quadrant
   int x, y[kPixelsEach];       // this thread's pixels
   bool inside[kPixelsEach];
 
-  // The window starts at pixel (left, top); pixels at or beyond (right, bottom) are outside.
+  // The window starts at pixel (left, top). Pixels at or beyond (right, bottom) are outside of the image.
   __device__ Window(int begin_, int end_, int left_, int top_, int right_, int bottom_)
       : begin(begin_), end(end_), left(left_), top(top_), right(right_), bottom(bottom_) {
     const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
@@ -74,7 +76,7 @@ struct Window {
 };
 
 struct Falloff {
-  float dx, dy, power;  // log2(alpha) before the cut-offs
+  float dx, dy, power;  // log2(alpha) before clamping and cut-off
 };
 template <int D>
 __device__ inline Falloff falloff(const Record<D>& r, float x, float y) {
@@ -93,17 +95,19 @@ __device__ inline float reciprocal(float x) {
   return y;
 }
 
-// Whether the contour alpha = 1/255 may reach a pixel centre of the quadrant whose first centre is (x, y). Its part in the
-// quadrant's rows reaches in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy of those rows
-// that is nearest to the outermost point; never less than that, for a splat left out would be missing in the image.
+// Return false only if the contour alpha = 1/255 reaches no pixel centre of the quadrant whose first centre is (x, y).
+// Within the quadrant's rows the ellipse extends in x from the left to the right solution of a dx^2 + 2 b dx dy + c
+// dy^2 = k at the dy of those rows nearest to the outermost point. The extent must not be underestimated: an omitted
+// splat would be missing in the image.
 template <int D>
 __device__ inline bool reaches(const Record<D>& r, float x, float y) {
-  const float k = r.l + (2e-3f - kLog2AlphaCutoff);  // slightly outside of the contour, against rounding
+  const float k = r.l + (2e-3f - kLog2AlphaCutoff);  // slightly larger than the contour, to allow for rounding
   if (!(k >= 0)) return false;
   const float a = -r.xyab.z, b = -0.5f * r.xyab.w, c = -r.c, ux = r.xyab.x - x, uy = r.xyab.y - y;
   const float ac = a * c, det = fmaf(-b, b, ac) - ac * 5e-7f;
   const float top = -b * sqrtf(k / (c * det));
-  if (!(a > 0 && c > 0 && det > ac * 1e-6f && fabsf(top) <= 1e30f)) return true;  // not a proper ellipse: test pixel by pixel
+  if (!(a > 0 && c > 0 && det > ac * 1e-6f && fabsf(top) <= 1e30f))
+    return true;  // not a proper ellipse in float32: test pixel by pixel
   const float inverse = 1.0f / a, slope = -b * inverse, offset = k * inverse, curve = det * inverse * inverse;
   const float low = -uy, high = low + float(kQuadrant - 1);
   const float at_right = fminf(fmaxf(top, low), high), at_left = fminf(fmaxf(-top, low), high);
@@ -114,9 +118,9 @@ __device__ inline bool reaches(const Record<D>& r, float x, float y) {
   return right >= 0 && left <= float(kQuadrant - 1);
 }
 
-// log2(alpha / its maximum) before the cut-offs, as a polynomial in the offset (x, y) from the window's centre to the pixel:
-// one + y (by_y + y by_yy) where one = k + x (by_x + x by_xx) and by_y = ky + x by_xy are the same for a whole column.
-// Beyond `cap` a splat is skipped.
+// log2(alpha / maximum) before the cut-offs, as a polynomial in the offset (x, y) from the window's centre to the
+// pixel: one + y (by_y + y by_yy). one = k + x (by_x + x by_xx) and by_y = ky + x by_xy are constant in a pixel column.
+// Values above `cap` are skipped.
 template <int D>
 struct alignas(16) StagedSplat {
   float k, by_x, by_xx, by_y, by_xy, by_yy;
@@ -125,7 +129,8 @@ struct alignas(16) StagedSplat {
 };
 static_assert(sizeof(StagedSplat<1>) == 32 && sizeof(StagedSplat<4>) == 48 && sizeof(StagedSplat<5>) == 48);
 
-// Reads a splat at an address in shared memory. In assembly, because the compiler would load the colours again for every pixel.
+// Read a staged splat from a shared-memory address. Inline assembly, because the compiler would otherwise reload the
+// colours for every pixel.
 template <int D, bool kCapped>
 __device__ inline StagedSplat<D> staged_at(uint32_t address) {
   constexpr int kFloats = 6 + D + (kCapped ? 1 : 0);
@@ -150,10 +155,11 @@ __device__ inline StagedSplat<D> staged_at(uint32_t address) {
 }
 __device__ inline uint32_t shared_address(const void* at) { return uint32_t(__cvta_generic_to_shared(at)); }
 
-// The cut-off of 1/255, as the polynomial counts.
+// The cut-off of alpha = 1/255 in the polynomial's units.
 __device__ inline float staged_cutoff(const AlphaLimit& limit) { return kLog2AlphaCutoff - limit.log2_most; }
 
-// (x, y) is the window's centre. The order of operations is explicit, so that both passes get the same bits.
+// Stage a record; (x, y) is the window's centre. The order of operations is explicit, so that the forward and backward
+// pass compute identical bits.
 template <int D>
 __device__ inline StagedSplat<D> staged(const Record<D>& r, float x, float y, const AlphaLimit& limit = {}) {
   const float a = r.xyab.z, b = r.xyab.w, c = r.c, dx = x - r.xyab.x, dy = y - r.xyab.y;
@@ -175,17 +181,17 @@ __device__ inline float sqrt_fast(float x) {
   return y;
 }
 
-// In which parts of the window the contour alpha = 1/255 may reach a pixel centre; the parts are 8 pixels wide and `kRows` high,
-// numbered from left to right and downwards. (x, y) is the first pixel centre of the window. The ellipse's part in a part's rows
-// reaches in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy of those rows that is nearest to
-// the outermost point; never less than that, for a splat left out would be missing in the image. Where it does not come to these
-// rows, the solutions are NaN, and compare as false.
+// Return the parts of the window in which the contour alpha = 1/255 may reach a pixel centre. Parts are 8 pixels wide
+// and `kRows` high, numbered left to right, then downwards. (x, y) is the first pixel centre of the window. Within a
+// part's rows the ellipse extends in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy
+// of those rows nearest to the outermost point. The extent must not be underestimated: an omitted splat would be
+// missing in the image. Where the ellipse does not reach the rows, the solutions are NaN and compare as false.
 //
-// Each of a warp's threads has a splat if `shown`. Lane i returns the mask of those that reach part i.
+// Each thread of the warp has a splat if `shown`. Lane i returns the mask of the splats that reach part i.
 template <int kRows, int D>
 __device__ inline unsigned reaching_parts(bool shown, const Record<D>& r, float x, float y) {
-  constexpr float kBeside = 2e-3f;                   // pixels, against rounding
-  const float k = r.l + (2e-3f - kLog2AlphaCutoff);  // a little outside of the contour, likewise
+  constexpr float kBeside = 2e-3f;                   // pixels, tolerance for rounding
+  const float k = r.l + (2e-3f - kLog2AlphaCutoff);  // slightly larger than the contour, to allow for rounding
   const float a = -r.xyab.z, b = -0.5f * r.xyab.w, c = -r.c, ux = r.xyab.x - x, uy = r.xyab.y - y;
   const float ac = a * c, det = fmaf(-b, b, ac) - ac * 5e-7f;
   const float top = -b * sqrt_fast(k * reciprocal(c * det));
@@ -210,8 +216,8 @@ __device__ inline unsigned reaching_parts(bool shown, const Record<D>& r, float 
   return mine | __ballot_sync(kAll, shown && !proper);
 }
 
-// Stages splat i of a batch, where i % 32 is the thread's lane, and stores for each part of the window the mask of splats that
-// reach it. `any`: one of the warp's threads has a splat.
+// Stage splat i of a batch, where i % 32 is the thread's lane, and store for each part of the window the mask of the
+// splats that reach it. `any`: at least one thread of the warp has a splat.
 template <int kRows, int D>
 __device__ inline void stage_splat(int i, bool any, const Record<D>& r, const Window& w, StagedSplat<D>* splats,
                                    uint4* reached_by_part, const AlphaLimit& limit = {}) {
