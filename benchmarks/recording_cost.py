@@ -18,14 +18,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import av
 import numpy as np
 
 from gsplat_core.io.frame_codec import camera_record
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.sessions import SessionInfo, SessionReader, SessionWriter, WriterOptions
+from gsplat_core.io.sessions import SessionInfo, SessionReader, SessionWriter
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.sinks.session_recorder import SessionRecorder
@@ -52,12 +51,8 @@ def main() -> int:
     by_itself("image and what lies beside it", info, frames, lambda writer, frame: writer.frame(frame))
     prepared = {frame.seq: with_loss_mask(frame) for frame in bare}
     by_itself("loss mask", info, bare, lambda writer, frame: writer.prepared(prepared[frame.seq], frame))
-    for shown in ("vp9", "lossless", "digest"):
-        options = WriterOptions(shown=shown)  # type: ignore[arg-type]
-        name = f"shown, {shown}"
-        by_itself(name, info, frames, lambda writer, frame: writer.shown(Shown(frame, frame.image, 1)), options)
-    for shown in ("vp9", "digest"):
-        beside_a_graph(shown, info, frames, recording.fps)  # type: ignore[arg-type]
+    by_itself("shown", info, frames, lambda writer, frame: writer.shown(Shown(frame, frame.image, 1)))
+    beside_a_graph(info, frames, recording.fps)
     return 0
 
 
@@ -66,11 +61,10 @@ def by_itself(
     info: SessionInfo,
     frames: list[Frame],
     write: Callable[[SessionWriter, Frame], None],
-    options: WriterOptions | None = None,
 ) -> None:
     """Measure one part of a recording in this thread."""
     with tempfile.TemporaryDirectory() as folder:
-        writer = SessionWriter(Path(folder) / "session", info, options)
+        writer = SessionWriter(Path(folder) / "session", info)
         begin = time.process_time()
         for frame in frames:
             write(writer, frame)
@@ -80,12 +74,12 @@ def by_itself(
     report(part=name, cpu_ms_per_frame=round(1e3 * spent / len(frames), 2), bytes_per_frame=size // len(frames))
 
 
-def beside_a_graph(shown: Literal["vp9", "digest"], info: SessionInfo, frames: list[Frame], fps: float) -> None:
+def beside_a_graph(info: SessionInfo, frames: list[Frame], fps: float) -> None:
     """Measure the whole recording at the stream's rate; `handed_over_us` is the time spent by the graph's threads."""
     handed: list[float] = []
     given = [with_loss_mask(frame) for frame in frames]
     with tempfile.TemporaryDirectory() as folder:
-        recorder = SessionRecorder(Path(folder) / "session", info, WriterOptions(shown=shown))
+        recorder = SessionRecorder(Path(folder) / "session", info)
         recorder.open()
         begin, spent = time.monotonic(), time.process_time()
         for k, (frame, prepared) in enumerate(zip(frames, given, strict=True)):
@@ -104,7 +98,7 @@ def beside_a_graph(shown: Literal["vp9", "digest"], info: SessionInfo, frames: l
         read_s = time.process_time() - begin_read
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
     report(
-        part=f"all, shown {shown}, at {fps:g} frames/s",
+        part=f"all, at {fps:g} frames/s",
         cpu_ms_per_frame=round(1e3 * (time.process_time() - spent - read_s) / len(frames), 2),
         bytes_per_frame=size // len(frames),
         handed_over_us_p50=round(1e6 * float(np.median(handed))),

@@ -29,7 +29,7 @@ from gsplat_core.io.sessions.records import (
     ShownLine,
     read_log,
 )
-from gsplat_core.io.sessions.tracks import CODINGS, Coding, TrackIndex, TrackReader, TrackWriter
+from gsplat_core.io.sessions.tracks import CODINGS, TrackIndex, TrackReader, TrackWriter
 
 Stage = Literal["", "prepared_", "late_"]
 """Name prefix of track files.
@@ -52,13 +52,13 @@ class SegmentWriter:
     Methods raise OSError and av.FFmpegError.
     """
 
-    def __init__(self, folder: Path, begins: SegmentBegins, *, fps: float, shown: Coding) -> None:
-        """Create the segment's folder and log; `shown` is the coding of displayed pictures."""
+    def __init__(self, folder: Path, begins: SegmentBegins, *, fps: float) -> None:
+        """Create the segment's folder and log."""
         folder.mkdir()
         self.folder = folder
         self.number, self.begun_ns = begins.number, begins.monotonic_ns
         self.frames = 0
-        self._fps, self._shown = fps, shown
+        self._fps = fps
         self._tracks: dict[str, TrackWriter] = {}
         self._start_ns: int | None = None
         self._closed = False
@@ -82,8 +82,7 @@ class SegmentWriter:
         height, width = picture.shape[:2]
         name = track_file(stage, track, height, width)
         if name not in self._tracks:
-            coding = self._shown if track == "shown" else CODINGS[track]
-            self._tracks[name] = TrackWriter(self.folder / name, coding, height, width, self._fps)
+            self._tracks[name] = TrackWriter(self.folder / name, CODINGS[track], height, width, self._fps)
         return self._tracks[name].write(picture, (pts_ns - self._start_ns) // 1_000_000)
 
     def line(self, line: Record) -> None:

@@ -38,9 +38,9 @@ CODINGS: Mapping[str, Coding] = {
     "rehearsal_mask": "grey",
     "depth": "float",
     "depth_confidence": "float",
-    "shown": "colour",
+    "shown": "vp9",
 }
-"""Coding of each track; `shown` may also be vp9."""
+"""Coding of each track."""
 PIXEL_FORMATS: Mapping[Coding, str] = {"colour": "bgr0", "grey": "gray", "float": "gray", "vp9": "yuv420p"}
 ENCODERS: Mapping[Coding, str] = {"colour": "ffv1", "grey": "ffv1", "float": "ffv1", "vp9": "libvpx-vp9"}
 _VP9 = {
@@ -275,7 +275,8 @@ class TrackReader:
 
     def __init__(self, index: TrackIndex, track: str, height_px: int, width_px: int) -> None:
         self._index, self._size = index, (height_px, width_px)
-        self._coding: Coding = CODINGS[track]
+        # Sessions of earlier versions may have displayed pictures without loss.
+        self._lossless: Coding = "colour" if track == "shown" else CODINGS[track]
         self._pictures: Iterator[tuple[int, NDArray[Any] | None, str | None]] | None = None
         self._next: tuple[int, NDArray[Any] | None, str | None] | None = None
 
@@ -319,7 +320,7 @@ class TrackReader:
                 raise UnreadableFile("its video is neither FFV1 nor VP9")
             if context.width * context.height > 4 * MAX_PIXELS:
                 raise UnreadableFile(f"frames of {context.width}x{context.height} exceed the bound of pixels")
-            coding: Coding = "vp9" if context.codec.canonical_name == "vp9" else self._coding
+            coding: Coding = "vp9" if context.codec.canonical_name == "vp9" else self._lossless
             decoder, wrong = PictureDecoder(stream), self._index.damaged()
             times: dict[int, int] = {}
             for number, packet in enumerate(_packets(container, stream)):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,6 @@ from gsplat_core.io.sessions.records import (
     write_session_file,
 )
 from gsplat_core.io.sessions.segments import SegmentWriter, Stage
-from gsplat_core.io.sessions.tracks import Coding
 from gsplat_core.scene.frames import Frame
 
 DELETING = ".deleted-"
@@ -154,11 +153,6 @@ SYNC_S = 1.0
 class WriterOptions:
     """Options of session recording."""
 
-    shown: Literal["vp9", "lossless", "digest"] = "vp9"
-    """Content kept of displayed pictures in addition to the SHA-256.
-
-    "vp9" keeps a lossy video, "lossless" the exact pictures, "digest" nothing.
-    """
     segment_bytes: int = 256 * 2**20
     segment_s: float = 60.0
     """Size and age limits of a segment."""
@@ -224,7 +218,6 @@ class SessionWriter:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SEGMENTS_FOLDER).mkdir(exist_ok=True)
         write_session_file(folder, info)
-        self._shown_coding: Coding = "vp9" if self.options.shown == "vp9" else "colour"
         self._kept = Retention(self.options.keep_bytes, self.options.keep_s, self.options.segment_bytes)
         self._synced_ns = self.options.clock()
         self._segment = self._begin(0, "begin")
@@ -282,7 +275,7 @@ class SessionWriter:
         self._go_on()
         frame, rendered = shown.frame, np.ascontiguousarray(shown.rendered)
         tracks: dict[TrackName, int] = {}
-        if shown.new and self.options.shown != "digest":
+        if shown.new:
             on_screen = rendered if shown.on_screen is None else shown.on_screen
             tracks["shown"] = self._segment.picture("", "shown", on_screen, frame.pts_ns)
         self._segment.line(
@@ -338,7 +331,7 @@ class SessionWriter:
             number=number, why=why, utc=datetime.now(UTC).isoformat(), monotonic_ns=self.options.clock()
         )
         folder = self.folder / SEGMENTS_FOLDER / f"{number:06d}"
-        return SegmentWriter(folder, begins, fps=self.info.fps, shown=self._shown_coding)
+        return SegmentWriter(folder, begins, fps=self.info.fps)
 
     def _next(self, why: str, now_ns: int) -> None:
         ended = self._segment
