@@ -152,6 +152,7 @@ class Recorder:
         self.tests: dict[str, list[str]] = defaultdict(list)
         self.seconds: dict[str, list[float]] = defaultdict(list)
         self.executed: dict[str, list[tuple[np.ndarray, int]]] = defaultdict(list)
+        self.failed: list[str] = []
 
     def take(self, file: str, test: int) -> None:
         places = np.flatnonzero(self.marks)
@@ -167,6 +168,10 @@ class Recorder:
         self.tests[file].append(test)
         self.seconds[file].append(sum(os.times()[:4]) - start)
         return result
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.failed.append(report.nodeid)
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> Iterator[None]:
@@ -213,9 +218,10 @@ class Marked:
         self.codes.write_text(json.dumps(codes), encoding="utf-8")
 
     def record(self, files: list[str]) -> str:
-        """Run test files and write their records. Return pytest's exit code and the last line of its output."""
+        """Run test files and write their records. Return pytest's exit code and the failed tests."""
 
         def write(recorder: Recorder) -> None:
+            print("\nfailed:", *recorder.failed)  # what they would execute later is not recorded
             for file in files:
                 pairs = [(places, np.full(len(places), test, np.int32)) for places, test in recorder.executed[file]]
                 places = np.concatenate([np.zeros(0, np.int64), *(each for each, _ in pairs)])
