@@ -19,9 +19,11 @@ Ending = Literal["steps", "deadline", "at_most"]
 have missed the deadline, or `at_most` steps were made before it.
 """
 MAX_IN_FLIGHT = 4
-"""Steps that may be queued on a GPU while a deadline is watched; enough to keep it busy."""
+"""Largest number of unfinished steps queued on a GPU under a deadline; enough to keep the GPU busy."""
 TURNS, SECOND_EYE = 4, 2
-"""With two eyes, the third of every four steps trains the second eye. The first eye is the displayed one, and the host
+"""Length of the eye cycle in steps, and the index in it of the second eye's step.
+
+With two eyes, the third of every four steps trains the second eye. The first eye is the displayed one, and the host
 prepares the second eye's picture while the GPU works on the first steps.
 """
 
@@ -113,8 +115,8 @@ class Spending:
     def allows_step(self, by_turns: bool = False) -> bool:
         """Return True if another step should be made.
 
-        With `by_turns`, two eyes alternate (`turn`). A step on the second eye is started only if there is time for one
-        on the first eye after it. That one is then always made, so the newest step trains the displayed eye.
+        With `by_turns`, two eyes alternate (`turn`). A step on the second eye is started only if time remains for a
+        step on the first eye after it. That step is then always made, so the newest step trains the displayed eye.
         """
         budget = self._budget
         if budget.steps is not None:
@@ -126,8 +128,8 @@ class Spending:
         wanted = 2 if by_turns and self.turn else 1
         if self._has_time_for(wanted):
             return True
-        # Replays of a session know only the number of steps. A step on the first eye in a turn of
-        # the second one is therefore always the last.
+        # A replay receives only the number of steps. A first-eye step in place of a second-eye step must
+        # therefore be the last one, so that the replay can derive the eye of each step from the number.
         needed = self.made < budget.at_least
         self._was_last = wanted == 2 and (self.made + 2 > budget.at_least if needed else self._has_time_for(1))
         return needed or self._was_last
@@ -136,7 +138,7 @@ class Spending:
         budget = self._budget
         if budget.at_most is not None and self.made + steps > budget.at_most:
             return False
-        # Queued steps finish first; the next ones must end before the deadline as well.
+        # Steps already queued run first, so the deadline must cover them and the new steps.
         return budget.clock() + (self._in_flight + steps) * self.step_s <= budget.deadline_s
 
     @property
@@ -230,7 +232,7 @@ class ObserveReport:
     seq: int
     steps: int
     arriving_loss: HostCopy | None
-    """Loss of the last step, possibly unfinished on a GPU; None if the frame was not trained on."""
+    """Loss of the last step, whose copy from a GPU may be in flight; None if the frame was not trained on."""
     gaussians: int
     ending: Ending = "steps"
     """Reason why training on the frame ended."""

@@ -76,12 +76,12 @@ class ReconstructorConfig:
     window_frames: int = 30
     """Number of recent frames that are trained on again to prevent forgetting."""
     motion_spacing_s: float = 0.2
-    """Shortest time in seconds in which motion can change its course."""
+    """Temporal resolution of motion: shortest time in seconds in which its direction or speed can change."""
     squared_error: bool = False
     """Compare colours by squared error, which PSNR measures, instead of L1."""
     history_s: float | None = None
-    """Seconds of the past that remain deformable online. None keeps all, which for some fields
-    takes memory that grows with the stream.
+    """Length of the past in seconds that stays deformable online. None keeps all of it. The memory of some fields then
+    grows with the stream.
     """
     preallocate: bool = False
     """Allocate memory for `max_gaussians` at the start, so that CUDA graphs stay valid when

@@ -147,8 +147,8 @@ def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None =
 def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
     """Return the PSNR in dB of masked images over the whole frame: squared error over tissue / (3 x all pixels).
 
-    Most papers print this variant. It rises with the tool's size, so report it only together with `psnr_tissue_db`.
-    Arguments and return value are the same as there.
+    Most papers report this variant. It rises with the tool's area, so report it only together with `psnr_tissue_db`.
+    Arguments and return value are those of `psnr_tissue_db`.
     """
     pair = _masked_pair(image, target, mask)
     return _psnr_db(pair.squared_error(), pair.pixels if pair.tissue_pixels else 0)
@@ -224,7 +224,7 @@ def frame_quality(
     Args:
         seq: frame number.
         image, target, mask: as in `psnr_tissue_db`.
-        similarity: compute SSIM as well, which takes longest; otherwise it is NaN.
+        similarity: True to compute SSIM, the slowest measure. False sets it to NaN.
     """
     pair = _masked_pair(image, target, mask)
     measured = similarity and pair.tissue_pixels

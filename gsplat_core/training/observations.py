@@ -42,9 +42,7 @@ class Observation:
 
     @property
     def right(self) -> Observation | None:
-        """Observation of the right eye, created on first use, which costs host time of several GPU
-        steps.
-        """
+        """Observation of the right eye. It is created on first use, which costs host time equal to several GPU steps."""
         return None if self.right_eye is None else self.right_eye.observation
 
     def to_rehearse(self) -> Observation:
@@ -55,7 +53,7 @@ class Observation:
         return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right_eye=right)
 
     def by_turns(self, turn: int) -> Observation:
-        """Return the left eye at even turns, the right eye, if any, at odd ones."""
+        """Return the right eye's observation, if there is one, at odd turns, else this observation."""
         return self if self.right_eye is None or turn % 2 == 0 else self.right_eye.observation
 
     def as_frame(self) -> Frame:
@@ -130,13 +128,13 @@ def learned_depth(frame: Frame, device: torch.device | str = "cpu") -> Tensor | 
 
 def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cpu") -> Tensor:
     """Return a depth map [H, W] as float32 on `device`, with 0 where it is not positive and finite."""
-    # Checked on the device; on the host it would take longer than some GPU steps.
+    # Compared on the device, because the host would take longer than some GPU steps.
     depth = tensor_of(depth_mm.astype(np.float32, copy=False), device)
     return torch.where(torch.isfinite(depth) & (depth > 0), depth, 0.0)
 
 
 NEWEST_SHARE = 0.7
-"""Share of the scheduled steps spent on the newest frame; the others train on older frames of the window."""
+"""Share of the scheduled steps spent on the newest frame. The other steps train on older frames of the window."""
 
 
 class ObservationWindow:
@@ -201,7 +199,7 @@ class ObservationWindow:
             return [newest] * steps
         to_newest = max(1, round(steps * NEWEST_SHARE))
         chosen = [self._frames[int(i)] for i in self._random.integers(0, older, steps - to_newest)]
-        # Spread the newest frame's steps evenly among the others, ending with it.
+        # Spread the newest frame's steps evenly over the schedule, the last step included.
         order: list[Observation] = []
         for k in range(steps):
             newest_turn = (k + 1) * to_newest // steps > k * to_newest // steps

@@ -1,4 +1,8 @@
-"""Training on all frames of a recording: frame order, decay of learning rates, temporal smoothing limited by how evenly the pictures change, and smoothing among nearest neighbours."""
+"""Training on all frames of a recording: frame order, decay of learning rates, and smoothing of motion in time and
+space.
+
+Both kinds of smoothing are limited by how evenly the pictures change (`steadiness`).
+"""
 
 from __future__ import annotations
 
@@ -40,8 +44,8 @@ def nearest_others(points: Tensor) -> Tensor:
         there = np.ascontiguousarray(host[finite] - host[finite].mean(axis=0))
         tree = cv2.flann_Index(there, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10})  # type: ignore[attr-defined]
         found, _ = tree.knnSearch(there, count + 1, params={"checks": -1, "eps": 0.0, "sorted": True})
-        # A point is its own first result unless others coincide with it; then drop the last result
-        # instead.
+        # A point is its own first result, unless other points coincide with it. In that case drop the
+        # last result instead.
         itself = found == np.arange(len(there))[:, None]
         itself[~itself.any(axis=1), -1] = True
         others[finite] = finite[found[~itself].reshape(len(there), count)]
@@ -72,7 +76,7 @@ def steadiness(observations: Sequence[Observation]) -> float:
         off = (now.image.float() - between).to(torch.int64).square().sum(-1) * tissue
         squared += torch.stack([off.sum(), 3 * tissue.sum()])
     total, values = squared.tolist()
-    # Noise of a frame plus that of the mean of two others.
+    # Noise variance of a frame plus that of the mean of two other frames.
     noise = 1.5 * NOISE_LEVELS**2
     return min(1.0, noise * values / total) if total else 1.0
 
@@ -136,7 +140,7 @@ class ToFit(NamedTuple):
     seen: list[Observation]
     """Observations to train on."""
     doubts: Mapping[str, int]
-    """See `RecordingDepth`."""
+    """Reasons for frames without depth, with numbers of frames (`RecordingDepth.doubts`)."""
     at_rest: bool = False
 
 
@@ -196,7 +200,7 @@ class OfflineTraining:
         self._order: list[int] = []
         self._rate = 1.0
         self._neighbours: Tensor | None = None
-        """Neighbours of each Gaussian, or None if they must be searched again."""
+        """Neighbours of each Gaussian, int64 [N, K]; None if they must be searched again."""
 
     def __call__(self, steps: int, progress: Callable[[int, Tensor], None] | None) -> Tensor:
         """Run `steps` steps, calling `progress` after each. Returns the last loss, [] on the device."""
@@ -222,7 +226,7 @@ class OfflineTraining:
         return self._observations[self._order.pop()]
 
     def _smooth(self) -> None:
-        """Smooth by the amount that belongs to the steps since the last time."""
+        """Smooth in time and space, in proportion to the number of steps since the last call."""
         each = self._rate * SMOOTH_EVERY / len(self._observations)
         smooth_in_time, share_motion = self._step.capabilities.smooth_in_time, self._step.capabilities.share_motion
         if self._smoothing and smooth_in_time is not None:
@@ -233,8 +237,8 @@ class OfflineTraining:
             share_motion(self._neighbours, min(self._rigidity * each, MOST_AT_ONCE))
 
     def _densify(self, share: float) -> None:
-        """Run a densification round. `share` of all rounds is complete with it, and the number of
-        Gaussians grows accordingly.
+        """Run a densification round that raises the number of Gaussians in proportion to `share`, the share of all
+        rounds completed with it.
         """
         self._step.settle(self._observations[-1], rate_scale=self._rate)
         self._neighbours = None

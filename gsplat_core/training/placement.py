@@ -1,12 +1,12 @@
 """Correction of the scene's geometry by the depth of frames.
 
-Visible Gaussians are moved along their rays. On a GPU the correction is a CUDA graph, because a live stream has no time for its hundred launches. Depth may
-become available after its frame was trained on.
-
 Pictures of one eye hardly constrain distance or motion along the line of sight, so the loss alone would need
-thousands of steps. Each Gaussian is therefore moved along its ray of the current camera, which sees the same picture
-as before. The first depth places the whole scene, which started on a plane. Later depth by parallax corrects all
+thousands of steps. Each visible Gaussian is therefore moved along its ray of the current camera, whose picture does
+not change. The first depth places the whole scene, which started on a plane. Later depth by parallax corrects all
 times, since it assumes static tissue. Later measured or stereo depth corrects a single time.
+
+Depth may become available after its frame was trained on (`LateDepth`). On a GPU the correction is a CUDA graph,
+because a live stream has no time for about a hundred launches.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class LateDepth:
     possible: Tensor | None
     """Depth for correcting the scene, float32 [H, W], 0 where unknown; None if unknown everywhere."""
     everywhere: Tensor | None
-    """`possible` extrapolated to all pixels, for placing a whole scene; None if not yet computed."""
+    """`possible` extrapolated to all pixels, for moving a whole scene to its first depth; None if not yet computed."""
 
     @staticmethod
     def of(frame: Frame, device: torch.device | str, *, places: bool = False) -> LateDepth:
@@ -70,19 +70,19 @@ class LateDepth:
 
     @staticmethod
     def for_placement(frame: Frame, device: torch.device | str) -> LateDepth:
-        """Prepare only the correction of the scene, for a frame that was trained on with its depth."""
+        """Prepare only the fields for correcting the scene, for a frame that was already trained on with its depth."""
         possible = possible_depth(frame)
         return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)
 
     def added_to(self, seen: Observation) -> Observation:
-        """Return the observation with the target of the depth loss."""
+        """Return the observation with `believed` as the target of its depth loss."""
         return replace(seen, depth=self.believed)
 
 
 LARGEST_STEP = 1.4
 """Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is known."""
 SHARE = 0.5
-"""Share of the correction (of log depth) applied by one frame, which averages the depth of several frames."""
+"""Share of a correction (of log depth) that one frame applies. Several frames are thus averaged."""
 CORRECTED_PX = 16
 """Side of the picture blocks whose Gaussians move together, in pixels."""
 
@@ -90,8 +90,8 @@ CORRECTED_PX = 16
 def smooth_factor(depth: Tensor, shown: Tensor, known: Tensor, pixels: Tensor) -> Tensor:
     """Return a smooth factor [N] for the depth of Gaussians.
 
-    Neighbours get the same factor, since tissue moves smoothly and a changed order along the line
-    of sight would change the picture.
+    Neighbours get the same factor, since tissue moves smoothly. Different factors would also reorder Gaussians along
+    the line of sight and change the picture.
 
     Args:
         depth: target depth [H, W].
@@ -254,7 +254,7 @@ class Placement:
             return
         if self.is_placed and origin.initialises_only:
             return
-        # The loss ignores shading depth, so observations do not contain it.
+        # Read depth from the frame, because observations omit depth sources that the loss ignores.
         late = late or LateDepth.for_placement(frame, observation.image.device)
         possible = late.possible
         if possible is None:
@@ -288,8 +288,8 @@ def _place(step: TrainingStep, motion: EditableMotion, frame: Frame, observation
     known = inside & (there > 0)
     if not bool(known.any()):
         return False
-    # Gaussians without depth move with their neighbours, and those outside the picture with the
-    # median.
+    # Gaussians without depth take the factor of their neighbours. Those outside the picture take the
+    # median factor.
     everywhere = late.everywhere
     if everywhere is None:
         everywhere = tensor_of(tissue_depth(frame, float(now.median())), now.device)

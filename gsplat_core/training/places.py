@@ -1,4 +1,6 @@
-"""Scenes that a stream has left, kept for recognition when the stream shows one of them again, and for the memory of the next one."""
+"""Scenes that a stream has left. They are kept to recognise a scene that returns, and to reuse the memory of the last
+one.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +19,17 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 
 MOST_PLACES = 8
-"""Largest number of kept places; the one left first is dropped."""
+"""Largest number of stored left scenes. The one that the stream left first is dropped."""
 RENDERED_PX = 160
-"""Width at which a place is rendered for comparison, in pixels."""
+"""Width in pixels at which a left scene is rendered for comparison."""
 COMPARED_PX = 64
 """Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels."""
 FINE_PX, COARSE_PX = 1.0, 16.0
 """Standard deviations, in pixels of that size, of the band-pass filter that removes noise and illumination."""
 SAME_PLACE = 0.75
-"""Correlation from which a picture shows a place. See benchmarks/results/constants.md."""
+"""Correlation from which a picture counts as showing a left scene. See benchmarks/results/constants.md."""
 LEAST_SHARE = 0.3
-"""Share of the picture that must be both tissue and covered by the place."""
+"""Smallest share of the picture that must be both tissue and covered by the left scene."""
 
 
 @dataclass
@@ -37,13 +39,13 @@ class Place:
     gaussians: Gaussians
     """Last state of the Gaussians, without a deformation field."""
     camera: Camera
-    """Camera that saw the place last."""
+    """Camera that last observed this scene."""
     left_s: float
-    """Time when the stream left it, in seconds."""
+    """Time in seconds when the stream left this scene."""
     _looks: dict[Camera, tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=dict, repr=False)
 
     def look(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Render the place `COMPARED_PX` wide: colours [H, W, 3] and opacity [H, W]. The last result is cached."""
+        """Render the left scene `COMPARED_PX` wide: colours [H, W, 3] and opacity [H, W]. The last result is cached."""
         if camera not in self._looks:
             with torch.no_grad():
                 output = render(self.gaussians, camera.scaled(RENDERED_PX / camera.width_px), depth=False)
@@ -55,7 +57,7 @@ class Place:
 
 
 class Places:
-    """Places left most recently."""
+    """Store of the scenes left most recently."""
 
     def __init__(self, most: int = MOST_PLACES) -> None:
         self._most = most
@@ -70,10 +72,10 @@ class Places:
         self._left = [*self._left, Place(kept, camera, time_s)][-self._most :] if self._most else []
 
     def take(self, frame: Frame) -> Place | None:
-        """Remove and return the place that a frame shows, or None.
+        """Remove and return the left scene that a frame shows, or None if it shows none.
 
-        Each place is rendered from the frame's pose or, without a pose, from its last camera. The
-        comparison ignores the frame's exposure and white balance.
+        Each left scene is rendered from the frame's pose or, without a pose, from its last camera. The comparison
+        ignores the frame's exposure and white balance.
         """
         likeness = [self._likeness(place, frame) for place in self._left]
         best = int(np.argmax(likeness)) if likeness else 0
@@ -100,13 +102,15 @@ class LeftScenes:
     def __init__(self) -> None:
         self.places = Places()
         self._recognised: tuple[int, Place] | None = None
-        """Number of the frame that starts the next scene, and the place that it shows."""
+        """Number of the frame that starts the next scene, and the left scene that this frame shows; None if it shows
+        none.
+        """
         self._kept: TrainingStep | None = None
         self._kept_size: tuple[int, int] | None = None
-        """Picture size of the newest scene."""
+        """Picture size (height, width) of the newest scene."""
 
     def forget(self) -> None:
-        """Discard the places."""
+        """Discard all left scenes."""
         self.places, self._recognised = Places(), None
 
     def leave(self, step: TrainingStep, camera: Camera, time_s: float) -> None:
@@ -114,13 +118,13 @@ class LeftScenes:
         self.places.leave(step.at(time_s), camera, time_s)
 
     def recognise(self, frame: Frame) -> bool:
-        """Return True if the frame, which starts the next scene, shows a place left before."""
+        """Return True if the frame, which starts the next scene, shows a scene that the stream left before."""
         place = self.places.take(frame)
         self._recognised = None if place is None else (frame.seq, place)
         return place is not None
 
     def recognised(self, seq: int) -> Gaussians | None:
-        """Return the Gaussians of the place that frame `seq` was recognised as, or None."""
+        """Return the Gaussians of the left scene as which frame `seq` was recognised, or None."""
         return self._recognised[1].gaussians if self._recognised and self._recognised[0] == seq else None
 
     def keep_memory(self, step: TrainingStep | None) -> None:

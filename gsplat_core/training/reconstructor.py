@@ -43,8 +43,8 @@ class Reconstructor:
     result is deterministic for equal frames, settings and seed. It is also independent of the number of threads, unless
     the field uses torch's matrix products, which round differently with other numbers of threads.
 
-    For a stream that does not wait, give `live`. All steps of `observe` then train on the newest frame. After
-    `publish`, call `grow` and `rehearse` until the next frame.
+    For a live stream, pass `live`. All steps of `observe` then train on the newest frame. After `publish`, call `grow`
+    and `rehearse` until the next frame arrives.
 
     All tensors are kept and trained on `device`. A GPU works on a frame's steps while the host prepares the next frame.
     """
@@ -67,7 +67,7 @@ class Reconstructor:
             live: settings of the steps in a live stream. None to mix steps on the newest frame and
                 on earlier ones, and to grow the scene before each frame is trained on.
             seed: seed of all random numbers.
-            recording_digest: digest of the recording, stated by the model.
+            recording_digest: digest of the recording, stored in the model's metadata.
             device: device of all tensors.
 
         Raises:
@@ -96,7 +96,7 @@ class Reconstructor:
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
-        """Reasons why `fit` found no depth, with numbers of frames of a moving camera."""
+        """Reasons for frames without depth in the last `fit`, each with its number of frames; for moving cameras."""
 
     @property
     def gaussians(self) -> int:
@@ -116,7 +116,7 @@ class Reconstructor:
         return (self._schedule.step_s or 0.0) * 1e9
 
     def kept(self) -> dict[str, int]:
-        """Return the sizes of all stream-dependent stores; each is bounded."""
+        """Return the current sizes of all stores that grow with the stream; each is bounded."""
         parameters = 0 if self._step is None else self._step.field.parameter_count
         archived = 0 if self._growth is None else self._growth.archived
         held = {"window_frames": len(self._window), "field_parameters": parameters, "places": len(self._left.places)}
@@ -143,7 +143,7 @@ class Reconstructor:
         Args:
             frame: next frame.
             budget: training budget of the frame; None for the configured number of steps.
-            steps: short for `budget=Budget.of_steps(steps)`.
+            steps: shorthand for `budget=Budget.of_steps(steps)`.
             train: False only advances the time.
 
         Raises:
@@ -224,9 +224,9 @@ class Reconstructor:
         return self._schedule.rehearsal_ns(steps)
 
     def grow(self, frame: Frame) -> None:
-        """Do the work that `observe` postpones in a live stream until `frame`, the newest trained
-        one, has been displayed. The scene is corrected by its depth, Gaussians are added for
-        uncovered tissue, and Gaussians are archived or restored.
+        """Run the work that `observe` postpones in a live stream. Call it after `frame`, the newest trained frame, has
+        been displayed. The scene is corrected by the frame's depth. Gaussians are created for uncovered tissue,
+        archived or restored.
         """
         assert self._step is not None
         self._placement.catch_up(self._step)
@@ -234,20 +234,21 @@ class Reconstructor:
             self._growth.finish(self._step, frame, self._window.newest, self._motion)
 
     def look_after_once(self) -> None:
-        """Run every periodic growth step of `grow` immediately, forcing eviction. For warm-up,
-        since the first run of each is slow.
+        """Run every periodic growth step of `grow` immediately, forcing eviction. For warm-up, since the first
+        execution of each step is slow.
         """
         if self._step is not None and self._growth is not None:
             self._growth.once(self._step, self._window.newest)
 
     def begin_scene(self, frame: Frame) -> bool:
-        """Leave the scene. The next observed frame, `frame`, starts a new scene or one that was left before.
+        """Leave the current scene. The next observed frame, `frame`, starts a new scene or returns to one that was left
+        before.
 
         A bounded number of left scenes is kept in host memory in their last state. The frame may have another size.
         Version numbers continue.
 
         Returns:
-            True if the frame shows a place that was left before.
+            True if the frame shows a scene that was left before.
         """
         if self._step is not None:
             self._left.leave(self._step, self._window.newest.camera, self._last_time_s)

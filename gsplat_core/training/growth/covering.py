@@ -29,7 +29,7 @@ from gsplat_core.transfers import HostCopy
 UNCOVERED_ALPHA = 0.5
 """Accumulated opacity below which a pixel counts as uncovered."""
 SMALLEST_SHARE = 0.002
-"""Uncovered share of the frame from which Gaussians are added; training closes single-pixel gaps."""
+"""Uncovered share of the frame from which Gaussians are added. Below it, training closes the single-pixel gaps."""
 
 
 def uncovered_pixels(alpha: Tensor, mask: Tensor) -> Tensor:
@@ -180,8 +180,8 @@ def gaussians_beside(
 class Covering:
     """Search for uncovered tissue in consecutive frames.
 
-    With `beside`, a host thread creates the Gaussians, which takes longer than a live frame. They are added at the next
-    search, independent of its time, so the same sequence of searches gives the same scene.
+    With `beside`, a host thread creates the Gaussians, because creation takes longer than a live frame interval. The
+    next search adds them whenever it happens, so the same sequence of searches gives the same scene.
     """
 
     def __init__(self, config: ReconstructorConfig, *, beside: bool = False) -> None:
@@ -202,7 +202,7 @@ class Covering:
         self._coverage = None if camera is None else CapturedCoverage(camera, device, rows)
 
     def forget(self) -> None:
-        """Discard Gaussians that are being created for a scene that is left."""
+        """Cancel the creation of Gaussians for a scene that the stream has left."""
         self._under_way.clear()
 
     def join(self, step: TrainingStep) -> None:
@@ -229,7 +229,7 @@ class Covering:
     def look(
         self, step: TrainingStep, observation: Observation, frame: Callable[[], Frame], *, has_depth: bool = False
     ) -> None:
-        """Search the tissue of one eye's view that the scene does not cover.
+        """Find tissue in one eye's view that the scene does not cover, and create Gaussians for it.
 
         Args:
             step: training step of the scene.

@@ -101,7 +101,7 @@ def gaussians_at_pixels(
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colour - 0.5) / SH_C0
     quat = facing(np.asarray(camera_to_world[:3, :3], np.float64)).astype(np.float32)
-    # Tensors share memory with the arrays; the first picture of a stream waits for this.
+    # Share memory with the arrays instead of copying, because a stream's first picture waits for this.
     return Gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         quats=torch.from_numpy(np.tile(quat, (count, 1))),
@@ -161,7 +161,7 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
         return frame.image
     bare_tool = (frame.mask == 0).astype(np.uint8)
     tool = cv2.dilate(bare_tool, np.ones((2 * TOOL_MARGIN_PX + 1,) * 2, np.uint8))
-    if tool.all():  # no tissue would be left
+    if tool.all():  # dilation would leave no tissue
         tool = bare_tool
     return inpaint_quarter_size(frame.image, np.asarray(tool, np.uint8))
 
@@ -173,7 +173,7 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
     height, width = hole.shape
     small = (max(1, width // 4), max(1, height // 4))
     small_hole = (cv2.resize((hole > 0).astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
-    if small_hole.all():  # no known pixel at this size
+    if small_hole.all():  # no pixel to in-paint from at this size
         outside = image[hole == 0] if not hole.all() else image.reshape(-1, 3)
         return np.where(hole[..., None] > 0, np.rint(outside.mean(0)), image).astype(np.uint8)
     filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), small_hole, 3, cv2.INPAINT_TELEA)

@@ -24,9 +24,9 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy, tensor_of
 
 SEE_EVERY = 8
-"""Number of frames between two visibility tests; with little free capacity every frame is tested."""
+"""Number of frames between two visibility tests. With little free capacity, every frame is tested."""
 ROOM_SHARE = 0.1
-"""Share of the capacity kept free for new tissue, if there are Gaussians to archive."""
+"""Share of the capacity kept free for new tissue, as long as there are Gaussians to archive."""
 UNSEEN_S = 0.5
 """Seconds out of view after which a Gaussian may be archived."""
 MARGIN_SHARE = 0.1
@@ -34,7 +34,7 @@ MARGIN_SHARE = 0.1
 extent may reach into it.
 """
 ARCHIVED_SCENES = 8
-"""Capacity of the archive, in multiples of the scene's."""
+"""Capacity of the archive, in multiples of the scene's capacity."""
 REACH_PX = 5
 """Distance from an uncovered pixel, in pixels, within which archived Gaussians are restored."""
 
@@ -48,7 +48,7 @@ class OutOfView:
         self.archive = Archive(ARCHIVED_SCENES * capacity)
         self._looks = 0
         self._looked_from: Camera | None = None
-        """Camera of the last search in the archive."""
+        """Camera for which the archive was last searched."""
         self._unseen_s: torch.Tensor | None = None
         """Cached result of `unseen_s` since the last test."""
 
@@ -132,7 +132,7 @@ class OutOfView:
 
 
 USUAL_DENSITY = 0.3
-"""Share of the usual Gaussian density below which a cell counts as empty."""
+"""Ratio to the usual Gaussian density below which a cell counts as empty."""
 LOOKS_AFTER = 0.02
 """Motion of the picture, as a share of its width, after which new tissue is searched again; each
 search takes some milliseconds.
@@ -197,8 +197,8 @@ class NewTissue:
     def unfilled(self, now: Gaussians, mask: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the centres [M, 2] of empty new cells on tissue, and the scene's depth [H, W], 0 where unknown.
 
-        Depth is the mean over Gaussians. A rendered depth is biased to the front, so tissue placed by it would come
-        nearer and nearer as the camera moves. Synchronises with the device.
+        Depth is the mean over Gaussians. A rendered depth is biased towards the camera. Tissue created at it would come
+        nearer with every step of a moving camera. Synchronises with the device.
         """
         empty, depth = self._empty(now)
         wanted = HostCopy(empty.flatten() & (value_at(mask, tensor_of(self._grid, mask.device)) > 0))
@@ -225,8 +225,8 @@ def fill_new_tissue(
 ) -> None:
     """Fill tissue that came into view before the first step on a frame, from the archive or with new Gaussians.
 
-    Otherwise training would stretch neighbouring Gaussians over it, which would follow the picture's edge as the camera
-    moves.
+    Without this, training would stretch neighbouring Gaussians over the new tissue. They would then follow the
+    picture's edge as the camera moves.
 
     Args:
         step: training step of the scene.

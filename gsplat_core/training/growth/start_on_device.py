@@ -1,5 +1,5 @@
-"""Creation of a scene's first Gaussians on the device, equal to that of `initialisation` but in a
-few milliseconds on a GPU.
+"""Creation of a scene's first Gaussians on the device. The result equals that of `initialisation` and takes a few
+milliseconds on a GPU.
 
 cuBLAS and cuDNN are avoided: each takes tens of milliseconds for its first use in a thread, which
 would delay a stream's first picture.
@@ -44,8 +44,8 @@ class StartOnDevice:
         columns = np.clip(pixels[:, 0].astype(np.int64), 0, camera.width_px - 1)
         rows = np.clip(pixels[:, 1].astype(np.int64), 0, camera.height_px - 1)
         self._cells = torch.from_numpy(rows * camera.width_px + columns).to(device)
-        # In every camera model the points of a pixel are linear in depth, so two depths determine
-        # all.
+        # In every camera model the point of a pixel is linear in depth. Two depths therefore determine
+        # the point at any depth.
         at_zero, at_one = (unprojected(pixels, np.full(len(pixels), z), camera) for z in (0.0, 1.0))
         self._points = self._float32(at_zero[0]), self._float32(at_one[0] - at_zero[0])
         self._pixel_mm = self._float32(at_zero[1]), self._float32(at_one[1] - at_zero[1])
@@ -93,7 +93,7 @@ def _without_tools(frame: Frame, image: Tensor) -> Tensor:
     bare = (tissue == 0).float()[None, None]
     margin = 2 * TOOL_MARGIN_PX + 1
     tool = max_pool2d(bare, margin, stride=1, padding=TOOL_MARGIN_PX)
-    tool = torch.where(tool.min() > 0, bare, tool)[0]  # the margin would leave no tissue
+    tool = torch.where(tool.min() > 0, bare, tool)[0]  # no margin if it would cover all tissue
     return torch.where(tool > 0, filled(picture, 1 - tool), picture)
 
 

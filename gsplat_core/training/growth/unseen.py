@@ -30,8 +30,8 @@ def pixels_of(means: Tensor, camera: Camera, margin_px: float = 0.0) -> tuple[Te
 
 def depth_of(means: Tensor, camera: Camera) -> Tensor:
     """Return the depth of points [N, 3] along the camera's axis, [N]."""
-    # A matrix product would delay a stream's first picture: cuBLAS takes tens of milliseconds for
-    # its first use in a thread.
+    # Not a matrix product: cuBLAS takes tens of milliseconds for its first use in a thread, which would
+    # delay a stream's first picture.
     x, y, z, offset = camera.world_to_camera[2].tolist()
     return x * means[:, 0] + y * means[:, 1] + z * means[:, 2] + offset
 

@@ -1,11 +1,8 @@
-"""Motion of tissue from pictures: dense optical flow between consecutive pictures, and its conversion to 3D motion of visible Gaussians.
+"""Motion of tissue from pictures: dense optical flow between consecutive pictures, and 3D motion of Gaussians from it.
 
-Flow is extrapolated smoothly where pictures show none.
-
-Conversion of optical flow to 3D motion of visible Gaussians.
-
-Depth is assumed constant between two frames, since one camera does not show motion along the line of sight. Float32
-points on the CPU use one compiled op. Other points use plain torch, which also serves as the op's reference in tests.
+Flow is extrapolated smoothly where pictures show no tissue. In 3D, depth is assumed constant between two frames, since
+one camera does not show motion along the line of sight. Float32 points on the CPU use one compiled op. Other points
+use plain torch, which also serves as the op's reference in tests.
 """
 
 from __future__ import annotations
@@ -36,8 +33,8 @@ WIDE_CELLS = 6.0
 WIDE_WEIGHT = 0.02
 """Weight of the neighbourhood relative to a cell's own flow."""
 Detail: TypeAlias = Literal["full", "half"]
-"""Resolution of the flow. `full` is a thorough search at full size. `half` is a quick search that
-halves pictures of more than `SMALL_PIXELS`.
+"""Resolution of the flow. `full` searches thoroughly at full size. `half` searches quickly and halves pictures of more
+than `SMALL_PIXELS` pixels.
 """
 SMALL_PIXELS = 150_000
 """Number of pixels up to which pictures are not halved, since that would lose detail and save little time."""
@@ -78,7 +75,9 @@ class ImageMotion:
         return smoothed(flow, tissue)
 
     def _pixel_flow(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-        """Return the raw flow [h, w, 2] in pixels of the full picture; h and w are halved if the search was."""
+        """Return the raw flow [h, w, 2] in pixels of the full picture. h and w are half the picture's size if it was
+        halved.
+        """
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = grey.shape
         if self._shrinks and height * width > SMALL_PIXELS:
@@ -205,7 +204,7 @@ class Seen:
 
 
 def beside(tensor: Tensor, values: Sequence[float] | NDArray[np.floating]) -> Tensor:
-    """Return a few numbers as a tensor on the device and of the type of `tensor`, copied without
-    synchronisation (see `Camera.matrices`).
+    """Convert a few numbers to a tensor with the device and dtype of `tensor`, without synchronisation (see
+    `Camera.matrices`).
     """
     return torch.tensor(np.asarray(values), dtype=tensor.dtype).to(tensor.device, non_blocking=True)

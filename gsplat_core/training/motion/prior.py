@@ -1,19 +1,13 @@
-"""Prediction of motion after the newest frame, for display between frames and as start of training on the next one.
-
-With known camera motion, optical flow also gives the depth of a scene without measured depth.
-
-Depth of the scene from known camera motion and optical flow, for a moving scope without measured depth.
-
-Without depth a scene starts on a plane at an arbitrary distance. With known poses that plane moves wrongly, and the
-field would have to learn the error of every frame. The position of a point in a second frame is linear in its inverse
-depth w (Hartley and Zisserman 2004, section 12.2), so every Gaussian has a least-squares w.
-
-A correction moves a Gaussian along its ray of the first camera, which sees the same picture as before.
-
-Prediction of motion after the newest frame, for display between frames and as start of training on the next frame.
+"""Prediction of motion after the newest frame, for display between frames and as start of training on the next frame.
 
 A `MotionPrior` processes each frame before the model is trained on it, and predicts the velocity after it. Further
 priors are added as modules registered in `MOTION_PRIORS`.
+
+With known camera motion, optical flow also gives the depth of a scene without measured depth (`DepthFromMotion`). Such
+a scene starts on a plane at an arbitrary distance. With known poses that plane moves wrongly, and the field would have
+to learn the error of every frame. The position of a point in a second frame is linear in its inverse depth w (Hartley
+and Zisserman 2004, section 12.2), so every Gaussian has a least-squares w. A correction moves a Gaussian along its ray
+of the first camera, so the first camera's picture does not change.
 """
 
 from __future__ import annotations
@@ -42,16 +36,16 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 AT_FIRST = 0.6
-"""Share before anything was learned. See benchmarks/results/constants.md."""
+"""Assumed share of a motion that continues, before any observation. See benchmarks/results/constants.md."""
 FOLLOWS = 0.15
-"""Weight of the newest frame in the moving average."""
+"""Weight of the newest frame in the moving average of the share."""
 ONE_FRAME = (-0.5, 1.5)
-"""Bounds of the share observed in one frame, which limit outliers of the optical flow."""
+"""Bounds of the share observed in one frame, which limit the effect of optical-flow outliers."""
 
 
 class Damping:
-    """Exponentially weighted mean of the least-squares share in realised = share * last. It stays
-    on the device without synchronisation.
+    """Share of a motion that continues in the next interval: exponentially weighted mean of the least-squares share in
+    realised = share * last. The share stays on the device without synchronisation.
     """
 
     def __init__(self) -> None:
@@ -99,10 +93,11 @@ class DepthFromMotion:
         self._distance_is_known = False
 
     def apply(self, step: TrainingStep, motion: SurfaceMotion, before_s: float) -> None:
-        """Correct the scene by the image motion since the frame at `before_s`, which it fits.
+        """Correct the scene's depth by the image motion since the frame at `before_s`, at whose time the scene fits its
+        picture.
 
-        Nothing changes if the camera only rotated or was static. On a GPU the host synchronises
-        until the distance is known.
+        Nothing changes if the camera only rotated or did not move. On a GPU the host synchronises in every call until
+        the scene's distance is known.
         """
         if not np.any(translation_between(motion.before, motion.after)):
             return
@@ -134,8 +129,8 @@ class DepthFromMotion:
     def _distance(
         self, pixels: Tensor, target: Tensor, motion: SurfaceMotion, known: Tensor, information: Tensor
     ) -> float | None:
-        """Return the distance of a plane that explains most of the motion, or None with too little
-        parallax or no such plane.
+        """Return the distance of the plane that explains most of the motion. Returns None with too little parallax or
+        if no plane explains enough.
         """
         c, d = parallax_terms(pixels, target, motion.before, motion.after)
         focal = float(motion.after.K[0, 0])
@@ -190,7 +185,7 @@ def _normalised(pixels: Tensor, camera: Camera) -> Tensor:
 
 
 HORIZON_S = 0.15
-"""Longest time after the newest frame for which its motion is extrapolated, in seconds; then the model is static."""
+"""Longest time in seconds after the newest frame for which motion is extrapolated. Later the scene is static."""
 LONGEST_GAP_S = 0.15
 """Longest interval between frames that gives a velocity, in seconds."""
 UNCERTAINTY = 0.05
@@ -306,8 +301,8 @@ class FlowPrior:
         return velocity / self._interval_s
 
     def _take(self, frame: Frame, flow: Flow | None, device: torch.device) -> None:
-        """Learn further properties of a frame in subclasses. `flow` is the motion from the previous
-        picture, or None if unknown.
+        """Update further state of a subclass from a frame. `flow` is the motion from the previous picture, or None if
+        unknown.
         """
 
     def _usable_motion(self) -> SurfaceMotion | None:
@@ -315,7 +310,7 @@ class FlowPrior:
         return self._motion if 0 < self._interval_s <= LONGEST_GAP_S and not self._is_sudden else None
 
     def _judge(self, moved_px: float) -> None:
-        """Detect a jump and update the usual motion."""
+        """Update the usual motion, and mark the newest motion as a jump if it is far larger."""
         usual = moved_px if self._usual_px is None else self._usual_px
         self._is_sudden = moved_px > max(SUDDEN * usual, SUDDEN_PX)
         self._usual_px = usual + USUAL_DECAY * (min(moved_px, SUDDEN * usual) - usual)
@@ -339,7 +334,7 @@ def followed(frame: Frame) -> NDArray[np.uint8] | None:
 
 
 def no_prior(config: ReconstructorConfig) -> None:
-    """Return no prior; the field's own extrapolation is used."""
+    """Select no prior; the field's own extrapolation is then used."""
 
 
 def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
@@ -363,8 +358,8 @@ def motion_of(step: TrainingStep) -> EditableMotion:
 class Following:
     """Delivery of a stream's frames to its motion prior.
 
-    Processing a frame takes longer than some training steps, and a picture that was just trained on needs no prior.
-    Without `at_once`, the two newest trained frames are therefore delivered only when a frame is skipped.
+    The prior is needed only to display frames without training. Processing a frame takes longer than some training
+    steps. Without `at_once`, the two newest trained frames are therefore delivered only when a frame is skipped.
     """
 
     def __init__(self, config: ReconstructorConfig, *, at_once: bool) -> None:
@@ -387,15 +382,15 @@ class Following:
         self._waiting.clear()
 
     def observe(self, step: TrainingStep, frame: Frame, observation: Observation, *, first: bool) -> None:
-        """Process a frame before the model is trained on it. `first`: the scene starts with it."""
+        """Process a frame before the model is trained on it. `first` is True for the first frame of a scene."""
         if self._at_once:
             self._deliver(step, frame, observation)
         elif not first:
             self._waiting.append((frame, observation))
 
     def skip(self, step: TrainingStep) -> None:
-        """Process the newest trained frames, since the next one is displayed without training, so
-        that the published scene keeps moving.
+        """Process the two newest trained frames. Called when a frame is displayed without training, so that the
+        published scene keeps moving.
         """
         if self._at_once:
             return
@@ -406,13 +401,13 @@ class Following:
         self._waiting.clear()
 
     def has_revealed(self, least_px: float) -> bool:
-        """Return True if a strip of at least `least_px` pixels was revealed at an edge and the scene
-        was moved accordingly.
+        """Return True if a strip of at least `least_px` pixels was revealed at an edge and the prior moved the scene
+        accordingly.
         """
         return self.prior is not None and self._at_once and self.prior.revealed_px >= least_px
 
     def cover_revealed(self) -> None:
-        """Record that revealed tissue was searched."""
+        """Reset the width of the revealed strip after the strip was searched for uncovered tissue."""
         if self.prior is not None:
             self.prior.revealed_px = 0.0
 
@@ -423,17 +418,16 @@ class Following:
 
 @contextmanager
 def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -> Iterator[None]:
-    """Set the prior's continuation on the field while a copy is published; training is not affected.
+    """Set the prior's continuation on the field while a copy is published. Training is not affected.
 
-    The scene is static after `learned_s`, the time of the newest trained frame, if the prior has not processed that
-    frame.
+    If the prior has not processed the newest trained frame, at `learned_s`, the scene is static after that time.
     """
     continuation = step.capabilities.continuation
     if prior is None or continuation is None:
         yield
         return
-    # Also without a velocity, so that slots whose fields have a continuation from the start need no
-    # other memory later.
+    # Set a continuation even without a velocity. Snapshot slots then allocate its tensors at the
+    # start and need no other memory later.
     velocity = prior.velocity(step) if prior.newest_s == learned_s else None
     still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
     continuation.continue_with(still if velocity is None else velocity, learned_s, prior.horizon_s)

@@ -27,7 +27,7 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 EDGE_PX = 1
-"""Margin around tools and holes in pixels where depth is not read, since tracks are inaccurate."""
+"""Margin in pixels around tools and holes where depth is not read, since tracked positions are inaccurate."""
 ROWS_AT_ONCE = 1 << 14
 """Number of trajectories computed at once, to limit memory."""
 
@@ -46,7 +46,7 @@ class SurfaceTracks:
         Args:
             frames: all frames.
             observations: the same frames as tensors.
-            at_rest: depth was estimated for static tissue, see `WithParallax`.
+            at_rest: True if depth was estimated for static tissue (`RecordingDepth.at_rest`).
         """
         self._at_rest = at_rest
         self._frames, self._seen = frames, observations
@@ -84,8 +84,8 @@ class SurfaceTracks:
         return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
 
     def _across(self, points: Tensor, number: int) -> Tensor:
-        """Return trajectories with motion across the picture only. Depth differences of static
-        tissue are errors, which would move points in front of others.
+        """Return trajectories with motion across the picture only. Depth differences of static tissue are errors. They
+        would move points in front of other points.
         """
         after, before = [points], [points]
         for motion in self._ahead[number:]:
