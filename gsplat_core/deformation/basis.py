@@ -41,10 +41,10 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
 class BasisSlot:
-    """Reusable basis field with spare capacity for Gaussians and bumps; unused places are inert."""
+    """Slot for a basis field with spare capacity for Gaussians and bumps. Unused rows and columns are inert."""
 
     def __init__(self, source: BasisField, rows: int) -> None:
-        # A ring has all places from the start, and the copy needs the same number.
+        # A ring uses all of its columns from the start, and the copy needs the same number.
         places = source.columns.places if source.columns.is_ring else bump_capacity(source.bumps)
         with torch.device(source.weights.device):
             self.field = type(source)(rows, source.time_window_s, bumps=places)
@@ -62,7 +62,7 @@ class BasisSlot:
         return count * bumps * (2 + int(self.field.weights.shape[2]))
 
     def overwrite(self, source: DeformationField) -> bool:
-        """Copy another field's bumps and column layout into the slot, and reset unused places to inert.
+        """Copy another field's bumps and column layout into the slot, and reset unused rows and columns to inert.
 
         Returns:
             False, with nothing copied, if the field does not fit into the slot.
@@ -78,7 +78,7 @@ class BasisSlot:
         if self._used != (count, columns.count):
             self._use(count, columns.count)
         theirs = (source.centers.data, source.log_widths.data, source.weights.data)
-        # Bumps occupy the first places, or all places of a ring.
+        # Bumps occupy the first columns, or all columns of a ring.
         copy_each(self._in_use, [values[:count, : columns.count] for values in theirs])
         self.field._time_window_s = source.time_window_s
         self.field._columns = replace(columns, places=places)
@@ -86,7 +86,7 @@ class BasisSlot:
         return True
 
     def _continue(self, source: Continuation | None, count: int) -> None:
-        """Copy the source's continuation, or disable the own one."""
+        """Copy the source's continuation, or disable the slot's continuation if the source has none."""
         mine = self.field.continuation
         if mine is None:
             return
@@ -97,7 +97,7 @@ class BasisSlot:
         mine.set_clock(self.field.frame_time, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
-        """Select the region of each tensor to write, and reset the previously used rest to inert."""
+        """Select the region of each tensor to write. Reset the rest of the previously used region to inert."""
         mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
         rows, columns = self._used
         for to, inert in zip(mine, INERT, strict=True):

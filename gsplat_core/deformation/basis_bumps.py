@@ -67,9 +67,10 @@ COLUMNS_AHEAD = 1
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of a field, numbered from the oldest; number n is stored at (oldest + n) % places.
+    """Layout of a field's columns.
 
-    Only a full ring has an oldest column at a place other than 0.
+    Columns are numbered from the oldest. Column n is stored at tensor index (oldest + n) % places. `oldest` is 0 unless
+    the layout is a full ring.
     """
 
     origin_s: float
@@ -78,15 +79,15 @@ class Columns:
     count: int
     """Number of columns in use."""
     places: int
-    """Number of columns of the tensors."""
+    """Number of columns allocated in the tensors."""
     oldest: int = 0
-    """Place of column 0."""
+    """Tensor index of column 0, the oldest column."""
     is_ring: bool = False
-    """True if new columns replace the oldest ones once all places are in use."""
+    """True if new columns replace the oldest ones once all allocated columns are in use."""
 
     @property
     def spare(self) -> int:
-        """Number of unused places."""
+        """Number of allocated columns that are not in use."""
         return self.places - self.count
 
     def moved_on(self, added: int) -> tuple[Columns, int]:
@@ -98,11 +99,11 @@ class Columns:
 
     @property
     def newest_place(self) -> int:
-        """Place of the newest column."""
+        """Tensor index of the newest column."""
         return (self.oldest + self.count - 1) % self.places
 
     def newest_places(self, count: int) -> Iterator[tuple[slice, range]]:
-        """Yield the places of the newest `count` columns in one or two slices, with column numbers."""
+        """Yield the tensor indices of the newest `count` columns as one or two slices, each with its column numbers."""
         number = self.count - count
         while number < self.count:
             place = (self.oldest + number) % self.places
@@ -159,8 +160,8 @@ BUMPS_PER_SPACING = math.sqrt(math.pi)
 class BumpTensors(ContinuedField):
     """Centres and log-widths [N, B], weights [N, B, 13], and their moments once trained.
 
-    Rows are Gaussians and columns are bumps. Both may include inert spares, for reserved Gaussians
-    (`reserve`) and for later times.
+    Rows are Gaussians and columns are bumps. Both may include inert spare entries, for reserved Gaussians (`reserve`)
+    and for later times.
     """
 
     def __init__(
@@ -374,7 +375,7 @@ class BumpTensors(ContinuedField):
         return passed
 
     def _lay_out(self, places: slice, numbers: range, held: Tensor | None) -> None:
-        """Initialise new bumps in these places, overwriting previous content."""
+        """Initialise new bumps in these tensor columns, overwriting their previous content."""
         used = self.count
         for tensor, inert in self._tensors_and_fill():
             tensor[:used, places] = inert
@@ -409,7 +410,7 @@ class BumpTensors(ContinuedField):
         return self.centers, self.log_widths, self.weights
 
     def _tensors_and_fill(self) -> Iterator[tuple[Tensor, float]]:
-        """Yield every tensor with rows and columns, and its value at places without a bump."""
+        """Yield every tensor with rows and columns, and the value that marks an entry without a bump."""
         yield from zip((p.data for p in self._whole_parameters()), INERT, strict=True)
         if self._moments is not None:
             yield from ((moment, 0.0) for moment in (*self._moments.first, *self._moments.second, self._moments.steps))

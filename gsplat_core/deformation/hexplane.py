@@ -48,7 +48,7 @@ def box_around(means: Tensor) -> Tensor:
     Without finite positions, the box is [-1, 1]³.
     """
     box = torch.tensor([[-1.0] * 3, [1.0] * 3], device="cpu" if means.is_meta else means.device)
-    if means.is_meta:  # only the shape is wanted
+    if means.is_meta:  # a meta tensor has a shape but no values
         return box
     finite = means.detach().to(torch.float32)
     finite = finite[finite.isfinite().all(dim=1)]
@@ -453,5 +453,5 @@ KIND = FieldKind(
     },
     rates=HexPlaneLearningRates(),
     captured_training=HexPlaneTraining,
-    offline_spacing_s=1 / 15,  # finer values were not tried
+    offline_spacing_s=1 / 15,  # finer spacings have not been measured
 )

@@ -83,7 +83,7 @@ class NewField:
     None in a live session, where `DeformationField.cover` extends the field.
     """
     spacing_s: float
-    """Shortest time in seconds within which motion must be able to change its course."""
+    """Temporal resolution of motion: shortest time in seconds in which its direction or speed can change."""
     history_s: float | None = None
     """Length of the past, in seconds, that stays deformable in a live session; None for all of it."""
 

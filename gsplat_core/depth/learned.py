@@ -1,15 +1,10 @@
 """Relative depth by a monocular network supplied by the user as an ONNX model.
 
-A network's output is defined up to scale and offset. It is aligned with a reference by an affine fit.
+Monocular networks predict depth or inverse depth up to a scale and offset that differ for each picture. An affine fit
+aligns the output with a reference: the frame's own depth if it has one, otherwise the previous result, which avoids
+flicker. The first frame of a stream without depth gets an assumed alignment.
 
-Affine alignment of relative depth: scale and offset between a network's output and a reference depth of the same
-picture.
-
-All functions work on values that are either depth or inverse depth. The result is of the same kind as the input.
-
-Monocular networks predict depth or inverse depth up to a scale and offset that differ for each picture. The alignment
-uses the frame's own depth if it has one, otherwise the previous answer, which avoids flicker. The first frame of a
-stream without depth gets an assumed alignment.
+The alignment functions take values that are either depth or inverse depth. Their result is of the same kind.
 """
 
 from __future__ import annotations
@@ -60,7 +55,8 @@ def is_constant(values: Plane) -> bool:
 
 
 def with_assumed_zero(values: Plane) -> Affine:
-    """Return the offset that limits the span of values [N] to `MOST_SPAN`; zero if the span is already smaller.
+    """Return the map whose offset limits the ratio of far to near values [N] to `MOST_SPAN`; zero offset if already
+    smaller.
 
     Used when no reference depth is available.
     """
@@ -101,14 +97,14 @@ def fitted(values: Plane, known: Plane) -> Affine | None:
 
 
 def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
-    """Return a start value from medians, which outliers hardly influence."""
+    """Return a start value for the fit from medians, which outliers hardly influence."""
     (x, dx), (y, dy) = _middle(values), _middle(known)
     factor = sign * dy / dx
     return Affine(factor, y - factor * x, 0.0)
 
 
 def _middle(values: Plane) -> tuple[float, float]:
-    """Return the median and the median absolute deviation, or the standard deviation if the latter is zero."""
+    """Return the median and the median absolute deviation. If the latter is zero, the standard deviation replaces it."""
     median = float(np.median(values))
     return median, float(np.median(np.abs(values - median))) or float(values.std())
 
@@ -134,9 +130,9 @@ SMALLEST_PX = 4
 GRID_PX = 80
 """Longer side of the grid on which network outputs are compared, in cells."""
 EVERY_S = 0.3
-"""Time from one inference to the next in seconds; the last answer is reused in between unless the scope moves."""
+"""Time from one inference to the next in seconds. The previous result is reused in between unless the scope moves."""
 ALIKE = 0.6
-"""Correlation with the reference depth from which the two show the same scene."""
+"""Smallest correlation with the reference depth at which both count as showing the same scene."""
 LEAST_SEEN = 0.05
 """Share of the picture that must be tissue."""
 UNSEEN = "too little of the picture is tissue for a depth network"
@@ -214,7 +210,7 @@ class LearnedDepth(Estimator):
         self._looked_ns: int | None = None
         self._answer: DepthMap | None = None
         self._before: NDArray[np.float64] | None = None
-        """Last confident answer on the grid, as values of the network's kind."""
+        """Last confident result on the comparison grid, as depth or inverse depth like the network's output."""
         self._pose: NDArray[np.float64] | None = None
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
@@ -287,7 +283,7 @@ class LearnedDepth(Estimator):
         return AGAINST if found.alike <= -ALIKE else UNLIKE
 
     def _by_before(self, grid: NDArray[np.float64], seen: NDArray[np.bool_]) -> Affine | None:
-        """Align to the previous answer. Returns None if there is none or it shows another scene."""
+        """Align to the previous result. Returns None if there is none, or if it shows another scene."""
         if self._before is None:
             return None
         found = fitted(grid[seen], self._before[seen])

@@ -1,8 +1,8 @@
-"""Depth maps with confidence, the estimators that return them, and checks of them.
+"""Depth maps with confidence, the estimators that return them, and checks of the maps.
 
 Depth of sensors, renderers and resized maps has edge pixels that belong to neither side, near-zero values next to
-unknown depth, and wrong rows or columns along the border. Gaussians initialised there float in front of the tissue and
-occlude it when they move (`measured_confidence`).
+unknown depth, and wrong rows or columns along the border. Gaussians initialised at such depth float in front of the
+tissue and occlude it when they move. `measured_confidence` rejects these pixels.
 
 Depth by parallax is validated by a second map of the same tissue from another pose and time, which must show the same
 relief (`agree`). The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a
@@ -69,7 +69,9 @@ class DepthMap:
 
     @property
     def kept(self) -> NDArray[np.float32]:
-        """Depth that is stored with the frame: that of at least its origin's `least_confidence`, 0 elsewhere."""
+        """Depth stored with the frame: values with at least the confidence `least_confidence` of the map's origin, else
+        0.
+        """
         return np.where(self.confidence >= self.origin.least_confidence, self.depth, np.float32(0))
 
 
@@ -80,16 +82,16 @@ def doubted(shape: tuple[int, int], origin: DepthOrigin, doubt: str) -> DepthMap
 
 
 class Estimator(ABC):
-    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The same frames give the
-    same bytes.
+    """Base class of depth estimators of one stream. Frames are passed in order, and an estimator may keep state. Equal
+    frames give bit-identical results.
     """
 
     origin: ClassVar[DepthOrigin | None] = None
-    """Origin of the depth; None if it is that of the frame, or if there is none."""
+    """Origin of the estimated depth. None if the estimator passes on the frame's own depth or returns no depth."""
     needs: ClassVar[str | None] = None
-    """Field of `Frame` without which nothing is estimated; None if the picture is enough."""
+    """Field of `Frame` that the estimator requires; None if the picture suffices."""
     evidence: ClassVar[str | None] = None
-    """Noun phrase for what shows the distance, for messages; None if nothing is estimated."""
+    """Noun phrase for messages that names the evidence of distance; None if the estimator estimates nothing."""
 
     @abstractmethod
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
@@ -233,7 +235,7 @@ UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level 
 
 @dataclass(frozen=True)
 class Look:
-    """Depth map at reduced size with its camera."""
+    """Depth map at reduced size with its camera, for comparisons."""
 
     inverse: NDArray[np.float32]
     """Inverse depth [h, w]."""

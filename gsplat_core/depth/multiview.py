@@ -1,19 +1,14 @@
 """Depth by parallax of a moving scope from known poses.
 
-Poses are first checked against the observed image motion. A plane sweep (Collins 1996) gives matching costs, semi-global matching (Hirschmüller 2008)
-selects distances, and other views confirm them. Streams are compared with earlier key frames.
+The depth of a picture is estimated from other pictures. Tracked corners are first checked against the poses. For given
+poses, the position of a point in another picture is linear in its inverse depth w (triangulation; Hartley and Zisserman
+2004, section 12.2). A corner therefore gives a least-squares w and a residual that no w removes. The residual is small
+if the poses are right.
 
-Consistency check between given camera poses and the observed image motion.
-
-For given poses, the position of a point in another picture is linear in its inverse depth w (triangulation; Hartley
-and Zisserman 2004, section 12.2). A tracked corner therefore gives a least-squares w and a residual that no w
-removes. The residual is small if the poses are right.
-
-Depth of one picture of a moving scope from other pictures with known poses.
-
-Tracked corners are first checked against the poses, which also gives the range of distances. That
-range is swept and regularised. Each pixel's confidence reflects how well and how
-uniquely the views match. Deforming or textureless tissue gets no confidence, and its depth is a smooth extrapolation.
+The corners also give the range of distances. A plane sweep (Collins 1996) over it gives matching costs, and semi-global
+matching (Hirschmüller 2008) selects distances. Each pixel's confidence reflects how well and how uniquely the views
+match. Deforming or textureless tissue gets no confidence, and its depth is a smooth extrapolation. Frames of a stream
+are compared with earlier key frames.
 """
 
 from __future__ import annotations
@@ -41,7 +36,7 @@ NOISE_GREY = 2.0
 contrast do not correlate.
 """
 DISAGREES = 0.5
-"""Cost of uncorrelated patches, also the upper bound, so that an occluded view cannot outvote the others."""
+"""Cost of uncorrelated patches and upper bound of any cost, so that an occluded view cannot outvote the other views."""
 AGREES = 0.2
 """Cost below which a view votes for a distance, corresponding to a correlation of 0.6."""
 
@@ -211,7 +206,7 @@ POSE_ERROR_PX = 0.6
 FEWEST_AGREEING = 0.6
 """Share of the views whose poses must explain their pictures."""
 CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
-"""Reason given if fewer views agree with their poses."""
+"""Rejection reason if fewer than `FEWEST_AGREEING` of the views agree with their poses."""
 ROUNDS = 6
 """Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving objects."""
 Array = NDArray[np.float64]
@@ -371,7 +366,7 @@ MOST_OWN_MOTION = 0.06
 this share and decreases linearly between the two.
 """
 DEFORMS = "the tissue moves too much relative to the scope for depth by parallax"
-"""Reason given if no pixel has confident depth."""
+"""Rejection reason if no pixel has confident depth."""
 FILLED = 0.2
 """Confidence of extrapolated depth."""
 
@@ -438,7 +433,7 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     costs = np.take_along_axis(cost, nearest, 2)[..., 0]
     agreeing = np.take_along_axis(votes, nearest, 2)[..., 0]
     confidence = np.minimum((WORST_COST - costs) / (WORST_COST - BEST_COST), unique / UNIQUE)
-    # The end labels also collect everything beyond the range.
+    # The first and last labels also collect all pixels beyond the swept range.
     inside = (nearest[..., 0] > 0) & (nearest[..., 0] < len(inverse_depths) - 1)
     confidence = np.clip(confidence, 0, 1) * float(np.clip(2 - 2 * found.own_motion / MOST_OWN_MOTION, 0, 1))
     confidence = confidence * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
@@ -502,7 +497,7 @@ class ParallaxDepth(Estimator):
     """Depth estimator by parallax for streams, with bounded memory and time per frame.
 
     Depth is estimated every `EVERY_S` and not for the frames between. A depth map is returned only if it agrees with
-    the previous one (`depth_agreement`). Frames without a pose, and cameras other than pinholes, get no depth.
+    the previous one (`agree`). Frames without a pose, and cameras other than pinholes, get no depth.
     """
 
     origin = PARALLAX
@@ -513,7 +508,7 @@ class ParallaxDepth(Estimator):
         self._kept: list[tuple[float, View]] = []
         self._found_s: float | None = None
         self._look: Look | None = None
-        """Depth map found at `_found_s`."""
+        """Depth map estimated at time `_found_s`."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""

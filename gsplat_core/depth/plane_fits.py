@@ -1,16 +1,15 @@
-"""Smooth surfaces by local plane fits: extrapolation into regions without depth, surfaces through scattered points, and reconstruction from stereo disparities.
+"""Smooth surfaces by local plane fits.
 
-Extrapolation of depth into regions without depth by fitted planes.
+Extrapolation into regions without depth (`filled_depth`) and surfaces through scattered points (`surface_through`) fit
+planes to inverse depth, which is linear in picture coordinates for a plane. `filled_depth` first fits one plane to all
+known inverse depths. It then fits local planes to the residual around each pixel, weighted by a wide and then a narrow
+Gaussian window.
 
-The inverse depth of a plane is linear in picture coordinates. One plane is fitted to all known inverse depths. Local
-planes are then fitted to the residual around each pixel, weighted by a wide and then a narrow Gaussian window.
-
-Surface reconstruction from stereo disparities by local planes and Wiener shrinkage of the residual.
-
-Errors of disparities are below a tenth of a pixel but correlated over about ten pixels. That is harmless for depth
-but tilts a surface by up to 10 degrees. Planes are therefore fitted in larger windows; the disparity of a plane is
-linear in picture coordinates. The residual, folds and edges, is kept by the share of its variance that exceeds the
-noise (James-Stein and Wiener estimators).
+Reconstruction from stereo disparities (`with_matched_surface`) shrinks the residual of local planes. Errors of
+disparities are below a tenth of a pixel but correlated over about ten pixels. That is harmless for depth but tilts a
+surface by up to 10 degrees. Planes are therefore fitted in larger windows; the disparity of a plane is linear in
+picture coordinates. The residual, folds and edges, is kept by the share of its variance that exceeds the noise
+(James-Stein and Wiener estimators).
 """
 
 from __future__ import annotations

@@ -1,19 +1,13 @@
 """Depth from stereo pairs, frame by frame.
 
-Semi-global matching followed by a local sub-pixel fit gives disparities. A pair is checked before its depth is used: range of disparities, alignment of
-rows, and a camera that agrees with the pictures.
+Disparity is x in the left picture minus x in the right picture, in pixels. Semi-global matching selects the disparity
+of each pixel in sixteenths of a pixel, which cluster around whole pixels. A local sub-pixel fit then moves each
+disparity to the best photometric agreement and estimates its standard deviation. Both steps are ops of
+`gsplat_core.ops` for CPU and CUDA. Tensors stay on their device, and the matching functions do not synchronise with it.
 
-Dense disparity of a rectified stereo pair by semi-global matching followed by a local sub-pixel fit.
-
-Disparity is x in the left picture minus x in the right picture, in pixels. Matching selects the surface of each pixel
-in sixteenths of a pixel, which cluster around whole pixels. The fit then moves each disparity to the best photometric
-agreement and estimates its standard deviation. Both steps are ops of `gsplat_core.ops` for CPU and CUDA. Tensors stay
-on their device, and no function here synchronises with it.
-
-Plausibility check of a stereo pair: disparity range, row alignment and reasons against a rectified pair.
-
-Corners of the left picture are searched in the right one, first along the row at low resolution over the whole
-disparity range, then with Lucas-Kanade optical flow in both directions at full size. In a rectified pair
+A pair is checked before its depth is used: range of disparities, alignment of rows, and a camera that agrees with the
+pictures. Corners of the left picture are searched in the right one, first along the row at low resolution over the
+whole disparity range, then with Lucas-Kanade optical flow in both directions at full size. In a rectified pair
 corresponding points are in the same row.
 """
 
@@ -163,7 +157,8 @@ BACK_PX = 0.5
 LEAST_POINTS = 24
 """Fewest points from which a pair is judged."""
 LEAST_SHARE = 0.2
-"""Share of the corners that must be found in the other eye, and share of the found ones that must fit the common rows.
+"""Smallest share of the corners that must be found in the other eye, and of the found corners that must fit the common
+row offset.
 """
 ROW_ERROR_PX = 1.5
 """Row error in pixels above which a point counts as wrongly matched."""
@@ -303,7 +298,7 @@ def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[
 
 
 LOOK_EVERY = 30
-"""Frames between two checks of the pair; eyes are rigid, but the distance of the tissue changes."""
+"""Frames between two checks of the pair. The eyes are rigid, but the distance of the tissue changes."""
 KEPT_LOOKS = 15
 """Number of checks whose row offsets are combined by their median."""
 MATCHED_WIDTH_PX = 800
@@ -499,9 +494,9 @@ def variance_px2(confidence: NDArray[np.float32], width_px: int, beside: float) 
     Args:
         confidence: float32 [H, W], above 0.
         width_px: width of the pictures.
-        beside: variance to add, in squared pixels of the matched pictures.
+        beside: additional variance, in squared pixels of the matched pictures.
 
-    Returns:
+    float32 [H, W] in squared pixels of pictures of `width_px`.
         float32 [H, W] in squared pixels of pictures of `width_px`.
     """
     own = HALF_BELIEVED_PX**2 * (1 / np.maximum(confidence, np.float32(1e-6)) - 1)

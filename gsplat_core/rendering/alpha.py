@@ -100,7 +100,7 @@ class AlphaRenderer:
             frames = made
             self._by_slot[slot.number] = key, frames
         if self._frames is not None and self._frames.gaussians.count == frames.gaussians.count:
-            # an overflow in one slot raises the capacity of all
+            # An overflow in one slot raises the capacity for all slots.
             frames.capacity = self._frames.capacity
         return frames
 
@@ -133,7 +133,7 @@ class _FrameInFlight:
 
     def outputs(self) -> Mapping[str, Tensor]:
         """See `PendingFrame.outputs`."""
-        with self._reading():  # longer tile lists may have to be tried
+        with self._reading():  # an overflowing frame is rendered again from the slot
             return _chosen(self._launched.result(), self._asked)
 
     def result(self) -> RenderOutput:

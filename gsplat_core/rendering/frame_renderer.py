@@ -1,13 +1,11 @@
 """Rendering of whole frames on an NVIDIA GPU as one CUDA graph without host synchronisation.
 
-`CapturedSequence` captures a sequence of launches and replays it as one launch. `TileListCapacity` bounds the tile lists. The host reads an overflow counter
-later and repeats a frame that needed longer lists.
-
-Capacity of a frame's tile lists, and detection of frames that exceed it.
+The graph deforms, projects, bins, sorts and blends. `CapturedSequence` captures a sequence of launches and replays it
+as one launch.
 
 An instance is a pair of a splat and a tile that it touches. A tile's list holds the instances that it blends.
-
-The graph deforms, projects, bins, sorts and blends.
+`TileListCapacity` bounds the lists. The host reads an overflow counter after the frame and repeats a frame that needed
+longer lists.
 """
 
 from __future__ import annotations
@@ -48,11 +46,11 @@ _CAPTURING = threading.Lock()
 class GraphMemory:
     """Memory pool for the captured graphs of one owner.
 
-    A graph that replaces an unused one takes over its memory.
+    A graph that replaces an unused graph takes over its memory.
     """
 
     def __init__(self, device: torch.device) -> None:
-        # torch frees a pool together with the last graph in it; this empty one keeps it.
+        # torch frees a pool together with the last graph in it. This empty graph keeps the pool alive.
         self._keeper = torch.cuda.CUDAGraph()
         _capture(self._keeper, lambda: torch.zeros(1, device=device), device, None)
 
@@ -68,8 +66,8 @@ class CapturedSequence(Generic[Result]):
     Allocations of the sequence keep their addresses. `results` are the same tensors at every replay, which overwrites
     them. Inputs that change between replays must be in device memory referenced by the sequence.
 
-    Kernels cannot be loaded during a capture. The sequence must have run before, or `warm_up` runs it once with all its
-    side effects.
+    CUDA cannot load kernels during a capture. The sequence must therefore have run before. `warm_up` runs it once, with
+    all its side effects.
     """
 
     def __init__(
@@ -92,12 +90,12 @@ def _capture(
     device: torch.device,
     pool: Any,
 ) -> Result:
-    # Not `torch.cuda.graph`, which collects garbage first: that takes longer than many frames.
+    # Not `torch.cuda.graph`, which runs the garbage collector first. That takes longer than many frames.
     with _CAPTURING:
         current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
         side.wait_stream(current)
         with torch.cuda.stream(side):
-            # thread_local lets other threads allocate
+            # thread_local lets other threads allocate memory during the capture.
             graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
                 results = sequence()
@@ -210,7 +208,7 @@ class FrameControls:
         self.rates = self._values[26:]
 
     def set(self, camera: Camera, time: float, rates: Sequence[float] = ()) -> None:
-        """Enqueue new values as arguments of one launch, so no host memory must stay unchanged."""
+        """Enqueue new values. They are passed as arguments of one launch, so the caller may reuse its memory at once."""
         values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time, *rates]
         store_scalars_(self._values, values)
 

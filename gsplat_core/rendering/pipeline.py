@@ -1,9 +1,7 @@
-"""`rasterization` with gsplat's arguments and results, for any implementation of the operations: project, colour, list by tile, blend.
+"""`rasterization` with gsplat's arguments and results, for any implementation of the operations.
 
-Rendering pipeline in four steps: project, colour, bin into tiles, blend.
-
-`rasterization()` and training run it with the compiled operations, tests with those in plain torch. On CUDA,
-`single_call.py` does the same in one native call.
+The pipeline has four steps: project, colour, bin into tiles, blend. `rasterization()` and training run it with the
+compiled operations, tests with those in plain torch. On CUDA, `single_call.py` does the same in one native call.
 """
 
 from __future__ import annotations
@@ -57,7 +55,7 @@ class Geometry(NamedTuple):
 
     means: Tensor
     covars: Tensor | None
-    """Upper triangles [..., N, 6]; None if the next two are given."""
+    """Upper triangles of the covariances [..., N, 6]; None if quaternions and scales are given."""
     quats: Tensor | None
     scales: Tensor | None
     opacities: Tensor
@@ -189,13 +187,13 @@ def view_colors(
     def shown(values: Tensor) -> Tensor:
         return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
 
-    # checked before clamping, which would turn minus infinity into black
+    # Check before clamping, which would turn minus infinity into black.
     values = evaluate(visible)
     if values.is_cuda and ops.zero_gradients_stay_zero:
         finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
         return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
-    # One cheap sum in the common case: a sum with a NaN or an infinity in it is not finite. A compiled graph cannot branch on a
-    # value, and always tests every colour.
+    # In the common case one sum suffices, because a sum is non-finite if any of its terms is. A compiled graph cannot
+    # branch on a value and always tests every colour.
     if torch.compiler.is_compiling() or not torch.isfinite(values.detach().sum()):
         finite = values.detach().isfinite().all(-1)
         visible = visible & finite

@@ -33,7 +33,8 @@ class Constants(NamedTuple):
     compensation_floor: float
     """Lower limit of the antialiasing compensation, without gradient where active.
 
-    gsplat 1.5.3 has a gradient at 0, but there Gaussians below 1/255 are culled before.
+    gsplat 1.5.3 has a gradient at 0, but culls Gaussians with an opacity below 1/255 before it applies the
+    compensation.
     """
 
 

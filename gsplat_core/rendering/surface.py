@@ -1,16 +1,11 @@
 """Surface seen by a camera: depth along each ray, normal and confidence.
 
-Each splat is a small piece of surface with a normal and a depth along the ray through a pixel. The pieces are blended with the weights of the picture, in
-plain torch.
+Each splat is a planar surface element with a normal and a depth along each ray. The density of a Gaussian along a ray
+is highest at the conditional mean of z, not at its centre's z. To first order this is affine in the pixel (Zhang et al.
+2024, "RaDe-GS", section 3): z(u) = z_centre + slope · (u - u_centre).
 
-Splats as planar surface elements with a normal and a depth along each ray.
-
-The density of a Gaussian along a ray is highest at the conditional mean of z, not at its centre's z. To first order
-this is affine in the pixel (Zhang et al. 2024, "RaDe-GS", section 3): z(u) = z_centre + slope · (u - u_centre).
-
-Per-ray blending statistics in plain torch, tile by tile, with the same blending as the picture.
-
-About a hundred times slower than the compiled blending, which keeps only sums. A median needs the sorted order.
+The elements are blended in plain torch, tile by tile, with the blending weights of the picture. This is about a hundred
+times slower than the compiled blending, which keeps only sums. A median needs the sorted order of the splats.
 """
 
 from __future__ import annotations
@@ -266,7 +261,7 @@ SURFACE_OUTPUTS = tuple(name for name in Surface._fields if name != "alpha")
 def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None = None) -> Surface:
     """Render the surface seen by `camera`, float32 on the Gaussians' device.
 
-    Much slower than a picture; see `tile_blending`.
+    Much slower than a picture (see the module docstring).
 
     Args:
         gaussians: Gaussians at one time.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsplat_core.errors import InvalidInput
 
-# Imported lazily: a process that only reads frames needs no torch and starts three times as fast.
+# Imported lazily, because a process that only reads frames needs no torch and then starts three times as fast.
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
@@ -73,7 +73,7 @@ class Camera:
     def from_focal(
         cls, focal_px: float, width_px: int, height_px: int, world_to_camera: ArrayLike | None = None
     ) -> Camera:
-        """A pinhole with square pixels and its principal point in the middle of the image."""
+        """Return a pinhole camera with square pixels and its principal point in the middle of the image."""
         K = np.array([[focal_px, 0, width_px / 2], [0, focal_px, height_px / 2], [0, 0, 1]])
         pose = np.eye(4) if world_to_camera is None else np.asarray(world_to_camera, dtype=np.float64)
         return cls(K, width_px, height_px, pose)
@@ -99,7 +99,7 @@ class Camera:
         """
         import torch
 
-        # One copy for both. CUDA copies so few bytes immediately, so the source may be freed.
+        # Copy both in one transfer. CUDA copies so few bytes immediately, so the source may be freed.
         values = np.concatenate([self.world_to_camera.ravel(), self.K.ravel()])
         both = torch.tensor(values, dtype=dtype or torch.float32)
         both = both.to(device, non_blocking=True)

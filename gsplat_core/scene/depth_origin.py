@@ -30,15 +30,17 @@ class DepthOrigin:
     is_recorded: bool = False
     """True for depth supplied with a frame, False for depth estimated from pictures."""
     initialises_only: bool = False
-    """Place a scene, but neither train on the depth nor correct the scene by it. For estimators whose scale changes
-    from frame to frame.
+    """True if the depth places a new scene, but is neither trained on nor used to correct the scene. For estimators
+    whose scale changes from frame to frame.
     """
     is_of_still_tissue: bool = False
-    """Estimated for tissue at rest: later depth corrects the scene at all times. Otherwise it corrects the frame's time."""
+    """True if the depth assumes static tissue. It then corrects the scene at all times, otherwise only at its frame's
+    time.
+    """
     loss_weight_online: float = 1.0
     """Factor of `ReconstructorConfig.depth_weight` in training frame by frame, for a scene that starts from this depth."""
     loss_weight_offline: float = 1.0
-    """The same factor in training on a complete recording."""
+    """Factor of `ReconstructorConfig.depth_weight` in training on a complete recording that starts from this depth."""
     right_share_offline: float | None = None
     """`LearningRates.right_share` in training on a complete recording. None keeps the setting, which lets colour
     differences between the eyes move Gaussians.
@@ -50,8 +52,8 @@ class DepthOrigin:
     tool_margin_px: int = 0
     """Margin around tools within which the depth may belong to the tool."""
     surface: str | None = None
-    """Import path of a function (frame, camera) -> frame that replaces the depth by a smooth surface before training on a
-    complete recording.
+    """Import path of a function (frame, camera) -> frame, called before training on a complete recording. The function
+    replaces the depth by a smooth surface.
     """
 
     def is_metric(self, eyes_calibrated: bool) -> bool:
@@ -59,9 +61,9 @@ class DepthOrigin:
         return self.scale == "metric" or (self.scale == "calibrated" and eyes_calibrated)
 
 
-# The loss weights of measured depth are a compromise. Lower values let colours move Gaussians along the line of sight by
-# more than the depth's error. Higher values leave less of a frame's few steps to its picture. Colours would also roughen
-# the surface that stereo depth is fitted by offline.
+# The loss weights of measured depth are a compromise. With lower values, colour errors move Gaussians along the line of
+# sight by more than the depth's error. Higher values leave less of a frame's few steps to its picture. Offline, colour
+# errors would also roughen the surface fitted to stereo depth.
 MEASURED = DepthOrigin(
     "measured", 0.005, "metric", is_recorded=True, loss_weight_online=3.0, loss_weight_offline=10.0
 )  # fmt: skip
@@ -76,8 +78,8 @@ LEARNED = DepthOrigin("learned", 0.2, initialises_only=True)
 DEPTH_ORIGINS: Registry[DepthOrigin] = Registry(
     "depth origin", {origin.name: origin for origin in (MEASURED, STEREO, PARALLAX, LIGHT, LEARNED)}
 )
-"""Depth sensor or depth of the recording; matching between the eyes; matching across times in the unit of the poses; shading
-of the scope's light; prediction of a network.
+"""Depth origins, in this order: sensor or recording; matching between the eyes; matching across times, in the unit of
+the poses; shading of the scope's light; prediction of a network.
 """
 RELATIVE_DISTANCE = 60.0
 """Mean distance of depth whose scale is unknown, in arbitrary units."""

@@ -29,7 +29,8 @@ class DepthSource:
 
     @staticmethod
     def after(source: DepthSource | None, frame: Frame) -> DepthSource | None:
-        """Return the depth source after another frame; one non-metric frame makes the whole non-metric.
+        """Return the depth source after another frame. Depth without a metric scale in any frame makes the model
+        non-metric.
 
         A scene initialised on a plane never becomes metric.
         """

@@ -22,12 +22,12 @@ class FrameStatus(Enum):
     REPLAY = "replay"
     STALE = "stale"
     DAMAGED = "damaged"
-    """Parts may be the decoder's guess. The frame is displayed, but neither trained on nor scored."""
+    """Picture that may contain the decoder's error concealment. It is displayed, but neither trained on nor scored."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame; operators replace it by copies with further fields and never modify it."""
+    """Video frame with its sensor data. Operators replace frames by changed copies and never modify them."""
 
     seq: int
     """Sequence number in the stream, from 0. Increases strictly; lost frames leave gaps."""

@@ -1,9 +1,8 @@
-"""Set of 3D Gaussians in the raw parametrisation that is optimised, and the layout of the rows [N, 16] that hold changes of it.
-
-Layout of the raw-parameter rows [N, 16] that hold deformation deltas and their gradients.
+"""Set of 3D Gaussians in the raw parametrisation that is optimised, and the layout of rows [N, 16] of raw parameters.
 
 Raw parameters are those that the optimiser changes: log-scales, opacity logits, and the coefficient of the constant
-spherical harmonic as colour. `gsplat_core/native/raw_layout.h` defines the same numbers for the kernels.
+spherical harmonic as colour. Rows [N, 16] hold deformation deltas and their gradients.
+`gsplat_core/native/raw_layout.h` defines the same layout for the kernels.
 """
 
 from __future__ import annotations
@@ -86,8 +85,8 @@ class Gaussians:
     @property
     def opacities(self) -> Tensor:
         """Opacities [N] in 0..1."""
-        # torch.sigmoid rounds differently at the ends of each thread's share. The equivalent tanh
-        # form does not.
+        # torch.sigmoid rounds differently at the ends of each thread's part of the tensor. The equivalent
+        # tanh form does not.
         return 0.5 + 0.5 * torch.tanh(0.5 * self.logit_opacities)
 
     @property
