@@ -1,10 +1,10 @@
-// The gradient of compositing, back to front from the saved transmittance.
+// Gradient of compositing, traversed back to front from the saved transmittance.
 //
-// With w_i = alpha_i T_i the weight of splat i and g_i = <dL/dcolour, c_i> at a pixel,
-//   dL/dalpha_i = T_i g_i - (sum of w_j g_j behind i, the background's included) / (1 - alpha_i),
-// so one running sum per pixel serves all channels. Over the pixels only moments of s = alpha dL/dalpha are summed; from these
-// the gradients of mean, conic and opacity are computed once per splat. Every instance (a splat in a tile) has a gradient row of
-// its own, and the rows of a splat are summed in a fixed order: no atomics, the same bits for any number of threads.
+// With w_i = alpha_i T_i the weight of splat i and g_i = <dL/dcolour, c_i> at a pixel, dL/dalpha_i = T_i g_i - (sum of
+// w_j g_j behind i, including the background) / (1 - alpha_i). One running sum per pixel therefore serves all channels.
+// Only moments of s = alpha dL/dalpha are summed over pixels; the gradients of mean, conic and opacity follow from them
+// once per splat. Every instance (a splat in a tile) has its own gradient row, and a splat's rows are summed in a fixed
+// order without atomics. The result is bitwise identical for any number of threads.
 #include "blocks.h"
 
 namespace GSPLAT_ISA::compositing {
@@ -13,15 +13,15 @@ namespace {
 
 constexpr float kLn2 = 0.69314718f;
 
-// A window's pixels, block by block.
+// State of a window's pixels, ordered block by block.
 struct Window {
-  float* through;  // transmittance in front of the splats seen so far (from the back)
-  float* behind;   // sum of w g of what is behind
+  float* through;  // transmittance in front of the splats visited so far (from the back)
+  float* behind;   // sum of w g of the splats behind
   int32_t* last;
   float* v_colors;  // [channels][kPixels]
 };
 
-// One splat over its blocks; adds its moments, colours and absolute gradients up in `sum`.
+// Process one splat over its blocks; add its moments, colours and absolute gradients to `sum`.
 template <int D, bool kAbs>
 GSPLAT_INLINE void splat_backward(const Splats& in, int32_t id, int64_t position, uint64_t blocks, vfloat block_x, vfloat block_y,
                                   const Window& w, vfloat* sum, vfloat* color_sum) {
@@ -81,7 +81,7 @@ void window_backward(const Splats& in, const Tile& tile, int x0, int y0, int64_t
   alignas(64) int32_t last[kPixels];
   alignas(64) float own_v_colors[D > 0 ? D * kPixels : 1];
   const Window w = {through, behind, last, D > 0 ? own_v_colors : scratch};
-  vfloat* const far_sums = (vfloat*)(scratch + channels * kPixels);  // of colours, when D is 0
+  vfloat* const far_sums = (vfloat*)(scratch + channels * kPixels);  // of the colours, if D is 0
   float* const far_row = scratch + channels * (kPixels + kLanes);
 
   const float* const background = in.backgrounds != nullptr ? in.backgrounds + tile.image * channels : nullptr;
@@ -142,7 +142,7 @@ void window_backward(const Splats& in, const Tile& tile, int x0, int y0, int64_t
     prefetch_records(in, ahead, kLanes);
     for (int64_t i = ahead; i < ahead + kLanes && i < tile.end; ++i)
       __builtin_prefetch(out.rows + int64_t(out.row_of[i]) * out.row_size, 1);
-    constexpr int kHalves = (kBlocks + 31) / 32;  // a splat's set of blocks, 32 to an int
+    constexpr int kHalves = (kBlocks + 31) / 32;  // bit set of a splat's blocks, 32 per int
     alignas(64) uint32_t touched[kHalves][kLanes] = {};
     if (first <= furthest) {
       vint sets[kHalves] = {};
@@ -200,7 +200,7 @@ void tile_backward(const Splats& in, int64_t index, const PictureGradient& from,
   for (int y = tile.y; y < tile.bottom; y += kWindow)
     for (int x = tile.x; x < tile.right; x += kWindow, add = true)
       window_backward<D, kAbs>(in, tile, x, y, index, add, from, out, scratch);
-  if (!add) {  // a tile outside of the image, whose instances reach no pixel
+  if (!add) {  // tile outside of the image: its instances reach no pixel
     for (int64_t position = tile.begin; position < tile.end; ++position)
       for (int64_t r = 0; r < out.row_size; ++r) out.rows[out.row_of[position] * out.row_size + r] = 0;
   }

@@ -1,5 +1,5 @@
-// What the forward and the backward kernel of the CPU share: the blocks of a window, which of them a splat touches, its alpha
-// there.
+// Shared by the forward and the backward CPU kernels: the blocks of a window, the blocks that a splat touches, and its
+// alpha in a block.
 #pragma once
 
 #include "compositing.h"
@@ -34,7 +34,7 @@ GSPLAT_INLINE int place(int x, int y) {
   return (y / kBlockHeight * kColumns + x / kBlockWidth) * kLanes + y % kBlockHeight * kBlockWidth + x % kBlockWidth;
 }
 
-// Four horizontally adjacent pixels, which are contiguous in a block too.
+// Four horizontally adjacent pixels; also contiguous in a block.
 typedef float quad __attribute__((vector_size(16)));
 GSPLAT_INLINE quad load_quad(const float* p) {
   quad v;
@@ -43,7 +43,7 @@ GSPLAT_INLINE quad load_quad(const float* p) {
 }
 GSPLAT_INLINE void store_quad(float* p, quad v) { __builtin_memcpy(p, &v, sizeof(v)); }
 
-// Transposes 4x4: 4 pixels of 4 channels from 4 channels of 4 pixels, and back.
+// Transpose 4x4 values between 4 channels of 4 pixels and 4 pixels of 4 channels.
 GSPLAT_INLINE void transpose(quad& a, quad& b, quad& c, quad& d) {
   const quad ab_low = __builtin_shufflevector(a, b, 0, 4, 1, 5), ab_high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
   const quad cd_low = __builtin_shufflevector(c, d, 0, 4, 1, 5), cd_high = __builtin_shufflevector(c, d, 2, 6, 3, 7);
@@ -53,7 +53,7 @@ GSPLAT_INLINE void transpose(quad& a, quad& b, quad& c, quad& d) {
   d = __builtin_shufflevector(ab_high, cd_high, 2, 3, 6, 7);
 }
 
-// Offsets of a block's pixels from its first.
+// Offsets of a block's pixels from its first pixel.
 GSPLAT_INLINE vfloat lane_x() {
   vfloat v;
   for (int i = 0; i < kLanes; ++i) v[i] = float(i % kBlockWidth);
@@ -79,11 +79,11 @@ GSPLAT_INLINE Falloff falloff(const SplatRecord& record, vfloat x, vfloat y) {
   return f;
 }
 
-// Tests kLanes splats, one per lane, against every block of the window whose first pixel centre is (x, y):
-// on_block(block, the lanes whose ellipse may reach a pixel of it).
+// Test kLanes splats, one per lane, against every block of the window whose first pixel centre is (x, y). Calls
+// on_block(block, mask of the lanes whose ellipse may reach a pixel of the block).
 //
-// The part of an ellipse in a strip of pixel rows reaches in x from the left to the right solution of
-// a dx^2 + 2 b dx dy + c dy^2 = k at the dy of the strip that is nearest to the outermost point.
+// Within a strip of pixel rows an ellipse extends in x from the left to the right solution of a dx^2 + 2 b dx dy + c
+// dy^2 = k at the dy of the strip nearest to the outermost point.
 template <class OnBlock>
 GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, int count, float x, float y,
                                const OnBlock& on_block) {
@@ -99,10 +99,10 @@ GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, i
   }
   const vfloat zero = {}, ux = load(fields[0]) - x, uy = load(fields[1]) - y;
   const vfloat a = -load(fields[2]), b = load(fields[3]) * -0.5f, c = -load(fields[4]);
-  const vfloat k = load(fields[5]) + (2e-3f - kLog2AlphaCutoff);  // slightly outside of the contour, against rounding
+  const vfloat k = load(fields[5]) + (2e-3f - kLog2AlphaCutoff);  // slightly larger than the contour, to allow for rounding
   const vfloat ac = a * c, det = fma(-b, b, ac) - ac * 5e-7f;
   const vmask reaches = at_least(k, zero);
-  // A conic that is not a proper ellipse in float32 is tested pixel by pixel.
+  // Where the conic is not a proper ellipse in float32, test pixel by pixel.
   const vfloat proper_det = det - ac * 1e-6f;
   const vmask proper = above(a, zero) & above(c, zero) & above(proper_det, zero);
   const vfloat inverse = 1.0f / a;
@@ -124,16 +124,16 @@ GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, i
   }
 }
 
-// Records are scattered in memory: they are prefetched while others are blended.
+// Prefetch scattered records while earlier ones are blended.
 GSPLAT_INLINE void prefetch_records(const Splats& in, int64_t first, int count) {
   const int64_t end = first + count < in.instances ? first + count : in.instances;
   for (int64_t i = first < 0 ? 0 : first; i < end; ++i) __builtin_prefetch(in.records + in.flatten_ids[i]);
 }
 
-// One tile as the kernels see it.
+// A tile's image, range of instances and pixel bounds.
 struct Tile {
-  int64_t image, begin, end;  // its instances
-  int x, y, right, bottom;    // its pixels
+  int64_t image, begin, end;  // range of instances
+  int x, y, right, bottom;    // first pixel, and one past the last
   bool masked;
 };
 GSPLAT_INLINE Tile tile_of(const Splats& in, int64_t tile) {

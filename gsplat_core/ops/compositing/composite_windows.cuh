@@ -44,17 +44,18 @@ Record<D>* records_of(const Inputs& in, CudaScratch& scratch, cudaStream_t strea
   return records;
 }
 
-// The lists come from the caller: an index out of range is read as a splat that reaches no pixel.
+// Record of the splat at a list position. The lists are caller input: an index out of range is read as a splat that
+// reaches no pixel.
 template <int D>
 __device__ inline Record<D> record_at(const Inputs& in, const Record<D>* records, int position) {
   const int id = in.flatten_ids[position];
   return uint32_t(id) < uint64_t(in.count) ? records[id] : faint_record<D>();
 }
 
-// Which window of which tile and image this block composites.
+// Window, tile and image that this block composites.
 struct Place {
   int64_t tile, image;
-  int side, part;  // windows on a side of a tile, and which of them
+  int side, part;  // windows per tile side, and the index of the block's window
 
   __device__ explicit Place(const Inputs& in) {
     side = (in.tile_size + kWindow - 1) / kWindow;
@@ -78,7 +79,7 @@ struct Place {
   __device__ static int64_t clamp(int64_t value, int64_t most) { return value < 0 ? 0 : value > most ? most : value; }
 };
 
-// run(number of channels as a constant); 0 stands for numbers that are not compiled.
+// Call run with the number of channels as a constant; 0 for numbers without a compiled specialisation.
 template <class Run>
 void with_channels(int channels, const Run& run) {
   switch (channels) {

@@ -1,16 +1,16 @@
-// The gradient of compositing, back to front from the saved transmittance.
+// Gradient of compositing, traversed back to front from the saved transmittance.
 //
-// Every instance (a splat in a window) has a gradient row of its own, the sum over the window's pixels in a fixed order; the rows
-// of a splat are summed in the order of the lists. No atomics, so results are bitwise reproducible.
+// Every instance (a splat in a window) has its own gradient row, the sum over the window's pixels in a fixed order. A
+// splat's rows are summed in list order. There are no atomics, so results are bitwise reproducible.
 #include "gather_rows.cuh"
 
 namespace gsplat::compositing {
 namespace {
 
-constexpr int kValues = 16;  // values that a warp sums at once
+constexpr int kValues = 16;  // values that a warp sums per pass
 
-// Sums 2 kHalf values over groups of 4 kHalf lanes with one shuffle per value: a lane hands over half of its values, then half of
-// the rest. For 16 values lane i of the warp returns the sum of value i / 2.
+// Sum 2 kHalf values over groups of 4 kHalf lanes with one shuffle per value: a lane sends half of its values, then
+// half of the remaining ones. For 16 values lane i of the warp returns the sum of value i / 2.
 template <int kHalf>
 __device__ inline float warp_sums(float* v, int lane) {
   if constexpr (kHalf == 0) {
@@ -37,7 +37,7 @@ __device__ inline float block_sum(float value) {
   return sum;
 }
 
-// Reads the window's pixels; sums the gradient of the background.
+// Read the window's pixels, and sum the gradient of the background.
 __device__ inline void start_pixels(const Inputs& in, const PictureGradient& from, const Place& place, const Window& w,
                                     Pixel (&pixels)[kPixelsEach], float* background_parts) {
   const float* const background = in.backgrounds != nullptr ? in.backgrounds + place.image * in.channels : nullptr;
@@ -62,7 +62,7 @@ __device__ inline void start_pixels(const Inputs& in, const PictureGradient& fro
   for (int p = 0; p < kPixelsEach; ++p) pixels[p].through = left[p], pixels[p].behind = left[p] * v_left[p];
 }
 
-// The row of an instance in this block's window, among those of all windows of its tile.
+// Return the row of an instance in this block's window, among the rows of all windows of its tile.
 __device__ inline int64_t row_of(const Inputs& in, int64_t position) {
   const int side = (in.tile_size + kWindow - 1) / kWindow, windows = side * side;
   return position * windows + blockIdx.x % windows;
@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(kBlockThreads, 5)
   blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, v_color, row, stage, in.alpha);
 }
 
-// What a splat's gradient needs of a pixel.
+// A pixel's values that a splat's gradient depends on.
 struct Blend {
   float alpha, through, widen, weight;
 };
@@ -97,7 +97,7 @@ __device__ inline Blend blend(const Pixel& pixel, float power, const AlphaLimit&
   return b;
 }
 
-// Adds a pixel's part of the moments and advances the pixel to in front of the splat.
+// Add a pixel's contribution to the moments, and advance the pixel to in front of the splat.
 template <bool kAbs, int D>
 __device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, const AlphaLimit& limit,
                                    Pixel& pixel, float* v) {
@@ -118,7 +118,7 @@ __device__ inline void add_moments(const Record<D>& r, const Falloff& f, const B
   }
 }
 
-// Any number of channels: the whole block processes one splat at a time, and 16 values of its row at a time.
+// For any number of channels: the whole block processes one splat at a time, and 16 values of its row at a time.
 template <bool kAbs>
 __global__ void __launch_bounds__(kBlockThreads)
     backward_windows_of_any(Inputs in, const Record<0>* records, PictureGradient from, float4* rows, float* background_parts) {

@@ -31,13 +31,13 @@ __global__ void __launch_bounds__(kBlockThreads, 8) composite_windows(Inputs in,
   __shared__ ForwardStage<D> stage;
   const Place place(in);
   Window w = place.window(in);
-  if (in.masks != nullptr && !in.masks[place.tile]) w.end = w.begin;  // nothing but the background
+  if (in.masks != nullptr && !in.masks[place.tile]) w.end = w.begin;  // a masked tile shows only the background
   const auto fetch = [&](int position) { return record_at(in, records, position); };
   BlendedPixels<D> blended = blend_forward<D, true>(w, fetch, stage, in.alpha);
   write_pixels<D>(in, place, w, blended, out);
 }
 
-// Any number of channels: the sums are in the image.
+// For any number of channels: the sums are accumulated in the image.
 __global__ void __launch_bounds__(kBlockThreads) composite_windows_of_any(Inputs in, const Record<0>* records, Pixels out) {
   __shared__ Record<0> staged[kBlockThreads];
   __shared__ int staged_ids[kBlockThreads];

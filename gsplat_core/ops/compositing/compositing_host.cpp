@@ -1,4 +1,4 @@
-// composite and composite_backward: checks, memory, and how each device runs them.
+// Host code of composite and composite_backward: checks, memory, and the launch on each device.
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -19,11 +19,11 @@ constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
 AlphaLimit limit_of(double max_alpha) {
   check(max_alpha >= kAlphaCutoff && max_alpha < 1, "composite: max_alpha must be from 1/255 to below 1, found ", max_alpha);
   const float most = float(max_alpha);
-  // The constant's last bit is not that of the rounded logarithm.
+  // kMaxAlpha uses the constant: its last bit differs from that of the rounded logarithm.
   return most == kMaxAlpha ? AlphaLimit{} : AlphaLimit{most, float(std::log2(max_alpha))};
 }
 
-// The inputs of either pass, checked; the tensors keep the memory alive that `in` points to.
+// Checked inputs of either pass. The tensors own the memory that `in` points to.
 struct Arguments {
   Tensor means2d, conics, colors, opacities, offsets, flatten_ids;
   OptionalTensor backgrounds, masks;
@@ -73,8 +73,8 @@ struct Arguments {
 
 #if defined(GSPLAT_CUDA)
 
-// Unlike on the CPU the values of the lists are not checked here, for that would make the host wait: the kernels clamp positions
-// outside of flatten_ids and skip indices that are no splat's.
+// CUDA does not check the values of the lists, because the host would have to wait. The kernels clamp positions outside
+// of flatten_ids and skip out-of-range splat indices.
 void check_sizes(const Inputs& in) {
   check(in.count < kMaxInts && in.instances <= kMaxInts && in.tiles() * in.windows() <= kMaxInts,
         "composite: more than 2^31 - 1 splats, instances or windows of 16x16 pixels");
@@ -96,10 +96,10 @@ struct alignas(64) Line {
   float floats[16];
 };
 
-// What is in front of the first tile's list is unused: lists of a fixed capacity are filled from the end.
+// Position of the first tile's list. Earlier entries are unused: lists of a fixed capacity are filled from the end.
 int64_t first_listed(const Inputs& in) { return in.tiles() > 0 ? in.offsets[0] : in.instances; }
 
-// The lists come from the caller, and a wrong index would read foreign memory.
+// Validate the caller's lists; an out-of-range index would read outside of the tensors.
 void check_lists(const Inputs& in) {
   int32_t before = 0;
   bool ordered = true;
@@ -110,7 +110,7 @@ void check_lists(const Inputs& in) {
   check(first_listed(in) == in.instances || most < in.count, "flatten_ids must be in [0, ", in.count, "), found ", int32_t(most));
 }
 
-// The record of every splat, and work over all tiles.
+// Records of all splats, and a parallel loop over all tiles.
 struct Pass {
   std::unique_ptr<SplatRecord[]> records;
   Splats splats;
@@ -123,7 +123,7 @@ struct Pass {
                                 [&](int64_t begin, int64_t end) { kernels().records(in, begin, end, records.get()); });
   }
 
-  // run(tile, scratch) for all tiles: threads take the next free one, and no result depends on which takes which.
+  // Call run(tile, scratch) for all tiles. Threads take the next free tiles; no result depends on the assignment.
   template <class Run>
   void for_tiles(const Run& run) const {
     constexpr int64_t kRun = 4;
@@ -133,7 +133,7 @@ struct Pass {
     const int64_t scratch = kernels().scratch_floats(splats.channels);
     torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
       const auto lines = uninitialised<Line>(scratch / 16 + 1);
-      // A few adjacent tiles at a time: they share splats, and the next tile's are being prefetched.
+      // Take a few adjacent tiles at a time: they share splats, and the next tile's records are prefetched.
       for (int64_t first; (first = next.fetch_add(kRun, std::memory_order_relaxed)) < tiles;)
         for (int64_t tile = first; tile < std::min(first + kRun, tiles); ++tile) run(tile, lines[0].floats);
     });
@@ -147,7 +147,7 @@ void forward(Call&, const Inputs& in, const Pixels& out) {
 
 void backward(Call&, const Inputs& in, const PictureGradient& from, const InputGradients& out) {
   const Pass pass(in);
-  // A row for every instance; those of one splat are contiguous, in the order of the lists.
+  // One row per instance; the rows of a splat are contiguous and in list order.
   auto first = uninitialised<int32_t>(in.count + 1), row_of = uninitialised<int32_t>(in.instances);
   const int64_t unused = first_listed(in), listed = in.instances - unused, channels = in.channels;
   const int32_t* const ids = in.flatten_ids + unused;

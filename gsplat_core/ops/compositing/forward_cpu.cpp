@@ -1,4 +1,4 @@
-// Records of the splats, and blending front to back.
+// Splat records, and front-to-back blending.
 #include "blocks.h"
 
 namespace GSPLAT_ISA::compositing {
@@ -8,10 +8,10 @@ namespace {
 constexpr float kLog2E = 1.44269504f;
 constexpr int kBatch = 64;  // splats per pass over the blocks: one bit each in a block's 64-bit mask
 
-// The state of a window's pixels between batches, block by block. D channels, or `channels` of them when D is 0.
+// State of a window's pixels between batches, block by block. It has D channels, or `channels` if D is 0.
 struct Window {
-  float* through;  // transmittance behind the splats so far, also past the stop
-  float* kept;     // the same, but from the last splat that was blended
+  float* through;  // transmittance after all splats so far, including those after termination
+  float* kept;     // transmittance after the last blended splat
   int32_t* last;
   float* colors;  // [channels][kPixels]
 };
@@ -32,7 +32,7 @@ void blend_block(const Splats& in, const int32_t* ids, int64_t position, uint64_
     const vmask valid = at_least(power, splat(kLog2AlphaCutoff)) & at_least(splat(record.cap), power);
     const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(in.alpha.log2_most))));
     const vfloat next = fma(-alpha, through, through);
-    // Past the stop the transmittance only falls, so this test alone ends a pixel for good.
+    // After termination the transmittance only decreases, so this test keeps a terminated pixel closed.
     const vmask open = above(next, splat(kMinTransmittance));
     const vfloat weight = zero_unless(open, alpha * through);
     if constexpr (D > 0) {
@@ -132,7 +132,7 @@ void blend_window(const Splats& in, const Tile& tile, int x0, int y0, const Pixe
 
 template <int D>
 void blend_tile(const Splats& in, Tile tile, const Pixels& out, float* scratch) {
-  if (tile.masked) tile.end = tile.begin;  // nothing but the background
+  if (tile.masked) tile.end = tile.begin;  // a masked tile shows only the background
   for (int y = tile.y; y < tile.bottom; y += kWindow)
     for (int x = tile.x; x < tile.right; x += kWindow) blend_window<D>(in, tile, x, y, out, scratch);
 }
@@ -152,7 +152,7 @@ void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* rec
       const float *mean = in.means2d + 2 * splat, *conic = in.conics + 3 * splat, *color = in.colors + channels * splat;
       SplatRecord& r = records[splat];
       const float a = conic[0], b = conic[1], c = conic[2];
-      // Zero times a value that is not finite is NaN.
+      // NaN if any value is not finite.
       float check = 0 * mean[0] + 0 * mean[1] + 0 * a + 0 * b + 0 * c + 0 * in.opacities[splat];
       for (int d = 0; d < channels; ++d) check += 0 * color[d];
       const bool usable = check == 0;
@@ -171,7 +171,8 @@ void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* rec
   }
 }
 
-// Colours (forward) or their gradients (backward) of a window; then, in the backward pass, a splat's sums by lane and in all.
+// Colours (forward) or their gradients (backward) of a window, followed in the backward pass by a splat's sums per lane
+// and in total.
 int64_t scratch_floats(int channels) { return int64_t(channels) * (kPixels + kLanes + 1); }
 
 void composite_tile(const Splats& in, int64_t tile, const Pixels& out, float* scratch) {

@@ -1,4 +1,4 @@
-// The gradient rows of the instances, summed by splat in the order of the lists, and turned into gradients.
+// Sums of the instances' gradient rows per splat, in list order, converted to gradients.
 #pragma once
 
 #include "../blending/blend_backward.cuh"
@@ -17,7 +17,8 @@ __global__ void number_instances(Inputs in, uint32_t* splats, uint32_t* position
   positions[i] = uint32_t(i);
 }
 
-// The range [x, y) of each splat among the instances sorted by splat; `ranges` was zeroed, for splats without any.
+// Write the range [x, y) of each splat among the instances sorted by splat. `ranges` must be zeroed, for splats without
+// instances.
 __global__ void ranges_of_splats(Inputs in, const uint32_t* sorted, uint2* ranges) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.instances || sorted[i] >= in.count) return;
@@ -33,8 +34,8 @@ __device__ inline float4 from_lane_xor(const float4& v, int mask) {
                      __shfl_xor_sync(kAll, v.w, mask));
 }
 
-// Sums the rows of each splat and turns the sums into gradients: four lanes per splat, each a float4 of the row at a time. A
-// splat with very many rows is summed by the whole warp, in an order that depends on their number alone.
+// Sum the rows of each splat and convert the sums to gradients. Four lanes process a splat, one float4 of the row each.
+// The whole warp sums a splat with very many rows; the order of additions depends only on their number.
 template <int D>
 __global__ void gather_rows(Inputs in, const Record<D>* records, const uint32_t* positions, const uint2* ranges,
                             const float4* rows, int windows, int shape, InputGradients out) {
@@ -90,7 +91,7 @@ __global__ void gather_rows(Inputs in, const Record<D>* records, const uint32_t*
   }
 }
 
-// The instances of each splat: their positions, sorted by splat, and where each splat's start and end.
+// Positions of the instances sorted by splat, and the range of each splat.
 struct Instances {
   const uint32_t* positions;
   const uint2* ranges;

@@ -23,7 +23,7 @@ __global__ void __launch_bounds__(kThreads) forward(const float* __restrict__ qu
   }
 }
 
-// The gradient as a symmetric matrix: of two equal elements each gets half of what both get.
+// Return the gradient as a symmetric matrix: each of two equal off-diagonal elements receives half of their sum.
 __device__ Symmetric3 symmetric(const float* v, bool triu, int64_t i) {
   if (triu) {
     v += 6 * i;

@@ -8,16 +8,16 @@
 
 namespace gsplat::covariance {
 
-// CPU: rows `begin` to `end` - 1.
+// CPU kernels for rows `begin` to `end` - 1.
 struct Kernels {
-  // R S^p S^p R^T with p = 1, or -1 when `inverse`; rows of 6 (upper triangle) or 9 floats.
+  // Computes R S^p S^p R^T with p = 1, or p = -1 if `inverse`, as rows of 6 (upper triangle) or 9 floats.
   void (*forward)(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t begin, int64_t end);
-  // Either gradient may be null.
+  // Either output may be null.
   void (*backward)(const float* quats, const float* scales, const float* v_covars, const float* v_precis, bool triu,
                    float* v_quats, float* v_scales, int64_t begin, int64_t end);
 };
 
-// CUDA: the same of all rows, in device memory.
+// CUDA versions for all rows, in device memory.
 void covariance_forward(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t count,
                         cudaStream_t stream);
 void covariance_backward(const float* quats, const float* scales, const float* v_covars, const float* v_precis, bool triu,

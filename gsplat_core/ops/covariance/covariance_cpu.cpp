@@ -23,7 +23,7 @@ static void forward(const float* quats, const float* scales, float* out, bool in
   }
 }
 
-// The gradient as a symmetric matrix: of two equal elements each gets half of what both get.
+// Return the gradient as a symmetric matrix: each of two equal off-diagonal elements receives half of their sum.
 GSPLAT_INLINE Symmetric3 load_gradient(const float* v, bool triu, int64_t first, int count) {
   Symmetric3 g;
   if (triu) {

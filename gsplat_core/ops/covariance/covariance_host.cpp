@@ -19,7 +19,7 @@ void backward(const Call& call, const Tensor& quats, const Tensor& scales, const
 
 #else
 
-constexpr int64_t kGrain = 4096;  // rows worth a thread
+constexpr int64_t kGrain = 4096;  // minimum rows per task
 
 void forward(const Call&, const Tensor& quats, const Tensor& scales, float* out, bool inverse, bool triu) {
   torch::stable::parallel_for(0, quats.size(0), kGrain, [&](int64_t begin, int64_t end) {

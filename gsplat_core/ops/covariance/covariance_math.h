@@ -1,4 +1,4 @@
-// Rotation and scale to covariance and back, one Gaussian per lane (Kerbl et al. 2023, equation 6).
+// Covariance from rotation and scale, and its gradient, one Gaussian per lane (Kerbl et al. 2023, equation 6).
 #pragma once
 
 #include "simd.h"
@@ -16,7 +16,7 @@ struct Symmetric3 {
 
 struct UnitQuat {
   vfloat w, x, y, z, inverse_norm;
-  vint valid;  // the length is neither zero nor beyond float's range
+  vint valid;  // the quaternion's length is neither zero nor beyond float's range
 };
 
 GSPLAT_INLINE UnitQuat normalise(const vfloat q[4]) {
@@ -45,7 +45,7 @@ GSPLAT_INLINE Symmetric3 outer_square(const Matrix3& r, const vfloat s[3]) {
   return c;
 }
 
-// Gradient `g` of outer_square's result, as the full symmetric matrix, taken back to `v_r` (added) and `v_s`.
+// Backpropagate the gradient `g` of outer_square's result, a full symmetric matrix: add to `v_r`, and write `v_s`.
 GSPLAT_INLINE void outer_square_backward(const Matrix3& r, const vfloat s[3], const Symmetric3& g, Matrix3& v_r, vfloat v_s[3]) {
   const vfloat full[3][3] = {{g.v[0], g.v[1], g.v[2]}, {g.v[1], g.v[3], g.v[4]}, {g.v[2], g.v[4], g.v[5]}};
   for (int k = 0; k < 3; ++k) {
@@ -58,7 +58,7 @@ GSPLAT_INLINE void outer_square_backward(const Matrix3& r, const vfloat s[3], co
   }
 }
 
-// Gradient of rotation_of and of the normalisation before it.
+// Gradient of rotation_of and of the preceding normalisation.
 GSPLAT_INLINE void rotation_backward(const UnitQuat& q, const Matrix3& v, vfloat v_q[4]) {
   const vfloat a01 = v.m[1][0] - v.m[0][1], a02 = v.m[0][2] - v.m[2][0], a12 = v.m[2][1] - v.m[1][2];
   const vfloat s01 = v.m[1][0] + v.m[0][1], s02 = v.m[0][2] + v.m[2][0], s12 = v.m[2][1] + v.m[1][2];

@@ -1,4 +1,4 @@
-// Two kernels for each step, over tiles: what one block needs of the window's sums it makes in shared memory.
+// Each step runs two kernels over tiles. A block computes the window sums that it needs in shared memory.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "disparity_fit.h"
@@ -7,7 +7,7 @@ namespace gsplat::disparity_fit {
 namespace {
 
 constexpr int kTile = 32, kHalo = kTile + 2 * kRadius;
-constexpr int kTileRows = kThreads / kTile;  // that a block's threads do at once
+constexpr int kTileRows = kThreads / kTile;  // rows that a block processes at once
 
 struct Tile {
   int left, top;
@@ -18,8 +18,8 @@ struct Shared {
   float values[kHalo][kHalo + 1], columns[kTile][kHalo + 1];
 };
 
-// The window's sums of value(y, x), which is asked for inside of the picture alone, at this thread's pixels: one in every
-// kTileRows rows.
+// Window sums of value(y, x) at this thread's pixels, one in every kTileRows rows. value is called only inside of the
+// image.
 template <class Value>
 __device__ inline void window(const Fit& fit, const Tile& tile, Shared& shared, float (&sums)[kTile / kTileRows],
                               const Value& value) {
@@ -48,7 +48,7 @@ __device__ inline void window(const Fit& fit, const Tile& tile, Shared& shared, 
   }
 }
 
-// Calls work(i, pixel) for this thread's pixels of the tile.
+// Call work(i, pixel) for this thread's pixels of the tile.
 template <class Work>
 __device__ inline void for_own(const Fit& fit, const Tile& tile, const Work& work) {
 #pragma unroll
@@ -68,7 +68,8 @@ __global__ void __launch_bounds__(kThreads) prepare(Fit fit, Planes planes) {
     const uint8_t* const from = fit.right + int64_t(within(row, fit.height)) * fit.width;
     return int(from[r]) - int(from[l]);
   };
-  planes.slope[i] = float(10 * rise(y) + 3 * (rise(y - 1) + rise(y + 1))) * (1.0f / 32.0f);  // Scharr's, 32 for one
+  planes.slope[i] =
+      float(10 * rise(y) + 3 * (rise(y - 1) + rise(y + 1))) * (1.0f / 32.0f);  // Scharr derivative, normalised by 32
   fit.px[i] = fit.sixteenths[i] == kUnknown ? 0.0f : float(fit.sixteenths[i]) * kPerSixteenth;
 }
 
@@ -76,7 +77,8 @@ struct Sample {
   float differs, rise;
 };
 
-// Left minus right picture and the right one's slope at the current disparity; 0 where unknown.
+// Return the intensity difference (left minus right) and the right image's slope at the current disparity; 0 where
+// unknown.
 __device__ inline Sample sample(const Fit& fit, const Planes& planes, int64_t i, int x) {
   if (fit.sixteenths[i] == kUnknown) return {0, 0};
   const int64_t row = i - x;

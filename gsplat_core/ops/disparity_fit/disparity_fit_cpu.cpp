@@ -1,4 +1,4 @@
-// Rows of each plane; the window is applied down the columns, then along the row.
+// Processes rows of each plane. The window is applied vertically, then horizontally.
 #include "disparity_fit.h"
 #include "simd_partial.h"
 
@@ -11,7 +11,8 @@ namespace {
 GSPLAT_INLINE int64_t within(int64_t i, int64_t size) { return i < 0 ? 0 : i < size ? i : size - 1; }
 GSPLAT_INLINE float clamped(float x, float most) { return x < -most ? -most : x > most ? most : x; }
 
-// A row of `plane` in the window's sums, into `sums`. column: kRadius zeros on both sides of the picture's width.
+// Write the window sums of a row of `plane` to `sums`. column: scratch with kRadius zeros on both sides of the image
+// width.
 GSPLAT_INLINE void window_row(const Fit& fit, const float* plane, int64_t y, float* column, float* sums) {
   const int64_t width = fit.width;
   const float* const taps = fit.taps.tap;
@@ -42,16 +43,17 @@ void prepare(const Fit& fit, const Planes& planes, int64_t begin, int64_t end) {
     const uint8_t* const below = fit.right + within(y + 1, fit.height) * width;
     for (int64_t x = 0; x < width; ++x) {
       const int64_t l = within(x - 1, width), r = within(x + 1, width), at = y * width + x;
-      const int slope = 10 * (here[r] - here[l]) + 3 * (above[r] - above[l] + below[r] - below[l]);  // Scharr's, 32 for one
+      const int slope =
+          10 * (here[r] - here[l]) + 3 * (above[r] - above[l] + below[r] - below[l]);  // Scharr derivative, normalised by 32
       planes.slope[at] = float(slope) * (1.0f / 32.0f);
       const bool known = fit.sixteenths[at] != kUnknown;
-      planes.information[at] = known ? 1.0f : 0.0f;  // until `share`
+      planes.information[at] = known ? 1.0f : 0.0f;  // mask of known pixels, an input of `share`
       fit.px[at] = known ? float(fit.sixteenths[at]) * kPerSixteenth : 0.0f;
     }
   }
 }
 
-// The plane of what is known lies in `information`, which is not needed yet.
+// `information` is not needed yet, and holds the mask of known pixels.
 void share(const Fit& fit, const Planes& planes, int64_t begin, int64_t end, float* column) {
   for (int64_t y = begin; y < end; ++y) {
     float* const shares = planes.known + y * fit.width;

@@ -1,4 +1,4 @@
-// A block for each line, which solves its system by cyclic reduction: after k rounds a pixel depends on those 2^k away alone.
+// One block per line solves its system by cyclic reduction: after k rounds a pixel depends only on pixels 2^k away.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "edge_aware_filter.h"
@@ -25,12 +25,12 @@ __global__ void __launch_bounds__(kThreads) link(Guide guide, float* right, floa
   down[i] = link_between(guide, i, y + 1 < guide.height ? i + guide.width : i);
 }
 
-// A pixel's equation: value = known + before * value before + after * value after.
+// Equation of a pixel: value = known + before * value before + after * value after.
 struct Equation {
   float before, after, known;
 };
 
-// kEach: pixels of a thread, kMostThreads apart.
+// kEach: pixels per thread, kMostThreads apart.
 template <int kEach>
 __global__ void __launch_bounds__(kMostThreads) smooth(Lines lines, int64_t plane_size) {
   extern __shared__ Equation equations[];

@@ -1,6 +1,6 @@
-// Planes smoothed within what looks like one surface in a guide picture: the fast global smoother (Min et al. 2014), weighted
-// least squares along each row and then along each column, a few times with less and less strength. Each line is a tridiagonal
-// system.
+// Edge-aware smoothing of planes by a guide image: the fast global smoother (Min et al. 2014). It solves a weighted
+// least-squares problem along each row and then along each column, for a few rounds with decreasing strength. Each line
+// is a tridiagonal system.
 #pragma once
 
 #include <cstdint>
@@ -13,17 +13,18 @@ class CudaScratch;
 namespace gsplat::edge_aware_filter {
 
 constexpr int kRounds = 3;
-constexpr float kAttenuation = 0.25f;  // of the strength, from round to round
-constexpr int64_t kMostLength = 4096;  // pixels of a line
+constexpr float kAttenuation = 0.25f;  // factor of the strength per round
+constexpr int64_t kMostLength = 4096;  // maximum pixels per line
 constexpr int kMostChannels = 4;
 
 struct Guide {
   const uint8_t* pixels;  // [height, width, channels]
   int32_t height, width, channels;
-  float per_step;  // links weaken by e for so many grey values: 1 / that
+  float per_step;  // 1 / (grey-value step at which a link weakens by a factor of e)
 };
 
-// All lines of one direction. Pixel i of line l is at l * across + i * along; it is linked with the next one by links[there].
+// All lines of one direction. Pixel i of line l is at l * across + i * along, and links[that index] connects it to the
+// next pixel.
 struct Lines {
   float* plane;
   const float* links;
@@ -31,16 +32,16 @@ struct Lines {
   float strength;
 };
 
-// CPU.
+// CPU kernels.
 struct Kernels {
-  // Links of the rows [begin, end) to the right and downwards: 1 where the guide does not change.
+  // Computes the links of rows [begin, end) to the right and downwards; 1 where the guide is constant.
   void (*link)(const Guide& guide, float* right, float* down, int64_t begin, int64_t end);
-  // Lines [begin, end). scratch: 2 * length vectors of `lanes` floats.
+  // Smooths lines [begin, end). scratch: 2 * length vectors of `lanes` floats.
   void (*smooth)(const Lines& lines, int64_t begin, int64_t end, float* scratch);
   int lanes;
 };
 
-// CUDA; every pointer is to device memory. planes: [count, height, width].
+// CUDA versions; all pointers are device memory. planes: [count, height, width].
 void link_on_device(const Guide& guide, float* right, float* down, cudaStream_t stream);
 void smooth_on_device(const Lines& lines, int64_t planes, int64_t plane_size, cudaStream_t stream);
 

@@ -1,4 +1,4 @@
-// A vector of lines at a time: elimination to the end of the lines, then back.
+// Solves a vector of lines at a time by forward elimination and back substitution.
 #include "edge_aware_filter.h"
 #include "simd_partial.h"
 
@@ -17,7 +17,7 @@ GSPLAT_INLINE float squared_change(const Guide& guide, int64_t one, int64_t othe
   return squares;
 }
 
-// Squared changes to links, in place.
+// Convert squared changes to links, in place.
 GSPLAT_INLINE void weaken(float* links, int64_t count, float per_step) {
   const float scale = -1.44269504f * per_step;
   for (int64_t x = 0; x < count; x += kLanes) {
@@ -40,7 +40,7 @@ void link(const Guide& guide, float* right, float* down, int64_t begin, int64_t 
   }
 }
 
-// Pixels of neighbouring lines; of the last few lines of all there may be fewer than lanes.
+// Load the pixels of neighbouring lines; the last group may have fewer lines than lanes.
 GSPLAT_INLINE vfloat take(const float* from, int64_t across, int lanes) {
   if (across == 1 && lanes == kLanes) return load(from);
   vfloat taken = vfloat{};
@@ -53,7 +53,7 @@ GSPLAT_INLINE void give(float* to, int64_t across, int lanes, vfloat values) {
 }
 
 void smooth(const Lines& lines, int64_t begin, int64_t end, float* scratch) {
-  float *const above = scratch, *const known = scratch + lines.length * kLanes;  // of the rows that are eliminated so far
+  float *const above = scratch, *const known = scratch + lines.length * kLanes;  // coefficients of the eliminated rows
   for (int64_t first = begin; first < end; first += kLanes) {
     const int lanes = int(end - first < kLanes ? end - first : kLanes);
     const int64_t begin_of = first * lines.across;

@@ -1,4 +1,4 @@
-// One block per tile: sorts the tile's list by depth, then composites it front to back.
+// One block per tile sorts the tile's list by depth, then composites it front to back.
 #include <type_traits>
 
 #include "../blending/blend_forward.cuh"
@@ -14,7 +14,8 @@ using namespace blending;
 
 using Splat = Record<4>;
 
-// The sorted splats of a tile. A list that overflowed may contain "no instance", which is read as a splat that reaches no pixel.
+// The sorted splats of a tile. After an overflow the list may contain "no instance", which is read as a splat that
+// reaches no pixel.
 template <Mode mode>
 struct TileSplats {
   const Lists& lists;
@@ -33,7 +34,7 @@ struct TileSplats {
   }
 };
 
-// Where a tile's list begins and ends. With segments, the tile also adds what it needed to the status.
+// Range of a tile's list. With segments, the tile also adds its required length to the status.
 template <Mode mode>
 struct TileList {
   int begin, end;

@@ -1,4 +1,4 @@
-// render_frame and accumulate_status_: checks, memory and the order of the launches.
+// Host code of render_frame and accumulate_status_: checks, memory and the order of the launches.
 #include <algorithm>
 #include <tuple>
 
@@ -8,7 +8,7 @@ namespace gsplat::frame {
 namespace {
 
 constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
-constexpr int64_t kFewTiles = 4096;  // for so many, every tile's counter can have 128 bytes to itself
+constexpr int64_t kFewTiles = 4096;  // up to this number of tiles every counter has its own 128 bytes
 
 using Frame = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 

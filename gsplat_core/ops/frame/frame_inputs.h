@@ -1,4 +1,4 @@
-// The inputs that the frame path's ops have in common, checked, and as the kernels take them.
+// Checked inputs shared by the frame path's ops, converted to kernel arguments.
 #pragma once
 
 #include <optional>

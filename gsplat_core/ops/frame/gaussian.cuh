@@ -1,4 +1,4 @@
-// One Gaussian of the frame path from its raw parameters, as the forward pass and the gradient both start.
+// Raw parameters of one Gaussian; the first step of the forward pass and of the gradient.
 #pragma once
 
 #include "../projection/projection_math.h"
@@ -11,12 +11,13 @@ namespace {
 using namespace GSPLAT_ISA::projection;
 using namespace spherical_harmonics;
 
-// The camera in shared memory. Its matrices come from device memory, so that a captured graph reads the current ones.
+// The camera in shared memory. Its matrices are read from device memory, so that a captured graph uses the current
+// values.
 struct Camera {
   float viewmat[16], intrinsics[9], center[3];
 };
 
-// Called by all threads of a block of at least 32; ends with a barrier. The centre is -R^T t.
+// Load the camera; its centre is -R^T t. All threads of a block of at least 32 must call it. Ends with a barrier.
 __device__ inline void load_camera(const Scene& in, Camera& camera) {
   const int i = threadIdx.x;
   if (i < 16) camera.viewmat[i] = in.viewmat[i];
@@ -42,9 +43,9 @@ __device__ inline ProjectionInput projection_input(const Scene& in, const Camera
   return p;
 }
 
-// Raw parameters with the deltas added. Usable: all of them are finite.
+// Raw parameters plus deltas. A Gaussian is usable if all of them are finite.
 struct RawGaussian {
-  float mean[3], quat[4], log_scale[3], color[3], logit;  // color: the delta of the first coefficient alone
+  float mean[3], quat[4], log_scale[3], color[3], logit;  // color: delta of the first coefficient only
   bool usable;
 };
 
@@ -67,7 +68,7 @@ __device__ inline RawGaussian load_gaussian(const Scene& in, int64_t n) {
   for (int k = 0; k < 3; ++k) g.log_scale[k] = in.log_scales[3 * n + k] + delta[kRawLogScale + k];
   for (int k = 0; k < 3; ++k) g.color[k] = delta[kRawColor + k];
   g.logit = in.logit_opacities[n] + delta[kRawOpacity];
-  // 0 x is 0 for a finite x and NaN for any other.
+  // 0 x is 0 for finite x, otherwise NaN.
   float sum = 0 * g.logit;
   for (int k = 0; k < 3; ++k) sum += 0 * g.mean[k] + 0 * g.log_scale[k] + 0 * g.color[k];
   for (int k = 0; k < 4; ++k) sum += 0 * g.quat[k];

@@ -1,4 +1,4 @@
-// Splats to instances: which tiles a splat touches, how many, and the keys of its instances.
+// Conversion of splats to instances: the tiles that a splat touches, their number, and the keys of its instances.
 #pragma once
 
 #include "../blending/splats.cuh"
@@ -12,11 +12,11 @@ using namespace blending;
 
 using namespace gsplat::tiles;
 
-constexpr uint32_t kMaxSum = 0x7fffffffu;  // sums saturate here; min(a + b, kMaxSum) is associative
+constexpr uint32_t kMaxSum = 0x7fffffffu;  // sums saturate at this value; min(a + b, kMaxSum) is associative
 
 __device__ inline uint32_t saturating_add(uint32_t a, uint32_t b) { return min(a + b, kMaxSum); }
 
-// The sum over the threads in front of this one, and over the whole block.
+// Sum over the preceding threads, and over the whole block.
 struct BlockSum {
   uint32_t before, all;
 };
@@ -27,21 +27,21 @@ __device__ inline uint32_t inclusive_warp_sum(uint32_t value) {
   }
   return value;
 }
-// `warp_sums` is shared memory for 32 values, free again after the next barrier.
+// `warp_sums` is shared memory for 32 values; it may be reused after the next barrier.
 __device__ inline BlockSum sum_over_block(uint32_t value, uint32_t* warp_sums) {
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, warps = int(blockDim.x) / 32;
   const uint32_t through = inclusive_warp_sum(value), before = __shfl_up_sync(kAll, through, 1);
   if (lane == 31) warp_sums[warp] = through;
   __syncthreads();
-  // Every warp adds up the warps' sums itself, which saves a barrier.
+  // Every warp adds up the warps' sums redundantly, which saves a barrier.
   const uint32_t sums = inclusive_warp_sum(lane < warps ? warp_sums[lane] : 0);
   const uint32_t in_front = __shfl_sync(kAll, sums, max(warp - 1, 0));
   return {saturating_add(warp > 0 ? in_front : 0, lane > 0 ? before : 0), __shfl_sync(kAll, sums, 31)};
 }
 
-// Which tiles a splat touches, in eight bytes that preprocess leaves for fill. A small footprint, whose bounding box has at most
-// 32 tiles, has one bit per tile, row by row. A large one has the box alone: a warp finds its tiles cooperatively from the
-// record, once per kernel. Both words are 0 where no tile is touched.
+// The tiles that a splat touches, packed into eight bytes that preprocess passes to fill. A small footprint, whose bounding box
+// has at most 32 tiles, stores one bit per tile, row by row. A large footprint stores only the box; each kernel recomputes its
+// tiles from the record with the whole warp. Both words are 0 if no tile is touched.
 //   small: x = width - 1 (5 bits from 26) | top (13 bits from 13) | left (13 bits), y = the bits
 //   large: x = 1 << 31 | top | left,                                                 y = bottom (13 bits from 13) | right - 1
 struct Footprint {
@@ -59,7 +59,7 @@ __device__ inline TileEllipse ellipse_of_record(const float4& xyab, float c, flo
   return tile_ellipse(xyab.x, xyab.y, -xyab.z, -0.5f * xyab.w, -c, l + (7e-4f - kLog2AlphaCutoff));
 }
 
-// The footprint of a splat with this bounding box and ellipse.
+// Return the footprint of a splat with this bounding box and ellipse.
 __device__ inline Footprint footprint_of(const TileBox& box) {
   const int width = box.right - box.left, height = box.bottom - box.top;
   if (width <= 0 || height <= 0) return {0, 0};
@@ -73,11 +73,11 @@ __device__ inline Footprint footprint_of(const TileBox& box) {
   return bits != 0 ? Footprint{uint32_t(width - 1) << 26 | corner, bits} : Footprint{0, 0};
 }
 
-// visit(tile, j) for the tiles of a small footprint, numbered j.
+// Call visit(tile, j) for each tile of a small footprint, with its number j.
 template <class Visit>
 __device__ inline void for_each_small_tile(const Footprint& footprint, int tile_width, const Visit& visit) {
   const int width = footprint.width(), first = footprint.top() * tile_width + footprint.left();
-  // i / width == i * inverse >> 10 for i < 32, however the reciprocal is rounded.
+  // i / width == i * inverse >> 10 for i < 32, independent of the rounding of the reciprocal.
   const int inverse = int(1024 * reciprocal(float(width))) + 1;
   int j = 0;
   for (uint32_t bits = footprint.large() ? 0 : footprint.y; bits != 0; bits &= bits - 1, ++j) {
@@ -86,8 +86,8 @@ __device__ inline void for_each_small_tile(const Footprint& footprint, int tile_
   }
 }
 
-// Called by the whole warp: visit(tile, j) for the tiles of lane `owner`'s large footprint, whose record is `records[splat]`. The
-// tiles are distributed over the lanes. Returns how many there are.
+// Call visit(tile, j) for the tiles of lane `owner`'s large footprint, whose record is `records[splat]`. The whole warp
+// must call it; the tiles are distributed over the lanes. Returns the number of tiles.
 template <class Visit>
 __device__ inline int for_each_large_tile(const Footprint& mine, const Record<4>* records, int64_t splat, int owner,
                                           int tile_width, const Visit& visit) {
@@ -99,7 +99,7 @@ __device__ inline int for_each_large_tile(const Footprint& mine, const Record<4>
   for (int first_row = box.top; first_row < box.bottom; first_row += 32) {
     const TileRun run = first_row + lane < box.bottom ? tile_run(box, first_row + lane, kTile) : TileRun{0, 0};
     const int length = max(run.end - run.first, 0);
-    int through = length;  // tiles of this row and the rows above
+    int through = length;  // tiles of this row and the preceding rows
     for (int step = 1; step < 32; step *= 2) {
       const int before = __shfl_up_sync(kAll, through, step);
       if (lane >= step) through += before;
@@ -114,8 +114,8 @@ __device__ inline int for_each_large_tile(const Footprint& mine, const Record<4>
   return total;
 }
 
-// Writes the key of one instance. `place` counts within the shared buffer or within the tile's segment; `instance` is the
-// instance's number when training.
+// Write the key of one instance. `place` is the position in the shared buffer or in the tile's segment; `instance` is
+// the instance number when training.
 template <Mode mode>
 __device__ inline void emit_instance(const Lists& lists, int tile, uint32_t place, uint32_t depth, int64_t splat,
                                      uint32_t instance) {
@@ -139,13 +139,13 @@ __device__ inline Footprint load_footprint(const Scene& in, const Scratch& scrat
   return {words.x, words.y};
 }
 
-// Called by the whole warp: visit(owner) for each lane with a large footprint.
+// Call visit(owner) for each lane with a large footprint. The whole warp must call it.
 template <class Visit>
 __device__ inline void for_each_large(const Footprint& footprint, const Visit& visit) {
   for (unsigned large = __ballot_sync(kAll, footprint.large()); large != 0; large &= large - 1) visit(__ffs(int(large)) - 1);
 }
 
-// Called by the whole warp: how many tiles each lane's splat touches.
+// Return the number of tiles that each lane's splat touches. The whole warp must call it.
 __device__ inline uint32_t count_tiles(const Scene& in, const Record<4>* records, const Footprint& footprint, int64_t n) {
   uint32_t tiles = uint32_t(footprint.small_count());
   for_each_large(footprint, [&](int owner) {
@@ -155,21 +155,21 @@ __device__ inline uint32_t count_tiles(const Scene& in, const Record<4>* records
   return tiles;
 }
 
-// Stores the first instance of splat `n`, and after the last splat the number of instances.
+// Store the first instance of splat `n`, and after the last splat the number of instances.
 __device__ inline void store_start(const Scene& in, const Lists& lists, int64_t n, uint32_t start, uint32_t end) {
   if (n < in.count) lists.splat_starts[n] = int32_t(start);
   if (n == in.count - 1) lists.splat_starts[n + 1] = int32_t(end);
 }
 
-// The next free place of a tile's list.
+// Reserve and return the next position in a tile's list.
 __device__ inline uint32_t reserve(const Scratch& scratch, int tile) {
   return atomicAdd(scratch.counters + tile * scratch.counter_stride, 1u);
 }
 
-constexpr int kMaxSmallTiles = 32 * 32;  // tiles of a warp's small footprints, at most
-constexpr int kInFlight = 4;             // atomic reservations of a thread in flight
+constexpr int kMaxSmallTiles = 32 * 32;  // maximum number of tiles in a warp's small footprints
+constexpr int kInFlight = 4;             // atomic reservations in flight per thread
 
-// Emits the instances of a warp's small footprints. Splats touch between 1 and 32 tiles; to balance the lanes, (splat, tile)
+// Emit the instances of a warp's small footprints. Splats touch 1 to 32 tiles. To balance the lanes, the (splat, tile)
 // pairs are first listed in `touched`, shared memory for kMaxSmallTiles entries, and then distributed evenly.
 template <Mode mode>
 __device__ inline void emit_small(const Scene& in, const Lists& lists, const Scratch& scratch, const Footprint& footprint,
@@ -200,7 +200,7 @@ __device__ inline void emit_small(const Scene& in, const Lists& lists, const Scr
   }
 }
 
-// Emits the instances of a warp's large footprints.
+// Emit the instances of a warp's large footprints.
 template <Mode mode>
 __device__ inline void emit_large(const Scene& in, const Lists& lists, const Scratch& scratch, const Footprint& footprint,
                                   int64_t n, uint32_t depth, uint32_t start) {

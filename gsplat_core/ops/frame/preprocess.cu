@@ -8,7 +8,7 @@ namespace {
 
 constexpr float kConstantBase = 0.28209479177387814f;
 
-// A warp's shared memory: the coefficients, later the (splat, tile) pairs of its small footprints.
+// A warp's shared memory: first the coefficients, later the (splat, tile) pairs of its small footprints.
 template <int degree, class Coefficient>
 union WarpShared {
   StagedHarmonics<degree, Coefficient> harmonics;
@@ -40,7 +40,7 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   }
   const unsigned visible = __ballot_sync(kAll, p.valid);
   using Staged = StagedHarmonics<degree, Coefficient>;
-  if constexpr (degree > 0)  // in flight while the boxes are computed
+  if constexpr (degree > 0)  // copies overlap with the computation of the boxes
     shared.harmonics.load(sh + (n - lane) * Staged::kUsed, Staged::kUsed, visible, in.aligned);
 
   Record<4> r = {};
@@ -73,10 +73,10 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   }
   const uint32_t depth = footprint.y != 0 ? __float_as_uint(p.depth) : 0;
   if (lists.segment > 0) {
-    // Every tile has a segment of its own, so keys can be written before the lists' lengths are known.
+    // Every tile has its own segment, so keys can be written before the list lengths are known.
     if (n == 0)
-      for (int i = 0; i < kStatusSize; ++i) lists.status[i] = 0;  // blend adds the tiles up
-    __syncwarp();                                                 // records are written, coefficients have been read
+      for (int i = 0; i < kStatusSize; ++i) lists.status[i] = 0;  // blend adds the counts of the tiles
+    __syncwarp();                                                 // all records are written, and all coefficients are read
     emit_small<kSegments>(in, lists, scratch, footprint, n, depth, 0, shared.touched);
     emit_large<kSegments>(in, lists, scratch, footprint, n, depth, 0);
     return;
@@ -88,7 +88,7 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   const auto count = [&](int tile, int) { atomicAdd(scratch.counters + tile * scratch.counter_stride, 1u); };
   for_each_small_tile(footprint, in.tile_width, count);
   uint32_t tiles = uint32_t(footprint.small_count());
-  __syncwarp();  // records of large footprints are written
+  __syncwarp();  // records of large footprints are visible to the warp
   for_each_large(footprint, [&](int owner) {
     const int of_large = for_each_large_tile(footprint, records, n, owner, in.tile_width, count);
     if (lane == owner) tiles = uint32_t(of_large);

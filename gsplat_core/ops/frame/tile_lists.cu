@@ -1,19 +1,20 @@
-// The tile lists between preprocess and blend: prefix sums of the counts, then the keys; and the status of a series of frames.
+// Tile lists between preprocess and blend: prefix sums of the counts, then the keys. Also accumulates the status of
+// consecutive frames.
 #include "dependent_launch.cuh"
 #include "instances.cuh"
 
 namespace gsplat::frame {
 namespace {
 
-// A prefix sum in one pass (decoupled look-back, Merrill and Garland 2016): a block publishes the sum of its kScanThreads counts,
-// then adds up what the preceding blocks have published.
+// Single-pass prefix sum (decoupled look-back, Merrill and Garland 2016). A block publishes the sum of its kScanThreads
+// counts, then adds the sums published by the preceding blocks.
 struct Counts {
   uint32_t* counts;  // [count, stride]
-  uint32_t* starts;  // [count]: the sum of the preceding counts
-  uint64_t* states;  // [blocks], zeroed: a block's 1 << 63 | largest count << 32 | sum
+  uint32_t* starts;  // [count]: sum of the preceding counts
+  uint64_t* states;  // [blocks], zeroed: per block 1 << 63 | largest count << 32 | sum
   int64_t count;
   int32_t stride;
-  bool in_place;  // also write the starts over the counts
+  bool in_place;  // also overwrite the counts with the starts
 
   __host__ __device__ int64_t blocks() const { return (count + kScanThreads - 1) / kScanThreads; }
 };
@@ -24,7 +25,7 @@ struct Total {
 
 __device__ inline Total unpack(uint64_t state) { return {uint32_t(state) & kMaxSum, uint32_t(state >> 32) & kMaxSum}; }
 
-// The total that it returns is valid for the first thread of the last block.
+// The returned total is valid only in the first thread of the last block.
 __device__ inline Total scan_part(const Counts& in, int64_t block) {
   __shared__ uint32_t warp_sums[32], warp_maxima[32];
   __shared__ Total preceding;
@@ -60,7 +61,7 @@ __device__ inline Total scan_part(const Counts& in, int64_t block) {
   return all;
 }
 
-// The first blocks scan the tiles, the others, when training, the blocks of Gaussians.
+// The first blocks scan the tiles; when training, the remaining blocks scan the blocks of Gaussians.
 __global__ void __launch_bounds__(kScanThreads) scan_counts(Lists lists, Counts tiles, Counts splats) {
   allow_dependent_launch();
   wait_for_preceding_kernel();
@@ -78,7 +79,7 @@ __global__ void __launch_bounds__(kScanThreads) scan_counts(Lists lists, Counts 
   lists.status[kStatusOverflow + 1] = 0;
 }
 
-// One key per instance, in any order within a tile: sorting makes the order reproducible.
+// Write one key per instance, in any order within a tile: sorting makes the order reproducible.
 template <bool training>
 __global__ void __launch_bounds__(kGaussianThreads) fill_lists(Scene in, Lists lists, Scratch scratch) {
   allow_dependent_launch();

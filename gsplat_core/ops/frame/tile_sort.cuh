@@ -1,5 +1,5 @@
-// A block of 128 threads sorts the 64-bit keys of one tile: by buckets in shared memory where depths are spread evenly, otherwise
-// bitonically in registers, in shared memory, or in global memory, as the length allows.
+// Sort of the 64-bit keys of one tile by a block of 128 threads. Evenly spread depths are sorted by buckets in shared
+// memory. Otherwise a bitonic sort runs in registers, shared memory or global memory, depending on the length.
 #pragma once
 
 #include "../blending/splats.cuh"
@@ -9,8 +9,8 @@ namespace {
 
 using namespace blending;
 
-constexpr int kSortKeys = 2048;      // keys that a block sorts in shared memory
-constexpr int kMaxKeysOfThread = 8;  // keys of a thread in registers
+constexpr int kSortKeys = 2048;      // maximum number of keys sorted in shared memory
+constexpr int kMaxKeysOfThread = 8;  // maximum number of keys per thread in registers
 
 __device__ inline void compare_exchange(uint64_t& a, uint64_t& b, bool ascending) {
   const uint64_t x = a, y = b;
@@ -19,8 +19,8 @@ __device__ inline void compare_exchange(uint64_t& a, uint64_t& b, bool ascending
   b = swap ? x : y;
 }
 
-// Bitonic sort (Batcher 1968) in registers and shuffles; thread t holds keys [t kEach, (t + 1) kEach). `shared` has 256 kEach
-// keys and is free again after the next barrier. Keys from `count` on must be the largest.
+// Bitonic sort (Batcher 1968) in registers with shuffles; thread t holds keys [t kEach, (t + 1) kEach). `shared` has
+// 256 kEach keys and may be reused after the next barrier. Keys from `count` on must be the largest.
 template <int kEach>
 __device__ inline void sort_in_registers(uint64_t (&keys)[kEach], int count, uint64_t* shared) {
   const int t = threadIdx.x;
@@ -31,7 +31,7 @@ __device__ inline void sort_in_registers(uint64_t (&keys)[kEach], int count, uin
 #pragma unroll
       for (int i = 0; i < kEach; ++i)
         if ((i & distance) == 0) compare_exchange(keys[i], keys[i | distance], (i & size) == 0);
-  // From here on `size` and `step` count threads.
+  // From here on, `size` and `step` are in threads.
   for (int size = 1; size <= kBlockThreads && size * kEach < 2 * count; size *= 2) {
     const bool ascending = (t & size) == 0;
     for (int step = size / 2; step > 0; step /= 2) {
@@ -40,7 +40,7 @@ __device__ inline void sort_in_registers(uint64_t (&keys)[kEach], int count, uin
       if (step >= 32) {
         uint64_t* const half = shared + (step == size / 2 && size == kBlockThreads ? kEach * kBlockThreads : 0);
         for (int i = 0; i < kEach; ++i) half[i * kBlockThreads + t] = keys[i];
-        __syncthreads();  // one barrier is enough: the next exchange uses the other half
+        __syncthreads();  // one barrier suffices: the next exchange uses the other half
         for (int i = 0; i < kEach; ++i) others[i] = half[i * kBlockThreads + (t ^ step)];
       } else {
         for (int i = 0; i < kEach; ++i) others[i] = __shfl_xor_sync(kAll, keys[i], step);
@@ -55,15 +55,15 @@ __device__ inline void sort_in_registers(uint64_t (&keys)[kEach], int count, uin
   }
 }
 
-// In shared and global memory all exchanges sort in the same direction, so that the length need not be a power of two: keys that
-// would be past the end never move.
+// In shared and global memory all exchanges sort in the same direction, so the length need not be a power of two:
+// padding keys past the end would never move.
 __device__ inline void exchange(uint64_t* keys, int64_t low, int64_t high, int64_t count) {
   if (high >= count) return;
   const uint64_t a = keys[low], b = keys[high];
   if (a > b) keys[low] = b, keys[high] = a;
 }
 
-// Pairs within 64 keys belong to one warp, since 32 consecutive pairs do.
+// Pairs within 64 keys belong to one warp, because 32 consecutive pairs do.
 __device__ inline void barrier_after(int distance) {
   if (distance > 32) {
     __syncthreads();
@@ -72,7 +72,7 @@ __device__ inline void barrier_after(int distance) {
   }
 }
 
-// Exchanges at `distance`, at half of it, and so on down to 1.
+// Run the exchanges at `distance`, distance / 2, ..., 1.
 __device__ inline void merge_down(uint64_t* keys, int count, int pairs, int distance) {
   for (; distance > 0; distance /= 2) {
     for (int i = threadIdx.x; i < pairs; i += int(blockDim.x)) {
@@ -83,7 +83,7 @@ __device__ inline void merge_down(uint64_t* keys, int count, int pairs, int dist
   }
 }
 
-// Sorts `keys` in shared memory, which were written before the last barrier; ends with a barrier.
+// Sort `keys` in shared memory, which were written before the last barrier. Ends with a barrier.
 __device__ inline void sort_shared(uint64_t* keys, int count) {
   if (count < 2) return;
   const int pairs = 1 << (31 - __clz(count - 1));  // half of the next power of two
@@ -99,7 +99,7 @@ __device__ inline void sort_shared(uint64_t* keys, int count) {
   __syncthreads();
 }
 
-// Sorts more than kSortKeys keys in global memory by one block, with shared memory for kSortKeys.
+// Sort more than kSortKeys keys in global memory with one block, using shared memory for kSortKeys keys.
 __device__ inline void sort_long(uint64_t* keys, int64_t count, uint64_t* shared) {
   const auto in_chunks = [&](const auto& sort) {
     for (int64_t first = 0; first < count; first += kSortKeys) {
@@ -135,7 +135,7 @@ __device__ inline void sort_long(uint64_t* keys, int64_t count, uint64_t* shared
 }
 
 constexpr int kBuckets = 512;
-constexpr uint32_t kMaxInBucket = 12;  // with more in one bucket the bitonic sort is faster
+constexpr uint32_t kMaxInBucket = 12;  // with more keys in one bucket the bitonic sort is faster
 
 struct BucketShared {
   uint32_t counts[kBuckets], starts[kBuckets];
@@ -153,10 +153,10 @@ __device__ inline uint32_t exclusive_warp_sum(uint32_t mine) {
   return through - mine;
 }
 
-// Sorts the keys of a tile whose depths are spread evenly: into buckets by depth, then by counting within each bucket. Thread t
-// holds keys i kBlockThreads + t < `count`. Writes their low words to `numbers` in the order of the keys, or returns false to all
-// threads; either way a barrier must follow. The result depends neither on the input order nor on that of the atomics, except
-// among equal keys.
+// Sort the keys of a tile whose depths are spread evenly: by depth into buckets, then by counting within each bucket.
+// Thread t holds keys i kBlockThreads + t < `count`. Writes the keys' low words to `numbers` in key order, or returns
+// false to all threads; in both cases a barrier must follow. The result depends neither on the input order nor on the
+// order of the atomics, except among equal keys.
 template <int kEach>
 __device__ inline bool sort_by_buckets(const uint64_t (&keys)[kEach], int count, BucketShared& shared, uint32_t* numbers) {
   constexpr int kOfLane = kBuckets / 32;
@@ -190,7 +190,7 @@ __device__ inline bool sort_by_buckets(const uint64_t (&keys)[kEach], int count,
     places[i] = atomicAdd(&shared.counts[buckets[i]], 1u);
   }
   __syncthreads();
-  // Every warp computes the prefix sums of all counts and stores its part.
+  // Every warp computes the prefix sums of all counts, and stores its part.
   uint32_t counts[kOfLane], total = 0, most = 0;
 #pragma unroll
   for (int i = 0; i < kOfLane; i += 4) {
@@ -220,14 +220,14 @@ __device__ inline bool sort_by_buckets(const uint64_t (&keys)[kEach], int count,
 #pragma unroll 1
     for (uint32_t j = first; j < end; ++j) {
       const uint64_t other = shared.keys[j];
-      if (other < keys[i] || (other == keys[i] && j < own)) ++place;  // lists that overflowed may contain equal keys
+      if (other < keys[i] || (other == keys[i] && j < own)) ++place;  // after an overflow a list may contain equal keys
     }
     numbers[place] = uint32_t(keys[i]);
   }
   return true;
 }
 
-// A block's shared memory: the keys while they are sorted, then the sorted ids and the staged splats.
+// A block's shared memory: the keys during sorting, then the sorted ids and the staged splats.
 template <class Stage>
 union BlendShared {
   uint64_t keys[kSortKeys];
@@ -240,7 +240,7 @@ union BlendShared {
   };
 };
 
-// The low words of a tile's keys in depth order: splats, or instances when training; in shared memory if they fit.
+// Low words of a tile's keys in depth order (splats, or instances when training); in shared memory if they fit.
 struct SortedIds {
   const uint32_t* first;
   int stride;
@@ -263,7 +263,7 @@ __device__ inline void sort_short(const uint64_t* keys, int length, BlendShared<
   for (int i = 0; i < kEach; ++i) shared.ids[int(threadIdx.x) * kEach + i] = uint32_t(mine[i]);
 }
 
-// Sorts a tile's keys by depth; ends with a barrier.
+// Sort a tile's keys by depth. Ends with a barrier.
 template <class Stage>
 __device__ inline SortedIds sort_tile(uint64_t* keys, int length, BlendShared<Stage>& shared) {
   SortedIds sorted = {shared.ids, 1};

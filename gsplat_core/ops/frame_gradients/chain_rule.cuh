@@ -1,4 +1,4 @@
-// From the sum of a Gaussian's gradient rows to the gradient of its raw parameters, one Gaussian per thread.
+// Chain rule from the sum of a Gaussian's gradient rows to the gradient of its raw parameters, one Gaussian per thread.
 #pragma once
 
 #include "../frame/gaussian.cuh"
@@ -11,13 +11,13 @@ namespace {
 using projection::ellipse_gradient;
 using projection::EllipseGradient;
 
-// The sum of a Gaussian's gradient rows.
+// Sum of a Gaussian's gradient rows.
 struct SplatRow {
   float moments[6];  // sums over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
   float colors[4];   // red, green, blue, z
 };
 
-// The gradient of a Gaussian's raw parameters.
+// Gradient of a Gaussian's raw parameters.
 struct RawGradient {
   float mean[3], quat[4], log_scales[3], color[3], logit;
 };
@@ -38,7 +38,7 @@ __device__ inline RawGradient projection_gradient(const Scene& scene, const Came
   for (int k = 0; k < 3; ++k) to.mean[k] = back.mean[k];
   for (int k = 0; k < 4; ++k) to.quat[k] = back.quat[k];
   for (int k = 0; k < 3; ++k) to.log_scales[k] = back.scales[k] * geometry.scales[k];
-  to.logit = sum.moments[0] * (1 - opacity_of(gaussian));  // dL/dlogit = o (1 - o) dL/do, and the first moment is o dL/do
+  to.logit = sum.moments[0] * (1 - opacity_of(gaussian));  // dL/dlogit = o (1 - o) dL/do, and the first moment equals o dL/do
   return to;
 }
 
@@ -48,8 +48,8 @@ __device__ inline RawGradient projection_gradient(const Scene& scene, const Came
                            [&](auto model) { return projection_gradient<decltype(model)::value>(scene, camera, gaussian, sum); });
 }
 
-// Chain rule of the colour: to the view direction and so to the mean, and to the coefficients c, which are replaced by their
-// gradient. A channel that was clamped at zero has no gradient.
+// Chain rule of the colour: to the view direction and through it to the mean, and to the coefficients c, which are
+// replaced by their gradient. A channel clamped at zero has no gradient.
 template <int kDegree>
 __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussian& gaussian, const float* v_color,
                                           float (&c)[3 * kBasesOf<kDegree>], RawGradient& to) {
@@ -65,7 +65,7 @@ __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussia
     v[j] = color > 0 ? v_color[j] : 0;
     to.color[j] = b[0] * v[j];
   }
-  if constexpr (kDegree > 0) {  // a constant has no direction
+  if constexpr (kDegree > 0) {  // degree 0 does not depend on the direction
     float v_mean[3];
     direction_gradient<kDegree>(direction, inverse, c, v, v_mean);
     for (int k = 0; k < 3; ++k) to.mean[k] += v_mean[k];
@@ -78,8 +78,9 @@ __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussia
 constexpr float kFirstBasis = 0.28209479177387814f;
 constexpr float kLeastWeightPx = 0.3f;  // LEAST_WEIGHT_PX in Python
 
-// What to add to the coefficients of degree 0, in place of their gradient, for weighted sums of residuals and the sum of the
-// weights; c is what they are without their deltas. A colour below 0 can rise and does not sink further.
+// Corrections to add to the coefficients of degree 0, in place of their gradient, from weighted sums of residuals and
+// the sum of the weights. c are the coefficients without deltas. A colour below 0 can increase but is not decreased
+// further.
 __device__ inline void colour_correction(const RawGaussian& gaussian, const float* residuals, float weight, float relaxation,
                                          const float* c, RawGradient& to) {
   for (int j = 0; j < 3; ++j) {

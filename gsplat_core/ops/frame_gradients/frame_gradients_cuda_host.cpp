@@ -1,4 +1,4 @@
-// render_frame_backward and render_frame_backward_adam_: checks, memory and the order of the launches.
+// Host code of render_frame_backward and render_frame_backward_adam_: checks, memory and the order of the launches.
 #include <cstdint>
 #include <tuple>
 
@@ -10,7 +10,7 @@ namespace {
 
 using Tensors = std::vector<Tensor>;
 
-// The results of render_frame after the image, in their order.
+// Order of render_frame's results after the image.
 enum Forward { kAlphas, kLast, kRecords, kTileOffsets, kSorted, kSplatStarts, kInstanceSplats, kStatus, kForwardTensors };
 
 bool is_quad_aligned(const Tensor& t) { return reinterpret_cast<uintptr_t>(t.const_data_ptr()) % 16 == 0; }
@@ -21,7 +21,7 @@ ViewArguments view_of(const Tensor& v_image, double eps2d, int64_t camera_model)
   return {v_image.size(1), v_image.size(0), eps2d, 0, 0, camera_model};
 }
 
-// Forward results and picture gradient, checked, as the kernels take them.
+// Checked forward results and image gradient, converted to kernel arguments.
 struct Backward {
   Tensor alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status, v_image;
   OptionalTensor v_alphas, residuals, relaxation;
@@ -61,7 +61,7 @@ struct Backward {
             .correction = {}};
   }
 
-  // Colours are to be corrected by `residuals`, if they are given.
+  // Enable colour corrections by `residuals`, if given.
   void correct(const Inputs& inputs, const OptionalTensor& residuals_in, const OptionalTensor& relaxation_in) {
     if (!residuals_in) return;
     const Scene& scene = inputs.scene;
@@ -89,7 +89,7 @@ struct Backward {
   }
 };
 
-// A tensor that is updated in place, of `count` values.
+// Return the data of a tensor of `count` values that is updated in place.
 float* updated(const CudaCall& call, const Tensor& t, int64_t count, const char* name) {
   call.floats(t, name);
   check(t.numel() == count, "render_frame_backward_adam_: ", name, " must have ", count, " values, got ", t.numel());

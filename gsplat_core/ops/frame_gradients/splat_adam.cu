@@ -1,16 +1,17 @@
-// As splat_gradients.cu with Adam over the Gaussians at the end: their gradients never go through global memory.
+// As splat_gradients.cu, followed by Adam in the same kernel. The Gaussians' gradients are never stored in global
+// memory.
 #include "warp_rows.cuh"
 
 namespace gsplat::frame {
 namespace {
 
-// The factors of Adam's update in this step, as in ../adam/adam.h.
+// Factors of the current step's Adam update, as in ../adam/adam.h.
 struct AdamFactors {
   float rates[kTensors], inv_bias2, fresh1, fresh2, epsilon;
 };
 
-// base^exponent by squaring: the step is in device memory, and a general power in double would take longer than the rest of the
-// update.
+// base^exponent by squaring. The step is in device memory, and a general double-precision power would take longer than
+// the rest of the update.
 __device__ inline double power_of(double base, int64_t exponent) {
   double result = 1;
   for (; exponent > 0; exponent /= 2, base *= base)
@@ -18,11 +19,11 @@ __device__ inline double power_of(double base, int64_t exponent) {
   return result;
 }
 
-// Even lanes compute the bias correction of the first moment, odd lanes that of the second.
+// Even lanes compute the bias correction of the first moment, odd lanes that of the second moment.
 __device__ inline AdamFactors factors_of(const Adam& adam, int lane) {
   const int64_t step_value =
       adam.step_is_long ? *static_cast<const int64_t*>(adam.step) : *static_cast<const int32_t*>(adam.step);
-  const int64_t step = step_value < 1 ? 1 : step_value;  // steps before the first are corrected like it
+  const int64_t step = step_value < 1 ? 1 : step_value;  // steps below 1 use the correction of step 1
   const double bias = 1 - power_of(lane % 2 == 0 ? adam.beta1 : adam.beta2, step);
   const double mine = lane % 2 == 0 ? 1 / bias : ::rsqrt(bias);
   const double over_bias1 = __shfl_sync(kAllLanes, mine, 0);
@@ -35,7 +36,7 @@ __device__ inline AdamFactors factors_of(const Adam& adam, int lane) {
   return f;
 }
 
-// Accurate to two units in the last place, which does not matter beside Adam's epsilon and learning rates.
+// Accurate to 2 ulp, which is negligible compared to Adam's epsilon and learning rates.
 __device__ inline float square_root(float x) {
   float y;
   asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -47,8 +48,8 @@ __device__ inline void update(float& p, float g, float& m, float& v, float rate,
   p -= __fdividef(rate * m, fmaf(square_root(v), f.inv_bias2, f.epsilon));
 }
 
-// Four values of a tensor and of its moments. Batches are loaded before any is stored: the compiler cannot know that the tensors
-// do not overlap, and would otherwise serialise loads and stores. Streaming accesses, since none is needed again soon.
+// Four values of a tensor and of its moments. All loads of a batch precede its stores: the compiler cannot prove that
+// the tensors do not overlap and would serialise them. Accesses are streaming, because the data is not reused soon.
 struct AdamQuad {
   float4 p, m, v;
 };
@@ -72,7 +73,7 @@ __device__ inline void update_value(const Adam& adam, int tensor, int64_t at, fl
   update(adam.parameters[tensor][at], g, adam.first[tensor][at], adam.second[tensor][at], f.rates[tensor], f);
 }
 
-// All tensors but the last (sh), and their columns in a raw row.
+// All tensors except the last (sh), and their columns in a raw row.
 constexpr int kSmall = kTensors - 1;
 constexpr int small_columns(int tensor) { return tensor == 1 ? 4 : tensor == 3 ? 1 : 3; }
 constexpr int small_offset(int tensor) {
@@ -84,7 +85,7 @@ __device__ inline float small_gradient(const WarpGradients<kDegree>& warp, int t
   return warp.raw.values[value / columns * warp.raw.kStride + small_offset(tensor) + value % columns];
 }
 
-// Updates `count` Gaussians from `first` on, whose gradients are all usable.
+// Update `count` Gaussians from `first` on, all of whose gradients are usable.
 template <int kDegree>
 __device__ inline void update_all(const Adam& adam, WarpGradients<kDegree>& warp, int64_t first, int count,
                                   const AdamFactors& factors, int lane) {
@@ -123,7 +124,8 @@ __device__ inline void update_all(const Adam& adam, WarpGradients<kDegree>& warp
   if (left < values) update_value(adam, kSmall, first * warp.kHarmonics + left, warp.sh.values[warp.sh.index_of(left)], factors);
 }
 
-// Updates value by value where some gradient is not usable: rows with a bit in `unusable` stay unchanged and are counted.
+// Update value by value where some gradients are not usable. Rows with a bit in `unusable` stay unchanged and are
+// counted.
 template <class Gradient>
 __device__ inline void update_some(const Adam& adam, int tensor, int columns, int64_t first, int count, unsigned unusable,
                                    const AdamFactors& factors, int lane, const Gradient& gradient) {
@@ -132,7 +134,7 @@ __device__ inline void update_some(const Adam& adam, int tensor, int columns, in
   if (lane == 0 && unusable != 0) atomicAdd(adam.skipped + tensor, (unsigned long long)(__popc(unusable)));
 }
 
-// Whether Adam can use these gradients: their squares are finite, too.
+// Return true if Adam can use these gradients: their squares must be finite too.
 template <int kCount>
 __device__ inline bool usable_gradient(const float* v) {
   bool usable = true;
@@ -177,7 +179,7 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
                   [&](int i) { return warp.sh.values[warp.sh.index_of(i)]; });
     }
   }
-  // A deformation field gets zeros for a Gaussian whose gradient is not usable.
+  // A deformation field receives zeros for a Gaussian with an unusable gradient.
   __syncwarp();
   if (mine && !usable_gradient<kRawUsed>(raw)) {
     const float none[kRawColumns] = {};

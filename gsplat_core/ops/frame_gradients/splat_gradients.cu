@@ -1,4 +1,4 @@
-// Per Gaussian: the sum of its gradient rows, and the chain rule to its raw parameters.
+// Sums each Gaussian's gradient rows, and applies the chain rule to its raw parameters.
 #include "warp_rows.cuh"
 
 namespace gsplat::frame {

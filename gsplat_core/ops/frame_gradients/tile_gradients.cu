@@ -1,7 +1,7 @@
-// The gradient of compositing: per tile, back to front, one row of sums for every instance.
+// Gradient of compositing: per tile, back to front, one row of sums per instance.
 //
-// A row is the sum over the tile's pixels in a fixed order. Unless `atomic`, every instance has a row of its own and nothing is
-// added atomically, so results are bitwise reproducible.
+// A row is the sum over the tile's pixels in a fixed order. Unless `atomic`, every instance has its own row and there
+// are no atomic additions, so results are bitwise reproducible.
 #include "../blending/blend_backward.cuh"
 #include "cuda_check.h"
 #include "frame_gradients.h"
@@ -14,8 +14,8 @@ using namespace blending;
 constexpr int kChannels = 4;  // red, green, blue, z
 static_assert(quads_of(shape_size(kChannels, false), kChannels) == kRowQuads);
 
-// The state of a pixel behind its last splat, and dL/d(its colour). The background lies behind everything, with its part of
-// dL/dalpha.
+// State of a pixel behind its last splat, and dL/d(pixel colour). The background is treated as a layer behind all
+// splats, with its contribution to dL/dalpha.
 __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& from, int x, int y, float (&v_color)[kChannels]) {
   const int64_t at = int64_t(y) * scene.width + x;
   const float4 v = reinterpret_cast<const float4*>(from.v_image)[at];
@@ -27,7 +27,7 @@ __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& f
   return {left, left * v_left, from.last[at]};
 }
 
-// A splat's row, which several tiles add to with atomics; written as an array of float4.
+// A splat's row to which several tiles add with atomics; has the interface of an array of float4.
 struct AtomicRow {
   float4* row;
 

@@ -1,5 +1,5 @@
-// Gradient rows summed and taken back to raw parameters by a warp for its 32 Gaussians. Rows go through shared memory, so that
-// tensors with many columns are read and written coalesced.
+// Gradient rows of a warp's 32 Gaussians, summed and propagated to raw parameters. Rows are staged in shared memory, so
+// that tensors with many columns are accessed coalesced.
 #pragma once
 
 #include <type_traits>
@@ -10,19 +10,19 @@ namespace gsplat::frame {
 namespace {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
-// Threads of a block: as many warps as fit into its shared memory.
+// Threads per block: as many warps as fit into its shared memory.
 template <int kDegree>
 constexpr int kSplatThreads = kDegree < 4 ? 128 : 64;
 
-// 32 rows of kColumns floats in shared memory. Rows of whole float4s are padded to an odd number of them: then neither eight
-// threads that access their rows nor eight that access consecutive float4s have bank conflicts.
+// 32 rows of kColumns floats in shared memory. Rows of whole float4s are padded to an odd number of float4s. Then
+// neither eight threads accessing their own rows nor eight threads accessing consecutive float4s have bank conflicts.
 template <int kColumns>
 struct WarpRows {
   static constexpr bool kQuads = kColumns % 4 == 0;
   static constexpr int kGap = kQuads && kColumns / 4 % 2 == 0 ? 4 : 0, kStride = kColumns + kGap;
   alignas(16) float values[32 * kStride];
 
-  // The index of value i of the unpadded rows.
+  // Index of value i of the unpadded rows.
   __device__ static int index_of(int i) { return kGap == 0 ? i : i + i / kColumns * kGap; }
   __device__ float4& quad(int i) { return *reinterpret_cast<float4*>(values + index_of(4 * i)); }
 
@@ -52,7 +52,8 @@ struct WarpRows {
   }
 };
 
-// Calls quad(i) for the whole float4s of the warp's `rows` rows and single(i) for the values that remain, over all lanes.
+// Call quad(i) for the whole float4s of the warp's `rows` rows, and single(i) for the remaining values, distributed
+// over the lanes.
 template <int kColumns, class Quad, class Single>
 __device__ inline void for_each_value(int rows, int lane, const Quad& quad, const Single& single) {
   const int values = rows * kColumns;
@@ -64,7 +65,7 @@ __device__ inline void for_each_value(int rows, int lane, const Quad& quad, cons
   }
 }
 
-// Starts an asynchronous copy of kBytes to shared memory, which wait_for_copies completes.
+// Start an asynchronous copy of kBytes to shared memory; wait_for_copies completes it.
 template <int kBytes>
 __device__ inline void start_copy(void* to, const void* from) {
   const unsigned at = unsigned(__cvta_generic_to_shared(to));
@@ -79,7 +80,7 @@ __device__ inline void wait_for_copies() {
   __syncwarp();
 }
 
-// Starts copying the rows with a bit in `selected`; `aligned`: `from` is aligned to 16 bytes.
+// Start copying the rows with a bit in `selected`. `aligned`: `from` is aligned to 16 bytes.
 template <int kColumns>
 __device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int rows, unsigned selected, bool aligned,
                                   int lane) {
@@ -101,7 +102,7 @@ __device__ inline void write_rows(WarpRows<kColumns>& from, float* to, int rows,
       rows, lane, [&](int i) { reinterpret_cast<float4*>(to)[i] = from.quad(i); }, [&](int i) { to[i] = from.values[i]; });
 }
 
-// Gradient rows staged in shared memory; those of a warp's Gaussians are contiguous.
+// Gradient rows staged in shared memory; the rows of a warp's Gaussians are contiguous.
 struct StagedRows {
   static constexpr int kCount = 96;
   float4 quads[kCount * kRowQuads];
@@ -115,9 +116,9 @@ __device__ inline void add_row(const float4* row, SplatRow& sum) {
   for (int i = 0; i < 4; ++i) sum.colors[i] += values[6 + i];
 }
 
-// For each lane, the sum of `count` rows from `start` on, in an order that depends on the counts alone: one after the other, but
-// rows of a splat with very many are added up by the whole warp. A lane without rows has the start of the next lane that has
-// some.
+// Return to each lane the sum of `count` rows from `start` on, in an order that depends only on the counts. A lane adds
+// its rows sequentially; the whole warp adds the rows of a splat with very many. A lane without rows must have the
+// start of the next lane that has rows.
 __device__ inline SplatRow sum_rows(const float4* rows, int start, int count, int lane, StagedRows& staged) {
   constexpr int kManyRows = 64;
   SplatRow sum = {};
@@ -155,7 +156,8 @@ __device__ inline SplatRow sum_rows(const float4* rows, int start, int count, in
   return sum;
 }
 
-// What a warp computes: the raw gradients of its 32 Gaussians, and in place of their coefficients the coefficients' gradients.
+// Results of a warp: the raw gradients of its 32 Gaussians, and the coefficients' gradients, stored over the
+// coefficients.
 template <int kDegree>
 struct WarpGradients {
   static constexpr int kHarmonics = 3 * kBasesOf<kDegree>;
@@ -165,7 +167,7 @@ struct WarpGradients {
     WarpRows<kRawColumns> raw;
   };
 
-  // For `rows` Gaussians from `first` on.
+  // Compute the gradients of `rows` Gaussians from `first` on.
   __device__ void compute(const Scene& scene, const Camera& camera, const Lists& lists, const PictureGradient& from,
                           int64_t first, int rows, int lane) {
     const int64_t n = first + min(lane, rows - 1);
@@ -181,7 +183,7 @@ struct WarpGradients {
       sum = sum_rows(from.rows, start, count, lane, instances);
     }
     const bool corrects = kDegree == 0 && from.correction.residuals != nullptr;
-    const float weight = sum.colors[3];  // if it corrects; else dL/dz
+    const float weight = sum.colors[3];  // sum of the weights for colour corrections, otherwise dL/dz
     if (corrects) sum.colors[3] = 0;
     RawGradient g = {};
     if (count > 0) g = projection_gradient(scene, camera, gaussian, sum);
@@ -207,7 +209,7 @@ struct WarpGradients {
   }
 };
 
-// run(degree as a constant) for a number of bases, which the host has checked.
+// Call run with the degree, as a constant, of a number of bases that the host has checked.
 template <class Run>
 void with_degree(int bases, const Run& run) {
   switch (bases) {

@@ -1,5 +1,6 @@
-// Features of one level and their gradients. Backward: one gradient row per plane and point, then every node of a plane adds the
-// rows around it in the order of the points within each cell: no atomic additions of floats, bitwise reproducible.
+// Features of one level and their gradients. The backward pass writes one gradient row per plane and point. Every node
+// of a plane then adds the surrounding rows, in the order of the points within each cell. There are no atomic float
+// additions, so results are bitwise reproducible.
 #include "cub_device.cuh"
 #include "cuda_scratch.h"
 #include "plane_samples.cuh"
@@ -44,7 +45,7 @@ __global__ void __launch_bounds__(kThreads) modulate(HexPlanes level, const floa
   }
 }
 
-// Whether every row of channels is aligned to 16 bytes.
+// Return true if every row of channels is aligned to 16 bytes.
 bool wide(const HexPlanes& level, int planes, const void* a, const void* b) {
   uintptr_t bits = uintptr_t(level.channels) * 4 | uintptr_t(a) | uintptr_t(b);
   for (int p = 0; p < planes; ++p) bits |= uintptr_t(level.planes[p].values);
@@ -56,7 +57,7 @@ __global__ void __launch_bounds__(kThreads)
     sample_gradients(HexPlanes level, const float* __restrict__ gradient, const int32_t* __restrict__ ranks, float* rows,
                      float* fractions, float* v_coordinates, int64_t count) {
   const int64_t index = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
-  const int64_t n = index < count ? index : count - 1;  // lanes past the end take part in the sums
+  const int64_t n = index < count ? index : count - 1;  // lanes past the end take part in the warp's sums
   const int lane = int(threadIdx.x) % kTeam, channels = int(level.channels);
   float x[4], v_x[4] = {};
   for (int axis = 0; axis < 4; ++axis) x[axis] = level.coordinates[4 * n + axis];
@@ -106,7 +107,7 @@ __global__ void __launch_bounds__(kThreads)
   const float* x = level.coordinates + 4 * n;
   const int64_t key =
       cells.first[p] + position_on(x[v_axis(p)], plane.height).cell * plane.width + position_on(x[u_axis(p)], plane.width).cell;
-  atomicAdd(counts + key, 1);  // whole numbers: their sum does not depend on the order
+  atomicAdd(counts + key, 1);  // integer sums do not depend on the order
   keys[p * count + n] = uint32_t(key);
   items[p * count + n] = int32_t(p * count + n);
 }
@@ -124,7 +125,7 @@ __global__ void __launch_bounds__(kThreads) add_rows(SortedCells cells, float* g
       .store(gradient + i);
 }
 
-// A dense layer of any size in float32: tiles of 64 rows and 64 outputs in shared memory, 4 x 4 of them per thread.
+// Dense float32 layer of any size: tiles of 64 rows and 64 outputs in shared memory, 4 x 4 of them per thread.
 constexpr int kTile = 64, kDeep = 16;
 
 __global__ void __launch_bounds__(kThreads)
