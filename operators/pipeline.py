@@ -216,14 +216,17 @@ class Pipeline(Application):
         self.source_op = SourceOp(
             self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=self._seconds
         )
-        is_analysed, learns = pace.session is not None, pace.predict_every > 0
+        learns = pace.predict_every > 0
+        # Frames of a session were analysed when they were recorded. A finished model is displayed and scored with the
+        # frames that it was trained on.
+        is_analysed = pace.session is not None or not learns
         depth = DepthOp(
             self,
             name="depth",
-            choice="recorded" if is_analysed else settings.depth,
+            choice="recorded" if pace.session is not None else settings.depth,
             camera=about.camera,
             in_background=pace.clock is not None,
-            # A graph that only displays a finished model does not use depth.
+            # A finished model does not use depth.
             has_time=learns and pace.clock is None,
             device=settings.device,
             held_out=pace.held_out,
@@ -266,10 +269,9 @@ class Pipeline(Application):
     def _analysis(self, depth: DepthOp, is_analysed: bool) -> Sequence[Operator]:
         """Return the operators between source and reconstruction, in order."""
         settings, recorder = self.settings, self.outputs.recorder
-        poses = pose_operators(
-            self, "given" if is_analysed else settings.poses, self.frame_source.description.camera, settings.depth
-        )
-        if not isinstance(settings, EngineOptions):
+        choice = "given" if self.pace.session is not None else settings.poses
+        poses = pose_operators(self, choice, self.frame_source.description.camera, settings.depth)
+        if is_analysed:
             return RecordedToolMaskOp(self, name="tool_mask"), *poses, depth
         return (
             analysis_operator(

@@ -216,6 +216,6 @@ class ReconstructOp(Operator):
         counts = self.counts
         outcome.add(TrainedEyes(self._eyes))
         outcome.add(replace(counts, withheld=dict(counts.withheld), scenes=dict(counts.scenes)))
-        self.training.contribute(outcome)
+        self.training.contribute(outcome, counts)
         if self.model is not None:
             outcome.add(ModelResult(self.model))

@@ -173,8 +173,23 @@ class OfflineSection(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ChecksSection(Section):
+    """Checks of the frames."""
+
+    tool_mask: Annotated[
+        str,
+        Option("Tools in frames without a mask", (*REPLAYS, *LIVE)),
+        Names(TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS),
+    ] = "builtin"
+    out_of_body: Annotated[
+        Policy,
+        Option("Pictures from outside of the body: withhold them, or off to let them pass", (*REPLAYS, *LIVE)),
+    ] = "withhold"
+
+
+@dataclass(frozen=True, kw_only=True)
 class LiveSection(Section):
-    """Checks and clock of a live run."""
+    """Clock of a live run."""
 
     budget_ms: Annotated[
         float | None,
@@ -188,17 +203,18 @@ class LiveSection(Section):
             le=10_000,
         ),
     ] = None
-    tool_mask: Annotated[
-        str, Option("Tools in frames without a mask", LIVE), Names(TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS)
-    ] = "builtin"
-    out_of_body: Annotated[
-        Policy, Option("Pictures from outside of the body: withhold them, or off to let them pass", LIVE)
-    ] = "withhold"
 
 
 @dataclass(frozen=True, kw_only=True)
 class JobOptions(
-    ReconstructSection, DepthSection, DisplaySection, SourceSection, LengthSection, ScheduleSection, OutputSection
+    ReconstructSection,
+    DepthSection,
+    ChecksSection,
+    DisplaySection,
+    SourceSection,
+    LengthSection,
+    ScheduleSection,
+    OutputSection,
 ):
     """Options of a replay job, as stored with the job. A job of `intrasplat batch` may name local files."""
 
@@ -214,7 +230,7 @@ class ReconstructOptions(JobOptions, OfflineSection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EngineOptions(ReconstructSection, DepthSection, DisplaySection, LiveSection):
+class EngineOptions(ReconstructSection, DepthSection, ChecksSection, DisplaySection, LiveSection):
     """Options of a live reconstruction, by `intrasplat live` or by a stream's engine process."""
 
 

@@ -199,15 +199,15 @@ class Training(ABC):
     def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:  # noqa: B027
         """Use the time after the frame's model was published. Arguments as for `learn`."""
 
-    def contribute(self, outcome: OutcomeBuilder) -> None:  # noqa: B027
-        """See `Contributor`."""
+    def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:  # noqa: B027
+        """Add results and notes to the outcome of the run. `counts` are those of its learner."""
 
 
 class EveryFrame(Training):
     """Trains the configured number of steps on each frame.
 
-    Damaged, withheld and held-out frames are displayed with the newest model. The first frame is
-    trained on even if it is held out, because the following ones need a model.
+    Damaged, withheld and held-out frames are displayed with the newest model. The first frame of a
+    scene is trained on even if it is held out, because the following ones need a model.
     """
 
     def __init__(self, held_out: Callable[[Frame], bool] = lambda frame: False) -> None:
@@ -221,6 +221,17 @@ class EveryFrame(Training):
             return None
         train = learner.newest is None or (usable and not self._held_out(frame))
         return learner.observe(frame, train=train)
+
+    def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
+        """See `Training.contribute`."""
+        if counts.withheld:
+            reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(counts.withheld.items()))
+            outcome.note(f"{sum(counts.withheld.values())} frames were neither trained on nor scored ({reasons})")
+        if counts.scenes:
+            reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(counts.scenes.items()))
+            outcome.note(
+                f"the frames show {1 + sum(counts.scenes.values())} scenes ({reasons}); the saved model is that of the last one"
+            )
 
 
 class UntilDisplay(Training):
@@ -311,8 +322,8 @@ class UntilDisplay(Training):
         if frame.arrived_ns is not None:
             self._depth_ages.record(self._clock.now_ns() - frame.arrived_ns)
 
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+    def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
+        """See `Training.contribute`."""
         age_ms = self._depth_ages.summary().p50_ms
         outcome.add(TakenDepth(self._depths_taken, age_ms, self._depths_dropped))
         if self._depths_taken:
@@ -424,8 +435,8 @@ class RecordedCalls(Training):
     def _miss(self, seq: int) -> None:
         self.missing = seq if self.missing is None else self.missing
 
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+    def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
+        """See `Training.contribute`."""
         if self.missing is not None:
             outcome.note(
                 f"frame {self.missing} was trained on in the session and is not in its recording, or its depth is not: later pictures may differ"

@@ -379,7 +379,7 @@ def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
     size = small.width_px, small.height_px
     grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
     tissue = np.ones((height, width), np.uint8)
-    for mask in (frame.mask, frame.loss_mask, frame.rehearsal_mask):
+    for mask in (frame.mask, frame.loss_mask):
         if mask is not None:
             tissue &= (mask != 0).astype(np.uint8)
     return View(

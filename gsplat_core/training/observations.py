@@ -142,10 +142,14 @@ class ObservationWindow:
 
     def __init__(self, capacity: int, seed: int) -> None:
         self._frames: deque[Observation] = deque(maxlen=capacity)
+        """Frames as they are trained on again later."""
+        self._whole_newest: Observation | None = None
+        """Newest frame before its display."""
         self._random = np.random.default_rng(seed)
 
     def add(self, observation: Observation) -> None:
         """Add an observation as the newest; a full window drops the oldest."""
+        self._whole_newest = observation
         self._frames.append(observation.to_rehearse())
 
     @property
@@ -167,6 +171,9 @@ class ObservationWindow:
         for index in reversed(range(len(self._frames))):
             if self._frames[index].seq == observation.seq:
                 self._frames[index] = observation
+                newest = self._whole_newest
+                if newest is not None and newest.seq == observation.seq:
+                    self._whole_newest = replace(newest, depth=observation.depth)
                 return
         raise InvalidInput(f"frame {observation.seq} is not in the window of {len(self._frames)} frames")
 
@@ -187,13 +194,14 @@ class ObservationWindow:
 
     def schedule(self, steps: int) -> list[Observation]:
         """Return observations for the next steps, ending with the newest frame, which is displayed
-        next.
+        next and therefore trained on without its `rehearsal_mask`.
         """
         if steps < 0:
             raise InvalidInput(f"steps is {steps}; it must be at least 0")
         if steps == 0:
             return []
-        newest = self._frames[-1]
+        newest = self._whole_newest
+        assert newest is not None
         older = len(self._frames) - 1
         if older == 0:
             return [newest] * steps

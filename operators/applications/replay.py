@@ -47,6 +47,7 @@ from operators.sources.recording import SessionSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
+from operators.tool_mask import check_tool_mask
 
 PIXELS_PER_GAUSSIAN = 4
 
@@ -64,6 +65,7 @@ class ReplaySettings(ReplayOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_depth(self.depth)
+        check_tool_mask(self.tool_mask)
 
     @property
     def inputs(self) -> tuple[Path, ...]:

@@ -8,7 +8,9 @@ import torch
 
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
+from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.transfers import HostCopy
+from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ReconstructOp
 from operators.training import EveryFrame
 from tests.operators.conftest import HEIGHT, WIDTH
@@ -39,6 +41,10 @@ class FakeReconstructor:
         self.calls.append(("publish", self.version))
         return self.make_model(self.version)
 
+    def begin_scene(self, frame):
+        self.calls.append(("begin_scene", frame.seq))
+        return False
+
     def whole_model(self, shown):
         return shown.as_model()
 
@@ -68,6 +74,35 @@ def test_held_out_frames_are_passed_on_and_never_trained_on(frame, model, comput
         ("observe", 2, True),
     ]
     assert (messages[1].steps, messages[1].loss) == (0, None)
+
+
+def test_withheld_frames_are_shown_and_a_cut_begins_a_scene_without_a_clock(frame, model, compute):
+    fake = FakeReconstructor(model)
+    operator = ReconstructOp(None, make_reconstructor=lambda: fake, training=EveryFrame())
+    operator.start()
+    frames = [
+        frame(0, withheld="black"),
+        frame(1),
+        frame(2, withheld="blur"),
+        frame(3, status=FrameStatus.DAMAGED),
+        frame(4, new_scene="cut", scene=1, withheld="smoke"),
+        frame(5, scene=1),
+    ]
+    shown = [message for each in frames for message in compute(operator, frame=each)]
+    assert [(message.frame.seq, message.trained, message.content.seq) for message in shown] == [
+        (1, True, 1),
+        (2, False, 1),
+        (3, False, 1),
+        (5, True, 5),
+    ]
+    assert ("begin_scene", 5) in fake.calls and fake.calls.count(("begin_scene", 5)) == 1
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.notes == (
+        "4 frames were neither trained on nor scored (black: 1, blur: 1, damaged: 1, smoke: 1)",
+        "the frames show 2 scenes (begun by a frame that was not used: 1); the saved model is that of the last one",
+    )
 
 
 def test_the_first_frame_is_trained_on_even_when_it_is_held_out(frame, model, compute):

@@ -11,7 +11,7 @@ from gsplat_core.io.bundle import load_bundle
 from services.reports.schema import RunReport
 
 QUICK = ("--steps-per-frame", "2")
-PATH = "source,tool_mask,depth,reconstruct,deform,rasterize,"
+PATH = "source,analysis,reconstruct,deform,rasterize,"
 
 
 def test_everything_is_written_and_fits_together(finished, tiny):
@@ -31,8 +31,7 @@ def test_everything_is_written_and_fits_together(finished, tiny):
     assert {name: times.calls for name, times in report.operators.items()} == dict.fromkeys(
         (
             "source",
-            "tool_mask",
-            "depth",
+            "analysis",
             "reconstruct",
             "deform",
             "rasterize",

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.recordings import open_recording
 from gsplat_core.training.config import ReconstructorConfig
 from operators import pipeline as pipeline_module
 from operators.applications import replay as replay_module
@@ -22,6 +25,7 @@ from operators.metrics import NextFrameResult, QualityResult
 from operators.reconstruct import ModelResult
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
+from operators.training import TrainingCounts
 
 
 def ingested(outcome):
@@ -208,3 +212,16 @@ def test_progress_has_the_previous_frame_beside_the_training_error(settings):
     replay(settings, events.append)
     assert [event.previous_frame_db is None for event in events] == [True, True, False, False, False]
     assert all(event.trained for event in events)
+
+
+def test_a_black_picture_is_withheld_as_in_a_live_stream(tiny, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for frame in open_recording(tiny):
+        picture = frame.image if frame.seq != 2 else np.zeros_like(frame.image)
+        cv2.imwrite(str(folder / f"{frame.seq:03d}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    outcome = replay(ReplaySettings(recording=folder, out=tmp_path / "out", steps_per_frame=1, out_of_body="off"))
+    training, quality = outcome.find(TrainingCounts), outcome.find(QualityResult)
+    assert training.withheld == {"black": 1} and training.frames == 3
+    assert (quality.frames, quality.trained.count) == (4, 3)
+    assert any("neither trained on nor scored (black: 1)" in note for note in outcome.notes)
