@@ -1,7 +1,8 @@
-"""Checks of endoscopic video: stages that annotate each frame, one per fault, and the operator that runs them in sequence.
+"""Checks of endoscopic video. Each stage annotates frames with one kind of fault; operators run the stages in sequence.
 
-`STAGES` lists them in the order in which a stream runs them. On ordinary frames some stages only take turns, to save time; every unusual frame is examined
-by all of them. The analysis of pictures is in `gsplat_core.endoscope`.
+`PICTURE_STAGES` and `TISSUE_STAGES` list the stages in order of execution. A frame is ordinary if its picture is as
+expected from the previous ones. To save time, each ordinary frame is checked by some of the stages in rotation. An
+unusual frame is checked by every stage. The image analysis is in `gsplat_core.endoscope`.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class StageCounts:
-    """Statistics of a stage in one run. Each stage has its own class, so that an outcome holds all of them."""
+    """Statistics of a stage in one run. One subclass per stage, because `OutcomeBuilder` stores one part per class."""
 
     frames: int
     """Number of frames the stage ran on."""
@@ -61,19 +62,19 @@ class Stage(ABC):
         self.found: Counter[str] = Counter()
         self.reset()
 
-    def reset(self) -> None:  # noqa: B027 - not every stage keeps something
+    def reset(self) -> None:  # noqa: B027 - stateless stages do not override it
         """Clear the state, at the start of a stream."""
 
     @abstractmethod
     def annotate(self, frame: Frame) -> Frame:
-        """Return the frame with the findings added."""
+        """Return the frame with the stage's findings in its fields."""
 
     def carried(self, frame: Frame) -> Frame:
-        """Return a skipped frame with the lasting results of the last annotated frame."""
+        """Return a frame that skips `annotate`, with results that stay valid between frames, such as a loss mask."""
         return frame
 
     def apply(self, frame: Frame) -> Frame:
-        """Annotate and count the frame."""
+        """Count the frame and return it annotated."""
         self.frames += 1
         return self.annotate(frame)
 
@@ -131,7 +132,7 @@ class StageOp(Operator):
 
 
 def tissue_of(frame: Frame) -> NDArray[np.uint8] | None:
-    """Return the mask of tissue whose pixels count, uint8 [H, W], 0 = excluded; None if all pixels do."""
+    """Return the intersection of tool mask and loss mask, uint8 [H, W], 0 = excluded; None if the frame has neither."""
     if frame.mask is None or frame.loss_mask is None:
         return frame.mask if frame.loss_mask is None else frame.loss_mask
     return np.minimum(frame.mask, frame.loss_mask)
@@ -150,14 +151,15 @@ def left_out(frame: Frame, kept: NDArray[np.uint8]) -> Frame:
 
 @dataclass(frozen=True)
 class OrdinaryFrames:
-    """Numbers of frames examined by all stages, and of ordinary frames."""
+    """Number of unusual frames, checked by every stage (`looked`), and of ordinary frames, checked by some stages."""
 
     looked: int
     ordinary: int
 
 
 class OrdinaryStream:
-    """State shared by two operators in sequence: the current frame's class and the stages due on it."""
+    """State shared by `PictureStagesOp` and `TissueStagesOp`: whether the current frame is ordinary, and its due
+    stages."""
 
     def __init__(self) -> None:
         self.pictures = OrdinaryPictures()
@@ -166,7 +168,7 @@ class OrdinaryStream:
         self.reset()
 
     def join(self, stages: int) -> range:
-        """Register `stages` further stages. Return their member numbers for `looks`."""
+        """Register `stages` further stages for the rotation. Return their member numbers, the argument of `looks`."""
         first, self._members = self._members, self._members + stages
         return range(first, self._members)
 
@@ -178,7 +180,7 @@ class OrdinaryStream:
         self._due: frozenset[int] = frozenset()
 
     def begin(self, ordinary: bool, pts_ns: int) -> None:
-        """Start the next frame. On an ordinary frame only the due stages run, otherwise all."""
+        """Select the stages for the next frame: those due in the rotation if it is `ordinary`, otherwise all."""
         self.frame_is_ordinary = ordinary
         if ordinary:
             self._due = self._turns.due(pts_ns)
@@ -191,10 +193,10 @@ class OrdinaryStream:
 
 
 class PictureStagesOp(StageOp):
-    """Runs its first stage on each frame, and the other stages on unusual frames or in turn.
+    """Runs its first stage on each frame. The other stages run on unusual frames, and in rotation on ordinary ones.
 
-    On an ordinary frame a skipped stage carries its previous result over. When a stage finds something unusual, all
-    later stages run on the frame, and all stages run on the next one.
+    A stage that is skipped on an ordinary frame reuses its previous result (`Stage.carried`). If a stage changes more
+    than masks or withholds the frame, all later stages run on this frame, and all stages run on the next frame.
 
     Inputs:
         frame: `Frame`.
@@ -203,7 +205,7 @@ class PictureStagesOp(StageOp):
         frame: `Frame` with more fields.
 
     Params:
-        stages: stages that need the picture alone; the first compares each picture with the previous one.
+        stages: stages that use no field but the picture; the first compares each picture with the previous one.
         stream: state shared with the following `TissueStagesOp`.
     """
 
@@ -248,7 +250,7 @@ def _settled(frame: Frame, came: Frame) -> bool:
 
 
 class TissueStagesOp(StageOp):
-    """Runs some stages on each frame, and others on unusual frames or in turn.
+    """Runs some stages on each frame. The others run on unusual frames, and in rotation on ordinary ones.
 
     Inputs:
         frame: `Frame`.
@@ -258,7 +260,7 @@ class TissueStagesOp(StageOp):
 
     Params:
         always: stages that run on every frame.
-        stages: stages that run on unusual or withheld frames, and in turn on ordinary ones.
+        stages: stages that run on every unusual or withheld frame, and in rotation on ordinary frames.
         stream: state shared with the preceding `PictureStagesOp`.
     """
 
@@ -309,7 +311,7 @@ class SequenceStage(Stage):
         if timing.pts_ns != frame.pts_ns:
             frame = frame.with_fields(pts_ns=timing.pts_ns)
         if timing.finding == OUT_OF_ORDER:
-            # A late picture is not compared with its neighbours, which are consecutive.
+            # `SequenceCheck` compares consecutive pictures, so a late picture must not reach it.
             return self.withhold(frame, OUT_OF_ORDER)
         if timing.finding is not None:
             self.found[timing.finding] += 1
@@ -321,11 +323,11 @@ class SequenceStage(Stage):
 
 @dataclass(frozen=True)
 class MaskAndDepthCounts(StageCounts):
-    """Frames withheld for their mask, and frames whose depth was repaired or removed."""
+    """Number of frames withheld because of their tool mask, and of frames whose depth was repaired or removed."""
 
 
 class MaskAndDepthStage(Stage):
-    """Withholds frames whose tool mask shows no tissue or was lost, and removes invalid depth.
+    """Withholds frames whose tool mask shows no tissue or suddenly lacks the tool, and removes invalid depth.
 
     It must run after the stage that sets `Frame.mask`. A frame without valid depth is trained on without it.
     """
@@ -347,7 +349,7 @@ class MaskAndDepthStage(Stage):
 
 @dataclass(frozen=True)
 class InterlacingCounts(StageCounts):
-    """Frames that were de-interlaced."""
+    """Number of de-interlaced frames."""
 
 
 class InterlacingStage(Stage):
@@ -374,7 +376,7 @@ class InterlacingStage(Stage):
 
 @dataclass(frozen=True)
 class FieldOfViewCounts(StageCounts):
-    """Frames with a limited field of view."""
+    """Number of frames whose field of view does not fill the picture."""
 
 
 class FieldOfViewStage(Stage):
@@ -399,7 +401,7 @@ class FieldOfViewStage(Stage):
 
 @dataclass(frozen=True)
 class StripCounts(StageCounts):
-    """Frames with a status bar or text."""
+    """Number of frames with a status bar or text at the border."""
 
 
 class StripStage(Stage):
@@ -424,7 +426,7 @@ class StripStage(Stage):
 
 @dataclass(frozen=True)
 class HighlightCounts(StageCounts):
-    """Frames with highlights."""
+    """Number of frames with specular highlights."""
 
 
 class HighlightStage(Stage):
@@ -445,7 +447,8 @@ class HighlightStage(Stage):
 
 @dataclass(frozen=True)
 class ExposureCounts(StageCounts):
-    """Frames whose exposure differs from that of their scene, and frames in which it was changing."""
+    """Number of frames whose exposure differs from the start of their scene, and of frames during an exposure
+    change."""
 
 
 class ExposureStage(Stage):
@@ -476,7 +479,7 @@ class ExposureStage(Stage):
 
 @dataclass(frozen=True)
 class SharpnessCounts(StageCounts):
-    """Frames withheld for blur and for smoke."""
+    """Number of frames withheld for blur and for smoke."""
 
 
 class SharpnessStage(Stage):
@@ -504,12 +507,12 @@ IN_DOUBT = "cut in doubt"
 
 @dataclass(frozen=True)
 class CutCounts(StageCounts):
-    """New scenes by reason (cut, returned, resized, frame rate), and frames withheld as possible cuts."""
+    """Number of new scenes by reason (cut, returned, resized, frame rate), and of frames withheld as possible cuts."""
 
 
 @dataclass(frozen=True)
 class SceneCounts(StageCounts):
-    """Number of frames that were given a scene number; `CutCounts` has the reasons for new scenes."""
+    """Number of frames that `SceneNumberStage` has numbered; `CutCounts` has the reasons for new scenes."""
 
 
 class SceneNumberStage(Stage):
@@ -530,7 +533,7 @@ class SceneNumberStage(Stage):
 
 
 class CutStage(Stage):
-    """Sets `Frame.new_scene` at cuts, never on a withheld or damaged frame.
+    """Sets `Frame.new_scene` on the first usable frame after a cut, never on a withheld or damaged frame.
 
     It must run after all stages that withhold pictures. A frame that may be a cut is withheld, and
     the next frame decides.

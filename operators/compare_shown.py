@@ -20,7 +20,7 @@ class ShownComparison:
     """Counts of replayed pictures that match or differ from the recorded ones."""
 
     same: int
-    """Pictures with the same SHA-256."""
+    """Number of replayed pictures whose SHA-256 equals that of the recorded picture."""
     different: int
     first_different: int | None
     """Sequence number of the first frame whose picture differs; None if all match."""

@@ -221,7 +221,7 @@ class BackgroundDepth:
                     self._put(frame.with_fields(**fields), places=scene != placed)
                     placed = scene
                 self._rest((time.thread_time() - began_s) * (1 / self._share - 1))
-        except BaseException as error:  # noqa: BLE001 - carried to the operator of this thread
+        except BaseException as error:  # noqa: BLE001 - raised again in the operator's thread by `raise_failure`
             self._failure = error
 
     def _next(self) -> Frame | None:
@@ -243,7 +243,7 @@ class BackgroundDepth:
             self._changed.wait_for(lambda: self._over, seconds)
 
     def raise_failure(self) -> None:
-        """Raise the exception that ended the thread, once."""
+        """Raise the exception that ended the background thread; later calls do nothing."""
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
@@ -333,11 +333,11 @@ class DepthOp(Operator):
 
 @dataclass(frozen=True)
 class TakenDepth:
-    """Statistics of depth that a live model received after the frames."""
+    """Statistics of late depth: estimates used by a live model after it was trained on their frames."""
 
     frames: int
-    """Number of frames whose depth was used."""
+    """Number of frames whose late depth the model has used."""
     age_p50_ms: float
     """Median delay from the frame's arrival to the use of its depth, in milliseconds."""
     dropped: int
-    """Rejected estimates, for example of an earlier scene or of a frame too old."""
+    """Number of late estimates that the model rejected, for example of an earlier scene or of a frame too old."""

@@ -122,8 +122,8 @@ class FrameClock:
         Args:
             frame: the frame to be trained on; its arrival updates the frame interval.
             first: the frame is the first of a scene and gets a larger budget.
-            behind: further frames are queued. The frame then gets no time past its deadline and
-                fewer minimum steps, so that the queue is worked off.
+            behind: further frames are queued. The frame then gets no time past its deadline and fewer minimum steps, so
+                that the queue drains.
         """
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns

@@ -38,13 +38,13 @@ class Legend:
     """Colours from `low` to `high`, evenly spaced."""
 
     def said(self) -> dict[str, Any]:
-        """Return the legend as JSON for the header of a picture."""
+        """Return the legend as JSON values for a picture's header."""
         low, high = (float(f"{value:.4g}") for value in (self.low, self.high))
         return {"unit": self.unit, "low": low, "high": high, "stops": list(self.stops), "unobserved": _hex(UNOBSERVED)}
 
 
 class DepthColours:
-    """False colours of depth with a slowly adapting range; near is warm. Not thread-safe."""
+    """False colours of depth, warm for near surfaces, with a slowly adapting depth range. Not thread-safe."""
 
     def __init__(self) -> None:
         self._range: tuple[float, float] | None = None

@@ -64,8 +64,8 @@ class ScoredFrame:
 
 @dataclass(frozen=True)
 class NextFrameResult:
-    """Accuracy of predictions of frames before training on them, as opposed to the training
-    error.
+    """Accuracy of pictures predicted before training on their frames. Unlike the scores of displayed pictures, it is no
+    training error.
     """
 
     psnr_tissue_db: float | None
@@ -83,16 +83,14 @@ class NextFrameScores:
         self._predicted, self._previous = ScoredMean(), ScoredMean()
 
     def add(self, predicted_db: float, previous_db: float) -> None:
-        """Add the PSNR of one frame's prediction and of the previous frame shown in its place, in dB. Ignored if
-        either is not finite.
-        """
+        """Add one frame's scores in dB: its prediction and the previous raw frame. Ignored if either is not finite."""
         if math.isfinite(predicted_db) and math.isfinite(previous_db):
             self._predicted.add(predicted_db)
             self._previous.add(previous_db)
 
     @property
     def result(self) -> NextFrameResult:
-        """Means over the frames so far."""
+        """Return the means over the frames so far."""
         return NextFrameResult(self._predicted.mean, self._previous.mean, self._predicted.count)
 
 
@@ -131,7 +129,7 @@ PREDICTIONS_KEPT = 64
 TRIM_EVERY_S = 30.0
 """Period for returning free heap memory to the operating system, in seconds."""
 SIMILARITY_EVERY = 8
-"""SSIM is several times slower than PSNR, so it is computed for one in this many frames."""
+"""Compute SSIM for one in this many frames, because it is several times slower than PSNR."""
 SETTLING_S = 1.0
 """Start-up time in seconds that is excluded from settled scores, because the model is being
 initialised.
@@ -149,7 +147,7 @@ class OnScreenResult:
     worst_db: float | None
     """Lowest tissue PSNR of a frame after the first second, in dB."""
     worst_seq: int | None
-    """Sequence number of the frame with the lowest PSNR."""
+    """Sequence number of the frame with the PSNR `worst_db`."""
     previous_frame_db: float | None
     """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial
     baseline).
@@ -161,7 +159,8 @@ class OnScreenResult:
     frames: int
     """Number of scored frames."""
     not_on_screen: int
-    """Scored frames whose own picture was not on display when the next frame arrived."""
+    """Number of frames scored against an older picture, because their own was not on display when the next frame
+    arrived."""
     unscored: int
     """Frames that arrived too fast to be scored."""
 
@@ -192,7 +191,7 @@ class PictureDigest:
         return self._digest.hexdigest()
 
     def close(self) -> None:
-        """End the thread. The digest stays readable."""
+        """End the hashing thread. `hexdigest` remains usable."""
         if self._thread is not None:
             self._thread.shutdown()
 
@@ -202,9 +201,9 @@ class PictureDigest:
 
 
 class OnScreen:
-    """Assignment of frames to the pictures on display when their next frames arrived.
+    """Assigns to each frame the picture that was on display when the following frame arrived.
 
-    This is a frame's own picture or, if that was late, an older one.
+    This is the frame's own reconstruction or, if that was late, the reconstruction of an older frame.
     """
 
     def __init__(self, show: Callable[[ShownPicture], None]) -> None:
@@ -223,17 +222,17 @@ class OnScreen:
             self._shown.append(shown)
 
     def add_frame(self, frame: Frame) -> None:
-        """Add the next frame."""
+        """Add a frame in the order of arrival."""
         self._frames.append(frame)
 
     def end(self) -> None:
-        """End the stream. The last frame has no successor and gets the final picture."""
+        """Mark the end of the stream, so that `pairs` assigns the final picture to the last frame."""
         if self._frames:
             self._frames.append(None)
 
     def pairs(self, waiting: int) -> Iterator[tuple[Frame, ShownPicture | None, float]]:
-        """Yield the oldest frames until `waiting` remain, each with its picture and the arrival of
-        the next frame in nanoseconds. The picture is None if there is none of the frame's size.
+        """Yield the oldest frames until `waiting` frames remain, each with its assigned picture and the arrival time of
+        the following frame in nanoseconds. The picture is None if none of the frame's size was on display.
         """
         while len(self._frames) > max(1, waiting):
             frame, following = self._frames.popleft(), self._frames[0]
@@ -283,7 +282,7 @@ class MetricsOp(Operator):
     """
 
     _previous: Frame | None
-    """Newest frame, the trivial baseline of the next one."""
+    """Newest raw frame; the trivial baseline for the prediction of the next frame."""
 
     def __init__(
         self,

@@ -45,11 +45,11 @@ MAX_TEXT = 4096
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """Annotation of a text that names an entry of a registry. Entries added at run time are accepted.
+    """Annotation of a string option whose values are names in a registry, including names registered at run time.
 
     Args:
-        registry: the entries.
-        addresses: entries that are followed by a colon and an address, with an example of the syntax.
+        registry: mapping whose keys are the accepted names.
+        addresses: names that must be followed by a colon and an address, with an example of the syntax.
         more: accepted names that are not in the registry.
     """
 
@@ -59,14 +59,15 @@ class Names:
 
     @property
     def choices(self) -> list[str]:
-        """Return the accepted texts; an entry with an address as in `addresses`."""
+        """Return the accepted values; for a name with an address, the example from `addresses`."""
         return [*self.more, *(self.addresses.get(name, name) for name in self.registry)]
 
     def check(self, value: str) -> str:
         """Return the value.
 
         Raises:
-            ValueError: for an unknown name, a missing address or a superfluous one; the message continues "NAME is VALUE; ".
+            ValueError: for an unknown name, a missing address or a superfluous one. The message completes the sentence
+            "NAME is VALUE; …".
         """
         name, colon, address = value.partition(":")
         if name in self.addresses and name in self.registry and not address:
@@ -101,7 +102,7 @@ class Option:
         commands: uses that the option applies to; empty for a value that the service sets itself.
         unit: unit of the value.
         null: meaning of None, such as "its own".
-        word: word of the command line for None, if a value may also be given as a word.
+        word: spelling of None on the command line, such as "auto"; None if it has no spelling.
         flag: spelling of a yes-or-no option on the command line; None for `--name`.
         gt, ge, lt, le: range of a number.
         least_length: minimum length of a text.
@@ -155,8 +156,8 @@ def _either(words: list[str]) -> str:
 
 
 def _strict(kind: Any, limits: Mapping[str, Any], least_length: int | None) -> Any:
-    """Return a type that pydantic accepts without conversions, such as true for the number 1, and with limits for its
-    numbers."""
+    """Return the pydantic type of an option's values: strict, without conversions such as true to 1, and with its
+    limits."""
     from pydantic import BeforeValidator, Field
 
     if get_origin(kind) in (Union, UnionType):
@@ -173,7 +174,8 @@ def _strict(kind: Any, limits: Mapping[str, Any], least_length: int | None) -> A
 
 
 def _listed(value: Any) -> Any:
-    """Return the words of a text such as "video,keyframes", of which "none" means no word."""
+    """Split a comma-separated string such as "video,keyframes"; "none" gives an empty tuple. Other types are
+    unchanged."""
     if isinstance(value, str):
         return () if value == "none" else tuple(value.split(","))
     return value
@@ -187,12 +189,12 @@ class Declared:
     option: Option
     hint: Any
     kind: Any
-    """Type without `Option` and None."""
+    """Type of the values, without the annotation `Option` and without None."""
     default: Any
 
     @property
     def choices(self) -> list[str]:
-        """Return the texts that the option accepts; empty if they are not limited to a list."""
+        """Return the accepted values as strings; empty if the option is not restricted to a list."""
         if get_origin(self.kind) is Literal:
             return [str(each) for each in get_args(self.kind)]
         kind = get_args(self.kind)[0] if get_origin(self.kind) is tuple else self.kind
@@ -205,11 +207,12 @@ class Declared:
 
     @property
     def addresses(self) -> Mapping[str, str]:
-        """Return the names that are followed by an address, which is a file."""
+        """Return the values that must be followed by a colon and a file, each with an example."""
         return next((each.addresses for each in _metadata(self.kind) if isinstance(each, Names)), {})
 
     def checked(self, value: Any) -> Any:
-        """Return the value as the option has it.
+        """Validate a value of the option and return it, converted from a comma-separated string if the option is a
+        tuple.
 
         Raises:
             InvalidSetting: if the value has another type or is out of range.
@@ -255,7 +258,8 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
 
 
 def options_of(kind: type[Section]) -> Mapping[str, Declared]:
-    """Return the options of a class by name: those of its sections in order, then those of combined classes."""
+    """Return the declared options of a class by name: those of its sections in order, then those of combined
+    classes."""
     return _options_of(cast(Any, kind))
 
 
@@ -293,7 +297,7 @@ Config = TypeVar("Config", bound="DataclassInstance")
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """Base of the sections and of their combinations.
+    """Base class of option sections, and of the classes that combine sections. Construction validates every option.
 
     Raises:
         InvalidSetting: if an option has another type or is out of range.
@@ -306,22 +310,22 @@ class Section:
             object.__setattr__(self, name, each.checked(getattr(self, name)))
 
     def chosen(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults, as values of JSON."""
+        """Return the options that differ from their defaults, as JSON values."""
         values = {name: getattr(self, name) for name in options_of(type(self))}
         changed = {name: value for name, value in values.items() if value != options_of(type(self))[name].default}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in changed.items()}
 
     def applied_to(self, config: Config) -> Config:
-        """Return a dataclass of the core with the values of options that it has fields of the same name for.
+        """Return a copy of `config` in which each field that has the name of an option has the option's value.
 
-        None keeps the value of the field.
+        An option of None leaves the field unchanged.
         """
         shared = {field.name for field in dataclasses.fields(config)} & options_of(type(self)).keys()
         given = {name: getattr(self, name) for name in shared if getattr(self, name) is not None}
         return dataclasses.replace(config, **given)
 
     def options(self, kind: type[Section] | None = None) -> dict[str, Any]:
-        """Return the options by name; those of the class `kind` alone if one is given."""
+        """Return the option values by name; if `kind` is given, only of options that `kind` declares."""
         return {name: getattr(self, name) for name in options_of(kind or type(self))}
 
 
@@ -329,10 +333,10 @@ Kind = TypeVar("Kind", bound=type[Section])
 
 
 def for_callers(kind: Kind) -> Kind:
-    """Decorate a class below `@dataclass`: its options have the limits of callers of the REST API.
+    """Restrict the inherited options of a class to the limits of REST API callers. Apply it below `@dataclass`.
 
-    Numbers have the limit `Option.callers_le`. A file of an option such as `depth` must be an ONNX file of this machine,
-    named by its absolute path.
+    `Option.callers_le` replaces the upper limit of a number. An option that takes a file, such as `depth`, accepts only
+    the absolute path of an existing ONNX file on the server.
     """
     (base,) = kind.__bases__
     for name, each in options_of(base).items():
@@ -350,7 +354,7 @@ def for_callers(kind: Kind) -> Kind:
 
 @dataclass(frozen=True)
 class ServerFile:
-    """Annotation of an option of a caller that may name a file of the server."""
+    """Annotation of an option in which a REST API caller may name an ONNX file on the server."""
 
     declared: Declared
 
@@ -358,7 +362,7 @@ class ServerFile:
         """Return the value.
 
         Raises:
-            ValueError: if it names no ONNX file by an absolute path.
+            ValueError: if the value names a file by a relative path, or a file that is not an existing `.onnx` file.
         """
         name, _, file = value.partition(":")
         if name not in self.declared.addresses:

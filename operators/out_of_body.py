@@ -33,7 +33,7 @@ class Gate(Protocol):
         ...
 
     def close(self) -> None:
-        """Close the gate, as after a picture taken outside of the body."""
+        """Reset to the state after a picture outside of the body, so that following pictures are withheld at first."""
         ...
 
 

@@ -47,12 +47,12 @@ class OutcomeBuilder:
 
     @property
     def parts(self) -> Mapping[type, object]:
-        """Parts so far, by class."""
+        """Return the parts added so far, by class."""
         return dict(self._parts)
 
     @property
     def outputs(self) -> dict[str, Path]:
-        """Paths of the outputs so far, by name."""
+        """Return the paths of the registered outputs, by name."""
         return dict(self._outputs)
 
     @property

@@ -1,11 +1,10 @@
-"""Output folder of a run: created, empty, or left by an earlier run of this program.
+"""Output folder of a run, and the files that a run may write or replace.
 
-Outputs never replace recordings, inputs, home or current folders, or files of other programs. `--overwrite` replaces only files that this program wrote,
-recognised by their content. A lock keeps two runs out of one folder.
+An output folder is new, empty, or the output of an earlier run of this program. Outputs never replace recordings,
+inputs, home or current folders, or files of other programs. A lock prevents two runs from writing into one folder.
 
-Recognition of this program's output files by content, so that `--overwrite` replaces only those.
-
-Each format carries a mark: a comment in `.ply` and `.mp4`, the generator of `.glb`, bytes after the array of `.npy`.
+`--overwrite` replaces only files that this program wrote. They are recognised by a mark in the file: a comment in
+`.ply` and `.mp4`, the generator of `.glb`, bytes after the array of `.npy`.
 A `.splat` has no space for a mark, so its rows are validated instead.
 
 A run collects its results in the staging folder `.run-…` inside the output folder. At the end the results replace the
@@ -397,7 +396,7 @@ class OutputFolder:
     `earlier` is True if the folder contains results of an earlier run.
 
     Raises:
-        OutputError: writing to the folder is not allowed (see `output_paths`).
+        OutputError: writing to the folder is not allowed (see `check_folder_path`).
         OutputFolderInUse: the folder contains foreign files, or another run writes into it.
         StorageFull: the disk is full.
     """

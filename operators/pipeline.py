@@ -127,9 +127,9 @@ class Pace:
     """Timing of a run: scheduler, queues, and training per frame."""
 
     clock: FrameClock | None = None
-    """Display deadlines of a live stream. None to process every frame, whatever time it takes."""
+    """Display deadlines of a live stream. None to process every frame without deadlines."""
     session: SessionReader | None = None
-    """Recorded session whose calls of training are repeated."""
+    """Recorded session whose training calls are replayed; None for a plain recording."""
     held_out: Callable[[Frame], bool] = lambda frame: False
     """Returns True for frames that are displayed and scored but not trained on."""
     predict_every: int = 1
@@ -146,7 +146,7 @@ class Pace:
         return {} if self.clock is None else {"policy": "drop_oldest", "capacity": capacity}
 
     def training(self, depth: DepthOp) -> Training:
-        """Return the training of each frame; `depth` is the depth operator of the graph."""
+        """Return the policy that decides how much each frame is trained on; `depth` is the graph's depth operator."""
         if self.clock is not None:
             return UntilDisplay(self.clock, depth.background)
         if self.session is not None:
@@ -267,7 +267,7 @@ class Pipeline(Application):
         self._connect_sinks(rasterize, reserve)
 
     def _analysis(self, depth: DepthOp, is_analysed: bool) -> Sequence[Operator]:
-        """Return the operators between source and reconstruction, in order."""
+        """Create and return the operators between source and reconstruction, in order."""
         settings, recorder = self.settings, self.outputs.recorder
         choice = "given" if self.pace.session is not None else settings.poses
         poses = pose_operators(self, choice, self.frame_source.description.camera, settings.depth)

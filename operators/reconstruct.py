@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ModelAnswer:
-    """The whole model as of a given frame."""
+    """Answer to a `ModelRequest`: the model with its deformable past, after training on the given frame."""
 
     model: Model | Snapshot
     frame: Frame
@@ -49,7 +49,7 @@ class ModelRequest:
         """Complete the request with a model.
 
         Args:
-            model: the whole model.
+            model: the model with its deformable past.
             frame: newest frame that the model includes.
             pause_ns: time for which training paused, in nanoseconds.
         """
@@ -131,9 +131,7 @@ class ReconstructOp(Operator):
 
     @property
     def parameter_count(self) -> int:
-        """Number of values in all tensors of the whole model, which is saved at the end of the
-        run.
-        """
+        """Number of values in all tensors of the complete model, which is saved at the end of the run."""
         learner = self._learner
         kept = self.model if learner is None else learner.reconstructor
         return 0 if kept is None else kept.parameter_count
@@ -188,13 +186,13 @@ class ReconstructOp(Operator):
         self.training.rest(frame, self._learner, frame_waits)
 
     def request_model(self) -> ModelRequest:
-        """Request the whole model as of the next frame. Thread-safe."""
+        """Request the model with its deformable past, after the next frame. Thread-safe."""
         request = ModelRequest()
         self._requests.append(request)
         return request
 
     def _answer_requests(self, frame: Frame, learner: Learner) -> None:
-        """Answer pending model requests after the picture was emitted, so that the work only delays
+        """Answer pending model requests. Called after the frame was emitted, so that copying the model delays only
         rehearsal.
         """
         while self._requests:

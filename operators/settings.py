@@ -125,7 +125,7 @@ class DisplaySection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputSection(Section):
-    """Files that a run writes beside its report and its model."""
+    """Files that a run writes in addition to its report and its model."""
 
     sinks: Annotated[
         tuple[Annotated[str, Names(SINKS)], ...], Option("Outputs for the report, or none", TRAINING_RUNS)
@@ -216,7 +216,8 @@ class JobOptions(
     ScheduleSection,
     OutputSection,
 ):
-    """Options of a replay job, as stored with the job. A job of `intrasplat batch` may name local files."""
+    """Options of a replay job, as stored with the job. Options of `intrasplat batch` may contain paths of local
+    files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,28 +272,28 @@ class StreamEngineOptions(EngineOptions):
 @dataclass(frozen=True, kw_only=True)
 @for_callers
 class CallerJobOptions(JobOptions):
-    """Options of a replay job that a caller of the REST API asks for."""
+    """Options of a replay job requested through the REST API, with the limits of API callers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 @for_callers
 class CallerCaptureOptions(CaptureOptions):
-    """Options of a stream's capture process, with the limits of callers."""
+    """Options of a stream's capture process, with the limits of REST API callers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 @for_callers
 class CallerEngineOptions(StreamEngineOptions):
-    """Options of a stream's engine process, with the limits of callers."""
+    """Options of a stream's engine process, with the limits of REST API callers."""
 
 
 def stream_options() -> dict[str, Declared]:
-    """Return the options of a stream of the service by name."""
+    """Return the declared options of a service stream by name."""
     return {**options_for(CallerCaptureOptions, "stream"), **options_for(CallerEngineOptions, "stream")}
 
 
 def check_stream_options(options: Mapping[str, Any]) -> None:
-    """Check options of a stream, as a settings file or a caller gives them. None stands for the default.
+    """Check a stream's options from a settings file or an API request. None selects the default.
 
     Raises:
         InvalidSetting: if an option is unknown or out of range.
@@ -319,10 +320,10 @@ def stream_options_schema() -> dict[str, Any]:
 
 
 def check_option(name: str, value: Any) -> None:
-    """Check the value of an option of `replay`, `reconstruct` or `live` by its name.
+    """Check the value of the option `name` of `replay`, `reconstruct` or `live`.
 
     Raises:
-        InvalidSetting: if it has another type or is out of range.
+        InvalidSetting: if the value has another type or is out of range.
     """
     known = {**options_of(LiveOptions), **options_of(ReconstructOptions), **options_of(ReplayOptions)}
     known[name].checked(value)

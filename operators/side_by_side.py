@@ -18,8 +18,8 @@ class SideBySideOp(Operator):
     """Runs several chains of operators on each frame in parallel, merges their results, and runs a final chain.
 
     Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at its output `frame`.
-    The result is the frame of the first chain with the fields `TAKEN_OVER` of the others. If the gate withholds the
-    frame, its result is used instead.
+    The result is the frame of the chain `first`, with the `TAKEN_OVER` fields and loss masks of the other chains. If
+    the gate withholds the frame, the gate's frame is used instead.
 
     The operators belong to no graph. This operator starts and stops them and forwards their contributions to the
     outcome.
@@ -33,7 +33,7 @@ class SideBySideOp(Operator):
     Params:
         gate: chain that may withhold a frame from downstream; the other chains see its picture.
         first: chain whose frame is passed on.
-        beside: further chains.
+        beside: chains that run in parallel to `first`; only their `TAKEN_OVER` fields and loss masks are used.
         then: final chain, run on the merged frame.
     """
 
@@ -119,7 +119,7 @@ def with_findings(decided: Frame, found: Frame) -> Frame:
 
 
 def through(operators: Sequence[Operator], frame: Frame) -> Frame:
-    """Return the frame after passing through a chain."""
+    """Run the operators of a chain on a frame, in order, and return the resulting frame."""
     for operator in operators:
         port: Any = _Passing(frame)
         operator.metadata = {}

@@ -1,4 +1,4 @@
-"""Training of the model by a stream's frames: how much each frame is trained on, and what happens between frames.
+"""Training policies: the number of optimiser steps on each frame, and the work between two frames.
 
 `ReconstructOp` owns a `Learner` and delegates these decisions to a `Training`. `EveryFrame` trains a number of steps on each frame. `UntilDisplay` trains
 until the display deadline, and on earlier frames until the next frame arrives. `RecordedCalls` repeats the calls of a recorded session.
@@ -52,19 +52,19 @@ class TrainingCounts:
     steps: int = 0
     """Optimiser steps on the newest frame before its display."""
     passed_over: int = 0
-    """Frames dropped for newer ones."""
+    """Number of frames dropped in favour of newer ones."""
     rehearsed: int = 0
-    """Rehearsal steps, on frames of the training window."""
+    """Number of rehearsal steps, which train on earlier frames of the training window."""
     withheld: dict[str, int] = field(default_factory=dict)
-    """Frames excluded from training (withheld or damaged), by reason."""
+    """Number of frames excluded from training (withheld or damaged), by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
     """Number of scene restarts, by reason."""
     places_found: int = 0
-    """New scenes recognised as a place that the stream had shown before."""
+    """Number of new scenes recognised as a place that the stream had shown before."""
 
 
 class Learner:
-    """Reconstructor of a run with its last published model.
+    """Owner of a run's reconstructor and of its last published model.
 
     Counts the calls that change the model and passes each to the recorder of the session, so that
     the run can be replayed.
@@ -98,7 +98,7 @@ class Learner:
         return reason is None
 
     def enter(self, frame: Frame, *, usable: bool) -> bool:
-        """Begin another scene if the frame does not belong to the current one.
+        """Restart the reconstructor's scene if the frame belongs to another scene or has another size.
 
         The scene number changes even if the first frame of a scene was dropped or withheld.
 
@@ -119,7 +119,7 @@ class Learner:
         return True
 
     def begin_scene(self, frame: Frame) -> None:
-        """Leave the scene; `frame` starts another one."""
+        """Start a new scene in the reconstructor with its first frame `frame`, and clear the published model."""
         self.counts.places_found += self.reconstructor.begin_scene(frame)
         self._record(lambda: SceneBegun(seq=frame.seq))
         self.newest = None
@@ -143,14 +143,15 @@ class Learner:
         )
 
     def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
-        """Use the depth of a frame that was trained on without it. Return False if it came too late."""
+        """Pass late depth to the model, of a frame that was trained on without depth. Return False if the model
+        rejects it."""
         taken = self.reconstructor.take_depth(frame, late)
         if taken and self._recorder is not None:
             self._recorder.depth(frame)
         return taken
 
     def grow(self, frame: Frame) -> None:
-        """Grow the scene after the display of `frame`, the newest trained one."""
+        """Run a growth step of the model. `frame` is the newest trained frame, already displayed."""
         self.reconstructor.grow(frame)
         self._record(lambda: Grown(seq=frame.seq))
 
@@ -161,7 +162,7 @@ class Learner:
             self._record(lambda: Rehearsed(steps=steps))
 
     def whole_model(self) -> Model | None:
-        """Return the model with its past in its own memory; None before there is one."""
+        """Return the model with its deformable past as an independent copy; None before the first publication."""
         return None if self.newest is None else self.reconstructor.whole_model(self.newest)
 
     def _record(self, line: Callable[[], ScheduleLine]) -> None:
@@ -170,16 +171,16 @@ class Learner:
 
 
 class Training(ABC):
-    """Decides how much the model is trained on a frame, and when."""
+    """Policy that decides how many steps the model is trained on a frame, and when."""
 
-    def begin(self) -> None:  # noqa: B027 - not every training has a state
+    def begin(self) -> None:  # noqa: B027 - stateless policies do not override it
         """Reset the state for a new stream."""
 
     def end(self) -> None:  # noqa: B027
         """Release the state after a stream."""
 
     def take(self, op_input: Any, learner: Learner) -> Frame:
-        """Return the next frame of the queue at the input `frame`."""
+        """Take the next frame from the queue of the input `frame`. A policy may drop frames."""
         frame: Frame = op_input.receive("frame")
         return frame
 
@@ -197,7 +198,7 @@ class Training(ABC):
         """
 
     def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:  # noqa: B027
-        """Use the time after the frame's model was published. Arguments as for `learn`."""
+        """Work between the publication of the frame's model and the next frame. Arguments as for `learn`."""
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:  # noqa: B027
         """Add results and notes to the outcome of the run. `counts` are those of its learner."""
@@ -286,9 +287,7 @@ class UntilDisplay(Training):
         return replace(shown, taken_ns=taken_ns, published_ns=published_ns)
 
     def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:
-        """Take late depth, grow the scene if due, then train on the window until the next frame
-        waits or is expected.
-        """
+        """Take late depth, run a growth step if due, then rehearse until the next frame is queued or expected."""
         if not frame_waits():
             self._clock.wait_until_shown()
         self._take_depth(learner)
@@ -308,9 +307,7 @@ class UntilDisplay(Training):
         learner.record_rehearsal(made)
 
     def _take_depth(self, learner: Learner) -> None:
-        """Pass depth maps that the background thread has finished to the model. They belong to
-        frames that were trained on without depth.
-        """
+        """Pass the newest late depth estimate of the background thread, if any, to the model."""
         found = None if self._depth is None else self._depth.take()
         if found is None:
             return
@@ -389,8 +386,8 @@ class RecordedCalls(Training):
         return learner.observe(frame, budget=Budget.of_steps(observed.steps), train=train)
 
     def _follow_to(self, frame: Frame, learner: Learner) -> Observed | None:
-        """Replay the calls that precede this frame's observation. Return its line; None if it was
-        never observed.
+        """Replay the calls before the `observe` call of this frame. Return the schedule line of that call; None if
+        there is none.
         """
         while self._due is not None:
             line = self._due
@@ -413,7 +410,7 @@ class RecordedCalls(Training):
         return None
 
     def _call(self, learner: Learner, line: SceneBegun | Grown | Rehearsed, frame: Frame) -> None:
-        """Replay one call that precedes the observation of `frame`."""
+        """Replay one recorded call that precedes the `observe` call of `frame`."""
         if isinstance(line, Rehearsed):
             if learner.reconstructor.gaussians:
                 learner.reconstructor.rehearse(line.steps)

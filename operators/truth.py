@@ -85,7 +85,7 @@ class TruthOp(Operator):
         self._memory: NDArray[np.uint8] | None = None
         """Last visible value of each pixel, uint8 RGB [H, W, 3]."""
         self._seen: NDArray[np.bool_] = np.zeros((0, 0), bool)
-        """Pixels at which an earlier frame has shown tissue, bool [H, W]."""
+        """True at pixels where an earlier frame has shown tissue, bool [H, W]."""
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         rendered: RenderedFrame = op_input.receive("rendered")

@@ -1,12 +1,9 @@
 """Limits on pictures, rendered frames and memory, to refuse a run that cannot fit before it starts.
 
-`operators.settings` declares the ranges of options.
-
-Memory estimates, to refuse a run that cannot fit before it starts.
-
-The constants are fitted to the peak resident size of replays on a CPU: `sinus` (540x540) and `cutting` (640x512) at
-scales 0.5, 1 and 2, with 2 to 156 frames. Including the 0.5 GiB that the process uses before its first frame, the
-estimates are within 10 % of each measurement.
+`operators.settings` declares the ranges of options. The constants of the memory estimates are fitted to the peak
+resident size of replays on a CPU: `sinus` (540x540) and `cutting` (640x512) at scales 0.5, 1 and 2, with 2 to 156
+frames. Including the 0.5 GiB that the process uses before its first frame, the estimates are within 10 % of each
+measurement.
 """
 
 from __future__ import annotations

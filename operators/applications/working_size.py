@@ -1,10 +1,7 @@
 """Measured working size of a live run on a CPU: the largest at which each frame is displayed before the next.
 
 The live graph runs on synthetic pictures, one at a time, with the minimum number of steps per frame. The latency from a frame's arrival to its picture is
-measured. The measurement doubles as the trial run, so that one-time initialisation precedes the first frame.
-
-The live graph runs on synthetic pictures, one at a time, with the minimum number of steps per frame. The latency from
-a frame's arrival to its picture is measured. The measurement doubles as the trial run.
+measured. The measurement also serves as the trial run, so that one-time initialisation is done before the first frame.
 """
 
 from __future__ import annotations

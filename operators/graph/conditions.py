@@ -12,7 +12,7 @@ from typing import Any
 
 
 class SchedulingStatus(IntEnum):
-    """Answer of a condition. Of several answers the greatest applies."""
+    """Result of a condition's check. An operator with several conditions has the greatest of their values."""
 
     READY = 0
     WAIT_TIME = 1

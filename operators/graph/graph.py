@@ -202,7 +202,8 @@ class Graph:
             logger.warning("%s; %s", failure, action.value, exc_info=_traceback_of(failure))
 
     def settle(self, now_ns: int) -> bool:
-        """Finish all operators that can do no more, repeatedly, as each may finish others. Return True if all are."""
+        """Finish every operator that can never compute again, until no further one is found. Return True if all
+        have finished."""
         again = True
         while again:
             again = False
@@ -315,7 +316,7 @@ class OperatorTask:
         return status, due_ns
 
     def exhausted(self) -> bool:
-        """Return True if the operator can do no more.
+        """Return True if the operator can never compute again.
 
         It was stopped, its inputs have ended, or all consumers of its outputs have finished.
         """
@@ -389,7 +390,7 @@ class OperatorTask:
             condition.on_execute(now_ns)
 
     def trail(self, tracker: FlowTracker) -> Trail:
-        """Return the trail of messages emitted in the current compute."""
+        """Return the flow-tracking trail for messages emitted in the current compute."""
         if self._trail is None or self._trail_length != len(self.received):
             self._trail_length = len(self.received)
             if self.received:

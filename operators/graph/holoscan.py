@@ -8,7 +8,7 @@ Workarounds for problems of the SDK (4.6):
 
 - Its MultiThreadScheduler may stop early. Threaded runs use its EventBasedScheduler, and a run
   that ends while an operator could compute raises EngineError.
-- `stop_execution` does not wake a graph that waits for an event. The gates perform the stop.
+- `stop_execution` does not wake a graph that waits for an event. The gates check for a stop instead.
 - Its greedy scheduler sleeps through events until the next due time. No due time is more than
   10 ms ahead.
 - Its schedulers declare a deadlock before they have seen the latest change. They are configured
@@ -17,7 +17,7 @@ Workarounds for problems of the SDK (4.6):
 - It replaces the SIGINT and SIGTERM handlers permanently. They are restored after the start.
 - Its EventBasedScheduler may check an operator in one thread while stopping it in another, and
   fail. With it a finished operator waits forever, which does not keep the run from ending.
-- It checks an operator while that operator computes. Such a check decides nothing.
+- It checks an operator while that operator computes. The gates ignore such a check.
 - It drops messages without counting. Edges apply the policy, and the SDK's queues never overflow.
 """
 
@@ -59,7 +59,7 @@ class Gate(_Condition):
         super().__init__(fragment, name=f"{task.name}_gate")
 
     def check(self, timestamp: int) -> tuple[Any, int | None]:
-        """Return the scheduling status as far as the SDK cannot derive it from its queues."""
+        """Return the scheduling status that results from conditions which the SDK does not know."""
         if not self.checked:
             self.checked = True
             self.scheduler.restore_signals()

@@ -1,14 +1,12 @@
-"""Recording of a session: operators that pass frames, analysis results and displayed pictures to a recorder, which writes in a background thread.
+"""Recording of a live session.
 
-Producers never block.
-
-Operators that pass frames, analysis results and displayed pictures to a `SessionRecorder`.
+Operators pass frames, analysis results and displayed pictures to a `SessionRecorder` without blocking.
 
     source → out_of_body → recorded_frames → analysis … → recorded_preparation → reconstruct
                                                … → display → recorded_pictures
 
-The recorder writes in its own thread. `recorded_frames` follows the out-of-body gate, so that withheld pictures are
-never written.
+The recorder writes in a background thread. `recorded_frames` follows the out-of-body gate, so that withheld pictures
+are never written.
 """
 
 from __future__ import annotations
@@ -301,7 +299,7 @@ class SessionRecorder:
             self._give_up(writer, str(error))
         except av.FFmpegError as error:  # those that are not an OSError
             self._give_up(writer, f"{self.folder}: the recording cannot be written ({error}); check its disk")
-        except BaseException as error:  # noqa: BLE001 - carried to the thread that closes
+        except BaseException as error:  # noqa: BLE001 - raised again by `close`
             self._give_up(writer, f"the recording failed: {type(error).__name__}: {error}")
             self._failure = error
 

@@ -21,7 +21,8 @@ _LAST_NUMBER = re.compile(r"(\d+)(?=\D*$)")
 
 
 class NewFiles:
-    """Yields images that follow the last one in name order. Names before it are skipped and counted in `late`."""
+    """Queue of new images in a folder, in name order. A name that sorts before the last taken image is counted in
+    `late`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -33,13 +34,13 @@ class NewFiles:
         self._changed_ns = -1
 
     def skip_to_newest(self) -> None:
-        """Skip all present images but the last. Raises OSError."""
+        """Skip all existing images but the last in name order. Raises OSError if the folder is missing."""
         self._scan()
         while len(self._waiting) > 1:
             self.taken()
 
     def next(self) -> Path | None:
-        """Return the next image, the same one until `taken`. None if there is none. Raises OSError without the folder."""
+        """Return the next image without removing it; None if there is none. Raises OSError if the folder is missing."""
         if self._waiting:
             return self._waiting[0]
         following = None if self._last is None else following_name(self._last)
@@ -51,7 +52,7 @@ class NewFiles:
         return self._waiting[0] if self._waiting else None
 
     def taken(self) -> None:
-        """Advance to the next image."""
+        """Remove the image returned by `next` from the queue."""
         self._last = self._waiting.popleft()
 
     def _scan(self) -> None:

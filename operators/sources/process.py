@@ -288,7 +288,7 @@ def serve_source(connection_fd: int, memory_fd: int) -> None:
         served.serve(source)
     except UserError as error:
         served.send("refused", error=str(error))
-    except Exception as error:  # noqa: BLE001 - carried to the parent, which reports it
+    except Exception as error:  # noqa: BLE001 - sent to the parent process, which reports it
         served.send("failed", error=f"{type(error).__name__}: {error}"[:2000])
     # Exit without waiting for library threads, which may be blocked in network calls.
     connection.close()
@@ -491,7 +491,7 @@ class ProcessSource(LiveSource):
         return super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
-        """Return the numbers of items dropped or repaired in the process and here, by reason."""
+        """Return the numbers of items dropped or repaired in the child process and in this process, by reason."""
         counts = Counter(super().counts())
         counts.update(self._earlier_counts)
         counts.update(self._child_counts)
@@ -575,7 +575,7 @@ class ProcessSource(LiveSource):
         return frame
 
     def _note(self, message: dict[str, Any]) -> None:
-        """Process a message other than a frame."""
+        """Store the state, counts or log record of a message that is not a frame."""
         kind = message["kind"]
         if kind == "state":
             try:

@@ -276,7 +276,7 @@ class ThreadedSource:
                 close = getattr(frames, "close", None)
                 if close is not None:
                     close()
-        except BaseException as raised:  # noqa: BLE001 - carried to the thread that calls read
+        except BaseException as raised:  # noqa: BLE001 - raised again by `read` in the consumer's thread
             error = raised
         with self._changed:
             if not stop.is_set():

@@ -149,7 +149,8 @@ class Connection:
 
 
 class StreamDamage:
-    """Damage of pictures: suspicious ones, and those predicted from them up to the next key frame."""
+    """Record of damaged pictures: those reported by the decoder, and those that depend on them until the next key
+    frame."""
 
     def __init__(self) -> None:
         self._keys: list[int] = []
@@ -164,7 +165,7 @@ class StreamDamage:
             self._own = {newest: self._own[newest]}
 
     def doubt(self, doubts: dict[int, str]) -> None:
-        """Take over the decoder's doubts, by packet number, and clear them."""
+        """Record the damage reported by the decoder, by packet number, and clear `doubts`."""
         self._own.update(doubts)
         doubts.clear()
 

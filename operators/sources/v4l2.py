@@ -18,8 +18,8 @@ READ_S = 5.0
 def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
     """Open `v4l2:/dev/video0?size=1920x1080&fps=60&format=mjpeg`; omitted options keep the driver's settings.
 
-    A disconnected camera is searched for again. Raises InvalidSetting, and SourceUnavailable if the device does not
-    exist.
+    The source reconnects to a camera that was unplugged. Raises InvalidSetting, and SourceUnavailable if the device
+    does not exist.
     """
     address = V4l2Address.parse(rest, options)
     size, fps, name = address.size, address.fps, address.format
