@@ -1,4 +1,4 @@
-// Channels are contiguous in memory, so each corner of a bilinear sample is a run of vectors.
+// Channels are contiguous in memory, so each corner of a bilinear sample is read as consecutive vectors.
 #include "hexplane.h"
 #include "line_position.h"
 #include "simd_partial.h"
@@ -9,10 +9,11 @@ using namespace gsplat::hexplane;
 
 namespace {
 
-// The four cells around a point of one plane (corners aligned, clamped at the border) and their weights.
+// The four cells around a point in one plane, and their weights. Corners are aligned, and coordinates are clamped at
+// the border.
 struct Corners {
-  const float *p00, *p10, *p01, *p11;  // first index along U, second along V
-  float fu, fv;                        // fractions
+  const float *p00, *p10, *p01, *p11;  // first subscript along U, second along V
+  float fu, fv;                        // fractional positions
   float du, dv;                        // cells per unit of the coordinate, zero at the border and beyond
 };
 
@@ -61,7 +62,7 @@ void backward_samples(const HexPlanes& level, const float* gradient, float* samp
       corners[p] = corners_of(level.planes[p], x[kPlaneAxes[p][0]], x[kPlaneAxes[p][1]], channels);
     for (int64_t c = 0; c < channels; c += kLanes) {
       const int64_t lanes = lanes_at(c, channels);
-      vfloat values[kPlanes], before[kPlanes];  // before: product of the planes before this one
+      vfloat values[kPlanes], before[kPlanes];  // before: product of the preceding planes
       vfloat value = load_first(gradient + n * channels + c, lanes);
       for (int p = 0; p < kPlanes; ++p) {
         values[p] = sample(corners[p], c, lanes);
@@ -132,7 +133,8 @@ void modulate(const HexPlanes& level, const float* space, float* features, int64
   }
 }
 
-// Outputs that a micro-kernel keeps in registers: rows x vectors accumulators, the vectors' weights, one broadcast.
+// Outputs that a micro-kernel keeps in registers: rows x vectors of accumulators, the weight vectors, and one broadcast
+// input.
 #if defined(__AVX512F__)
 constexpr int kTileRows = 6, kTileVectors = 4;
 #else
@@ -140,7 +142,7 @@ constexpr int kTileRows = 4, kTileVectors = 2;
 #endif
 static_assert(kBlockRows % kTileRows == 0, "a block is whole tiles");
 
-// outputs[r, first + v] = bias + inputs[r, :] . weights[:, first + v], for one tile.
+// Compute outputs[r, first + v] = bias + inputs[r, :] . weights[:, first + v] for one tile.
 template <int kVectors>
 GSPLAT_INLINE void tile(const DecodeLayer& layer, const float* inputs, float* outputs, int64_t stride, int64_t first, bool relu) {
   vfloat sums[kTileRows][kVectors];
@@ -161,7 +163,7 @@ GSPLAT_INLINE void tile(const DecodeLayer& layer, const float* inputs, float* ou
   }
   for (int r = 0; r < kTileRows; ++r)
     for (int v = 0; v < kVectors; ++v) {
-      // `s < 0` and not `s > 0`, so that NaN propagates.
+      // `s < 0` instead of `s > 0`, so that NaN propagates.
       const vfloat s = sums[r][v];
       store(outputs + r * stride + first + v * kLanes, relu ? select(s < 0.0f, vfloat{}, s) : s);
     }
@@ -177,7 +179,7 @@ void apply_layer(const DecodeLayer& layer, const float* inputs, float* outputs, 
   }
 }
 
-// The features of Gaussian n: space times lines, levels side by side.
+// Compute the features of Gaussian n: space times lines, levels concatenated.
 void features_of(const Decode& d, int64_t n, float* features) {
   for (int l = 0; l < d.level_count; ++l) {
     const DecodeLevel& level = d.levels[l];

@@ -1,4 +1,5 @@
-// hexplane_features, its gradient, and the two halves of factorised inference: checks, memory, and how each device runs them.
+// Host code of hexplane_features, its gradient, and the two halves of factorised inference: checks, memory, and the
+// launch on each device.
 #include <algorithm>
 #include <array>
 #include <initializer_list>
@@ -17,7 +18,7 @@ namespace {
 using Planes = std::initializer_list<const Tensor*>;
 using FeatureGradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-// Contiguous tensors of one level, kept alive beside the raw pointers.
+// Contiguous tensors of one level, which own the memory of the raw pointers.
 struct Level {
   Tensor coordinates;
   std::array<Tensor, kPlanes> tensors;
@@ -124,7 +125,7 @@ void run_decode(Call& call, const DecodeInputs& in, float* outputs) {
 #else
 
 constexpr int64_t kGrain = 512;
-constexpr int64_t kChannelChunk = 16;  // channels of one plane that one task adds up: one cache line
+constexpr int64_t kChannelChunk = 16;  // channels of one plane that one task sums: one cache line
 
 void run_product(const Call&, const Level& level, int last, float* features) {
   torch::stable::parallel_for(0, level.count, kGrain,
@@ -136,8 +137,8 @@ void run_modulate(const Call&, const HexPlanes& level, const float* space, float
                               [&](int64_t begin, int64_t end) { kernels().modulate(level, space, features, begin, end); });
 }
 
-// Block by block, points write what each plane's sample should change by; then each task adds up its own channels of its own
-// plane in the order of the points. No two tasks share a cell, so the sums are the same for any number of threads.
+// For each block, points first write the gradient of each plane's sample. Then each task sums its own channels of one
+// plane in point order. No two tasks share a cell, so the sums do not depend on the number of threads.
 void run_backward(const Call& call, const Level& level, const float* gradient, float* points, float* const* planes) {
   const int64_t channels = level.raw.channels, chunks = (channels + kChannelChunk - 1) / kChannelChunk;
   Tensor memory = call.empty({kPlanes, kBackwardBlock, channels});
@@ -158,7 +159,7 @@ void run_backward(const Call& call, const Level& level, const float* gradient, f
   }
 }
 
-// Weights [outputs, inputs] and bias of one layer, transposed and padded for the kernel.
+// Transpose and pad the weights [outputs, inputs] and bias of one layer for the kernel.
 DecodeLayer pack(const Tensor& weight, const Tensor& bias, std::vector<float>& storage) {
   const int64_t outputs = weight.size(0), inputs = weight.size(1);
   const int64_t lanes = kernels().lanes, padded = (outputs + lanes - 1) / lanes * lanes;

@@ -1,4 +1,5 @@
-// Where a coordinate in [-1, 1] falls on a grid whose first and last cells lie at the ends. Only kernel files include this.
+// Position of a coordinate in [-1, 1] on a grid whose first and last cells are at the ends of the interval. Only kernel
+// files include this.
 #pragma once
 
 #include "simd.h"
@@ -6,12 +7,12 @@
 namespace GSPLAT_ISA::hexplane {
 
 struct LinePosition {
-  int64_t cell;    // the left one of two neighbours
-  float fraction;  // of the way to the right one
+  int64_t cell;    // left one of two neighbours
+  float fraction;  // fractional position between the left and the right cell
   float slope;     // cells per unit of the coordinate, zero at the border and beyond
 };
 
-// NaN gives the first cell with a NaN fraction, so that it propagates into the result and nothing outside is read.
+// NaN maps to the first cell with a NaN fraction. It propagates into the result without reading out of bounds.
 GSPLAT_INLINE LinePosition position_on(float coordinate, int32_t size) {
   const float scale = 0.5f * float(size - 1);
   const float unclamped = (coordinate + 1.0f) * scale;

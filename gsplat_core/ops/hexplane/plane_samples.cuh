@@ -1,5 +1,5 @@
-// Bilinear samples of channels-last planes by a team of lanes per point, each with some of the channels; and the gradient of one
-// node of a plane, which adds the gradient rows of the Gaussians in the four cells around it in their sorted order.
+// Bilinear samples of channels-last planes, with a team of lanes per point that share the channels. Also the gradient
+// of one node of a plane: the sum of the gradient rows of the Gaussians in the four surrounding cells, in sorted order.
 #pragma once
 
 #include <type_traits>
@@ -12,11 +12,11 @@ namespace gsplat::hexplane {
 using GSPLAT_ISA::hexplane::LinePosition;
 using GSPLAT_ISA::hexplane::position_on;
 
-// kPlaneAxes for device code, which cannot index it.
+// kPlaneAxes for device code, which cannot index the host constant.
 constexpr int u_axis(int plane) { return plane == 2 || plane == 4 ? 1 : plane == 5 ? 2 : 0; }
 constexpr int v_axis(int plane) { return plane == 0 ? 1 : plane < 3 ? 2 : 3; }
 
-// Consecutive channels of a lane: 4 if the number of channels is a multiple of 4 and memory is aligned, otherwise 1.
+// Consecutive channels per lane: 4 if the number of channels is a multiple of 4 and memory is aligned, otherwise 1.
 template <int kLane>
 struct Channels {
   float v[kLane];
@@ -80,10 +80,10 @@ __device__ __forceinline__ Channels<kLane> between(const Channels<kLane>& a, con
   return plus(a, t, b - a);
 }
 
-// The cells around a point: of a plane four, of a line two. Offsets are in floats, from the start of the plane.
+// The cells around a point: four in a plane, two in a line. Offsets are in floats from the start of the plane.
 struct Corners {
   int64_t start;
-  int32_t right, below;  // to the neighbours; 0 if there is only one cell
+  int32_t right, below;  // offsets to the neighbours; 0 if the axis has only one cell
   LinePosition u, v;
 
   __device__ Corners(const FeaturePlane& plane, const LinePosition& along_u, const LinePosition& along_v, int channels)
@@ -108,7 +108,7 @@ struct Sample {
   }
   __device__ Channels<kLane> along_u(const Corners& at) const { return between(p10 - p00, p11 - p01, at.v.fraction); }
   __device__ Channels<kLane> along_v(const Corners& at) const { return between(p01 - p00, p11 - p10, at.u.fraction); }
-  // The value and its derivatives per cell, which share most of their computation.
+  // Compute the value and its derivatives per cell together; they share most of the computation.
   __device__ void value_and_slopes(const Corners& at, Channels<kLane>& value, Channels<kLane>& along_u,
                                    Channels<kLane>& along_v) const {
     const Channels<kLane> upper = p10 - p00, lower = p11 - p01, top = plus(p00, at.u.fraction, upper);
@@ -118,7 +118,7 @@ struct Sample {
   }
 };
 
-// The sum over the lanes of a team, in a fixed order; every lane has it.
+// Sum over the lanes of a team, in a fixed order, returned to every lane.
 template <int kTeam>
 __device__ __forceinline__ float team_sum(float x) {
 #pragma unroll
@@ -126,8 +126,8 @@ __device__ __forceinline__ float team_sum(float x) {
   return x;
 }
 
-// Calls `run` with the channels of a lane and the lanes of a team as constants. Every row of channels must be aligned to 16
-// bytes.
+// Call `run` with the channels per lane and the lanes per team as constants. Every row of channels must be aligned to
+// 16 bytes.
 template <class Run>
 void with_wide_team(int64_t channels, const Run& run) {
   const auto four = std::integral_constant<int, 4>();
@@ -135,33 +135,33 @@ void with_wide_team(int64_t channels, const Run& run) {
   run(four, std::integral_constant<int, 16>());
 }
 
-// The same without that condition: 4 channels a lane only if `wide`.
+// As above for any alignment: 4 channels per lane only if `wide`.
 template <class Run>
 void with_team(bool wide, int64_t channels, const Run& run) {
   if (wide) return with_wide_team(channels, run);
   run(std::integral_constant<int, 1>(), std::integral_constant<int, 16>());
 }
 
-constexpr int kDenseCell = 8;  // a cell with at least so many Gaussians is dense: its rows are summed in a pass of their own
+constexpr int kDenseCell = 8;  // a cell with at least this many Gaussians is dense: a separate pass sums its rows
 constexpr int kDenseRun = 32;  // sorted rows that one team sums in that pass
-constexpr int kNodeBatch = 2;  // rows of a node in flight: few, since many nodes are
+constexpr int kNodeBatch = 2;  // rows of a node in flight; few, because many nodes are processed concurrently
 
-// One plane's Gaussians, sorted by cell = along the major axis * minor size + along the minor axis.
+// One plane's Gaussians sorted by cell = major coordinate * minor size + minor coordinate.
 struct SortedCells {
-  const int32_t* starts;    // of the plane's first cell
-  const float* rows;        // [all planes' items, C], sorted: gradient of the plane's sample
-  const float* fractions;   // [items, 2]: fraction of the way to the right node along the major and the minor axis
-  const float* dense_sums;  // sums of dense cells for their corners (../hexplane_training/training.h); null: none
+  const int32_t* starts;    // start of each cell's items, from the plane's first cell
+  const float* rows;        // [items of all planes, C], sorted: gradient of the plane's sample
+  const float* fractions;   // [items, 2]: fractional position between nodes along the major and the minor axis
+  const float* dense_sums;  // sums of dense cells for their corners (../hexplane_training/training.h), or null
   int32_t minor_size;
 };
 
-// The weight of node `node` in a sample at `at`.
+// Weight of node `node` in a sample at `at`.
 __device__ __forceinline__ float weight_of(const LinePosition& at, int node) {
   return int(at.cell) == node ? 1.0f - at.fraction : int(at.cell) == node - 1 ? at.fraction : 0.0f;
 }
 
-// Calls use(i, fraction along major, along minor, row) for the sorted items [begin, end) in order; kBatch of them are loaded at
-// once.
+// Call use(i, fraction along major, along minor, row) for the sorted items [begin, end) in order, loading kBatch of
+// them at once.
 template <int kLane, int kBatch, class Use>
 __device__ __forceinline__ void for_rows(const SortedCells& cells, int32_t begin, int32_t end, int channel, int channels,
                                          const Use& use) {
@@ -180,8 +180,9 @@ __device__ __forceinline__ void for_rows(const SortedCells& cells, int32_t begin
   }
 }
 
-// The index in [runs, 5, 4, C] of the sums of a dense cell's rows in run `run`: the first of five places is for the cell that
-// begins in an earlier run, the others are for those that begin in one of the run's quarters, where no two do.
+// Index in [runs, 5, 4, C] of the sums of a dense cell's rows in run `run`. The first of the five slots is for the cell
+// that begins in an earlier run. The other four are for cells that begin in each quarter of the run; at most one dense
+// cell begins in a quarter.
 __device__ __forceinline__ int64_t dense_place(int run, bool begins, int32_t begin, int corner) {
   return (int64_t(run) * 5 + (begins ? 1 + begin % kDenseRun / kDenseCell : 0)) * 4 + corner;
 }
@@ -190,7 +191,7 @@ template <int kLane>
 __device__ Channels<kLane> node_gradient(const SortedCells& cells, int major, int minor, int channel, int channels) {
   Channels<kLane> sum = Channels<kLane>::all(0.0f);
 #pragma unroll 1
-  for (int left = 0; left < 2; ++left) {  // along the major axis, the cell on the node's right comes last
+  for (int left = 0; left < 2; ++left) {  // along the major axis, process the cell on the node's right last
     const int cell_major = major - 1 + left;
     if (cell_major < 0) continue;
     const int32_t* starts = cells.starts + int64_t(cell_major) * cells.minor_size + minor;

@@ -1,6 +1,6 @@
-// Features and network in one kernel. A warp has 16 Gaussians, four lanes each. The four take 16 bytes each of 64 bytes of
-// features, which is the order in which the tensor cores take their operands: loads are wide and nothing is exchanged between
-// lanes.
+// Features and network in one kernel. A warp processes 16 Gaussians with four lanes each. Of 64 bytes of features each
+// of the four lanes loads 16, which matches the tensor cores' operand layout: loads are wide and lanes exchange
+// nothing.
 #include <type_traits>
 
 #include "../hexplane/line_position.h"
@@ -15,12 +15,13 @@ using namespace GSPLAT_ISA::hexplane;
 
 constexpr int kRowsPerWarp = 16;
 
-// Where a row falls on the three lines of a level. Each of a row's four lanes computes one axis and shares it by shuffles.
+// Positions of a row on the three lines of a level. Each of a row's four lanes computes at most one axis and shares it
+// by shuffles.
 struct LinePlaces {
-  int offset[3];  // of the left node, in items
+  int offset[3];  // offset of the left node, in items
   float fraction[3];
 
-  // own: of the axis that this lane computed; group: the row's lanes
+  // own: the axis computed by this lane; group: the row's lanes
   __device__ LinePlaces(const LinePosition& own, int group, int channels) {
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) {
@@ -30,20 +31,22 @@ struct LinePlaces {
   }
 };
 
-// Warps of a block, which share the weights, and blocks per multiprocessor, by the registers that the layers need.
+// Warps per block, which share the weights, and blocks per multiprocessor, limited by the registers that the layers
+// need.
 constexpr int warps_of(int item, int width) { return item == 2 ? 4 : width == 32 ? 12 : 8; }
 constexpr int blocks_of(int item, int width) {
   return item == 2 ? (width == 32 ? 6 : width == 64 ? 4 : 2) : width == 128 ? 1 : 2;
 }
 
-// kChannels: the number of channels if known at compile time and if every line has two nodes or more; 0: read from the input.
+// kChannels: the number of channels if known at compile time and every line has at least two nodes; 0: read from the
+// input.
 template <class T, int kWidth, bool kLines, int kChannels>
 __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_of(int(sizeof(T)), kWidth))
     deltas_kernel(FieldInput in, FieldNetwork net, const void* packed, float* deltas, float* hidden) {
   extern __shared__ uint4 shared[];
   constexpr int kItem = int(sizeof(T)), kPiece = 16 / kItem, kQuad = 4 * kPiece, kBlocks = kWidth / 8;
   constexpr int kWarps = warps_of(kItem, kWidth);
-  constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // pieces of 64 bytes that are loaded together
+  constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // pieces of 64 bytes loaded together
   for (int i = int(threadIdx.x); i < int(net.packed_bytes(kItem) / 16); i += 32 * kWarps)
     copy_16(shared + i, static_cast<const uint4*>(packed) + i);
   const T* weights = reinterpret_cast<const T*>(shared);
@@ -65,8 +68,8 @@ __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_
   start_with_bias(sums, biases, place.quad);
   const int stride = net.first_stride(kItem);
   const T* w = weights + place.group * stride + place.quad * kPiece;
-  // If rows are multiples of 128 bytes, the eight lanes of two adjacent rows load first one row, then the other, 128 bytes at a
-  // time, and exchange halves afterwards: a load then touches 4 cache lines instead of 8, which bounds this kernel.
+  // If rows are multiples of 128 bytes, the eight lanes of two adjacent rows load 128 bytes of one row, then of the
+  // other, and exchange halves. A load then touches 4 cache lines instead of 8, which is the limit of this kernel.
   const int odd = kParts == 2 ? place.group % 2 : 0;
   const int lane_at = place.quad * kPiece + odd * kQuad;
   for (int level = 0; level < in.levels; ++level) {
@@ -94,7 +97,7 @@ __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_
         }
       }
     }
-    constexpr int kAhead = kLines ? 1 : 4;  // without lines an iteration has only two loads: unroll for more in flight
+    constexpr int kAhead = kLines ? 1 : 4;  // without lines an iteration has only two loads: unroll to keep more in flight
 #pragma unroll kAhead
     for (int c = 0; c < channels; c += kParts * kQuad, w += kParts * kQuad) {
       Piece<T> value[kParts][2];
@@ -166,7 +169,7 @@ void launch(const FieldInput& in, const FieldNetwork& net, const void* packed, f
   auto kernel = wide && in.channels == 64   ? deltas_kernel<T, kWidth, true, 64>
                 : wide && in.channels == 32 ? deltas_kernel<T, kWidth, true, 32>
                                             : deltas_kernel<T, kWidth, true, 0>;
-  if constexpr (std::is_same_v<T, float>) {  // training is in float32
+  if constexpr (std::is_same_v<T, float>) {  // only training stores the trunk's outputs, in float32
     if (in.lines.values == nullptr) kernel = deltas_kernel<T, kWidth, false, 0>;
   }
   constexpr int kWarps = warps_of(int(sizeof(T)), kWidth);

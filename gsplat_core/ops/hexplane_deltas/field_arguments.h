@@ -1,4 +1,4 @@
-// From the tensors of a field to what its CUDA kernels take, checked; shared by inference and training.
+// Checked conversion of a field's tensors to the arguments of its CUDA kernels; shared by inference and training.
 #pragma once
 
 #include <vector>
@@ -8,13 +8,14 @@
 
 namespace gsplat::hexplane {
 
-// Contiguous float32 on the call's device, aligned to 16 bytes for the kernels' wide loads; a view that is not aligned is copied.
+// Return a contiguous float32 tensor on the call's device, aligned to 16 bytes for the kernels' wide loads. A
+// misaligned view is copied.
 inline Tensor aligned_floats(const CudaCall& call, const Tensor& t, const char* name) {
   const Tensor c = call.floats(t, name);
   return reinterpret_cast<uintptr_t>(c.const_data_ptr()) % 16 == 0 ? c : torch::stable::clone(c);
 }
 
-// The network's layers; the tensors are made contiguous in place, and must outlive the result.
+// Return the network's layers. The tensors are made contiguous in place, and must outlive the result.
 inline FieldNetwork network_of(const CudaCall& call, std::vector<Tensor>& weights, std::vector<Tensor>& biases,
                                int64_t features) {
   check(weights.size() >= 2 && weights.size() <= size_t(kMaxFieldLayers) && weights.size() == biases.size(),
@@ -36,7 +37,8 @@ inline FieldNetwork network_of(const CudaCall& call, std::vector<Tensor>& weight
   return net;
 }
 
-// The time planes (three per level, [V, U, C]) and where their lines at one time go; returns the lines' size in items.
+// Set the time planes (three per level, [V, U, C]) and the offsets of their lines at one time. Returns the lines' size
+// in items.
 inline int64_t lines_of(const CudaCall& call, std::vector<Tensor>& planes, int64_t channels, FieldTimePlanes& times,
                         FieldLines& lines) {
   int64_t size = 0;

@@ -1,4 +1,4 @@
-// hexplane_deltas: checks, memory and the order of the launches.
+// Host code of hexplane_deltas: checks, memory and the order of the launches.
 #include "field_arguments.h"
 
 namespace gsplat::hexplane {

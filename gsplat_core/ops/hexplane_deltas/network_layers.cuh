@@ -1,4 +1,4 @@
-// Layers of the network in the registers of a warp that has 16 Gaussians, in float32 or half precision.
+// Network layers in the registers of a warp that processes 16 Gaussians, in float32 or half precision.
 #pragma once
 
 #include "matrix_units.cuh"
@@ -41,9 +41,9 @@ struct Piece<__half> {
 
 __device__ __forceinline__ uint32_t bits_of(__half2 x) { return *reinterpret_cast<uint32_t*>(&x); }
 
-// Transposes halves of two adjacent rows between lanes: before, the lanes of the even row have the first half of both rows (`a`
-// of the even, `b` of the odd one), those of the odd row the second. Afterwards `a` and `b` are the two halves of the lane's own
-// row.
+// Exchange halves of two adjacent rows between lanes. Before, the even row's lanes hold the first half of both rows
+// (`a` of the even row, `b` of the odd row), and the odd row's lanes hold the second halves. Afterwards `a` and `b` are
+// the two halves of the lane's own row.
 template <class T>
 __device__ __forceinline__ void exchange_halves(Piece<T>& a, Piece<T>& b, bool odd) {
 #pragma unroll
@@ -54,7 +54,8 @@ __device__ __forceinline__ void exchange_halves(Piece<T>& a, Piece<T>& b, bool o
   }
 }
 
-// sums[t] += the pieces of two rows times the first layer's weights; `w` points to the lane's column in the row of block 0.
+// sums[t] += the pieces of two rows times the first layer's weights. `w` points to the lane's column in the row of
+// block 0.
 template <int kBlocks>
 __device__ __forceinline__ void first_layer(float (&sums)[kBlocks][4], const Piece<__half> (&x)[2], const __half* w, int stride) {
   const uint32_t a0[4] = {bits_of(x[0].v[0]), bits_of(x[1].v[0]), bits_of(x[0].v[1]), bits_of(x[1].v[1])};
@@ -78,7 +79,7 @@ __device__ __forceinline__ void first_layer(float (&sums)[kBlocks][4], const Pie
   }
 }
 
-// The next layer. Its inputs are the sums of the previous layer as they are in registers.
+// Compute the next layer. Its inputs are the previous layer's sums, in their register layout.
 template <int kIn, int kOut>
 __device__ __forceinline__ void next_layer(const float (&in)[kIn][4], float (&sums)[kOut][4], const __half* w, int stride) {
 #pragma unroll

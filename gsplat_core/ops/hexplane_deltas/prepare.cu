@@ -1,4 +1,4 @@
-// Lines from the time planes at one time, and the network packed for shared memory.
+// Interpolates the time planes into lines at one time, and packs the network for shared memory.
 #include <cuda_fp16.h>
 
 #include "../hexplane/line_position.h"
@@ -13,8 +13,8 @@ using namespace GSPLAT_ISA::hexplane;
 __device__ void put(float* to, int64_t at, float x) { to[at] = x; }
 __device__ void put(__half* to, int64_t at, float x) { to[at] = __float2half_rn(x); }
 
-// The weight at index `at` of the packed network. After the first layer, inputs are in the order in which a lane has them in
-// registers from the previous layer: with half, pairs of two column blocks of 8 are interleaved; with float, the order is
+// Return the weight at index `at` of the packed network. After the first layer, inputs are in the order of the previous
+// layer's register layout: with half, pairs of two column blocks of 8 are interleaved; with float, the order is
 // unchanged.
 template <class T>
 __device__ float packed_weight(const FieldNetwork& net, int at) {
@@ -41,7 +41,7 @@ __device__ float packed_bias(const FieldNetwork& net, int at) {
   return output >= 0 && (head || output < net.width) ? net.biases[layer][output] : 0.0f;
 }
 
-// blockIdx.y is a line, and the last one the network.
+// blockIdx.y selects a line; the last index selects the network.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     prepare(FieldTimePlanes planes, FieldInput input, const float* time, FieldNetwork net, void* packed) {

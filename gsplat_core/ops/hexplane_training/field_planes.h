@@ -1,4 +1,4 @@
-// The planes of a field as the CUDA ops of its training take them, checked.
+// Checked planes of a field, for the CUDA ops of its training.
 #pragma once
 
 #include "../hexplane_deltas/field_arguments.h"
@@ -8,7 +8,7 @@ namespace gsplat::hexplane {
 
 using Tensors = std::vector<Tensor>;
 
-// The planes of all levels (xy, xz, yz, xt, yt, zt each) and what is derived from their sizes.
+// The planes of all levels (xy, xz, yz, xt, yt, zt each), and quantities derived from their sizes.
 struct Field {
   FieldPlanes planes = {};
   FieldTimePlanes times = {};

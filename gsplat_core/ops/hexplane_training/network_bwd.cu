@@ -1,7 +1,7 @@
-// Backward pass of the network on the tensor cores: gradients of the layers' sums and of the features.
+// Backward pass of the network on tensor cores: gradients of the layers' pre-activations and of the features.
 //
-// The assignment of a layer's columns to columns of the product is free. Here a lane has four consecutive ones of each row, at
-// 16 half + 4 quad of 32 columns, and reads and writes 16 bytes everywhere.
+// The assignment of a layer's columns to columns of the product is arbitrary. Here a lane has four consecutive columns
+// of each row, at 16 half + 4 quad of 32 columns, so that all its accesses are 16 bytes wide.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "matrix_units.cuh"
@@ -12,10 +12,10 @@ namespace {
 
 constexpr int kRowsPerWarp = 16;
 constexpr int kRowsPerBlock = kRowsPerWarp * kThreads / 32;
-constexpr int kFeatureColumns = 64;  // that a warp computes at once
+constexpr int kFeatureColumns = 64;  // feature columns that a warp computes at once
 
-// Weights as [outputs, inputs], rows padded by 4 floats, and in every 16 rows row 4 a + b stored at 4 b + a: the lanes of a warp,
-// whose quads are 4 rows apart, have no bank conflicts.
+// Weights [outputs, inputs] with rows padded by 4 floats; within every 16 rows, row 4 a + b is stored at 4 b + a. The
+// quads of a warp read rows 4 apart, and this layout avoids bank conflicts.
 struct BackwardLayout {
   int width, features;  // padded
   __device__ __host__ explicit BackwardLayout(const FieldNetwork& net)
@@ -44,12 +44,12 @@ __global__ void __launch_bounds__(kThreads) pack_weights(FieldNetwork net, float
 
 // 16 rows and 32 columns of a product.
 struct Columns {
-  float sums[4][4];  // [t][2 r + half]: of row group + 8 r and column 16 half + 4 quad + t
+  float sums[4][4];  // [t][2 r + half]: row group + 8 r, column 16 half + 4 quad + t
 
   __device__ float4 at(int r, int half) const {
     return make_float4(sums[0][2 * r + half], sums[1][2 * r + half], sums[2][2 * r + half], sums[3][2 * r + half]);
   }
-  // The gradient of ReLU, whose outputs at the same place are `outputs`.
+  // Gradient of ReLU, from its outputs at the same positions.
   __device__ void rectify(int r, int half, const float4& outputs) {
     const float out[4] = {outputs.x, outputs.y, outputs.z, outputs.w};
 #pragma unroll
@@ -57,7 +57,7 @@ struct Columns {
   }
 };
 
-// out += the product of `a` and the weights' rows at `first` and `second`.
+// out += `a` times the weight rows at `first` and `second`.
 template <int kOut>
 __device__ __forceinline__ void multiply_rows(Columns (&out)[kOut], const SplitLeft& a, const float* first, const float* second) {
 #pragma unroll
@@ -70,7 +70,7 @@ __device__ __forceinline__ void multiply_rows(Columns (&out)[kOut], const SplitL
   }
 }
 
-// out += in W for 32 of the weights' rows; `w` points to the lane's columns of the quad's first row.
+// out += in W for 32 of the weight rows. `w` points to the lane's columns of the quad's first row.
 template <int kOut>
 __device__ __forceinline__ void multiply_columns(Columns (&out)[kOut], const Columns& in, const float* w, int stride) {
 #pragma unroll
@@ -80,11 +80,11 @@ __device__ __forceinline__ void multiply_columns(Columns (&out)[kOut], const Col
   }
 }
 
-// Four columns of a row of v_raw; zeros where the row is not finite, and in columns that are not the field's.
+// Load four columns of a row of v_raw. Non-finite rows and columns that do not belong to the field are zero.
 __device__ __forceinline__ float4 head_gradient(const float* v_raw, int64_t row, bool inside, const WarpPlace& place) {
   const int column = 4 * place.quad;
   const float4 v = inside ? *reinterpret_cast<const float4*>(v_raw + row * kRawColumns + column) : float4{};
-  const unsigned team = 0xfu << (place.group * 4);  // the four lanes of the row
+  const unsigned team = 0xfu << (place.group * 4);  // the row's four lanes
   const bool finite = __all_sync(team, isfinite(v.x) && isfinite(v.y) && isfinite(v.z) && isfinite(v.w));
   const auto own = [&](int i, float x) { return finite && head_output(column + i) >= 0 ? x : 0.0f; };
   return make_float4(own(0, v.x), own(1, v.y), own(2, v.z), own(3, v.w));
@@ -115,7 +115,7 @@ __global__ void __launch_bounds__(kThreads, kWidth == 128 ? 1 : 2)
   }
   Columns now[kBlocks];
   for (int layer = net.layers - 1; layer >= 1; --layer) {
-    const int64_t start = (layer - 1) * count;  // of the layer before
+    const int64_t start = (layer - 1) * count;  // start of the previous layer
     const int stride = layout.hidden_stride();
     const float* w = weights + layout.start(layer) + place.quad * stride;
     Columns before[kBlocks] = {};
@@ -126,7 +126,7 @@ __global__ void __launch_bounds__(kThreads, kWidth == 128 ? 1 : 2)
 #pragma unroll
       for (int b = 0; b < kBlocks - 1; ++b) multiply_columns(before, now[b], w + 32 * b * stride, stride);
     }
-    float4 outputs[kBlocks][2][2];  // loaded ahead of the last products; rows past the end read the last row
+    float4 outputs[kBlocks][2][2];  // loaded before the last products; rows past the end read the last row
 #pragma unroll
     for (int r = 0; r < 2; ++r) {
       const float* row = hidden + (start + (rows[r] < count ? rows[r] : count - 1)) * kWidth + 4 * place.quad;

@@ -1,6 +1,6 @@
-// The gradient of the network's weights on the tensor cores: outer products of the gradients of a layer's outputs and its inputs,
-// summed over Gaussians. Split-K: a block sums a tile of one layer over its split of the Gaussians; the partial sums are then
-// added in their order.
+// Gradient of the network's weights on tensor cores: outer products of the gradients of a layer's outputs and of its
+// inputs, summed over Gaussians. Split-K: a block sums a tile of one layer over its share of the Gaussians; the partial
+// sums are then added in a fixed order.
 #include "cuda_scratch.h"
 #include "matrix_units.cuh"
 #include "training.h"
@@ -8,20 +8,20 @@
 namespace gsplat::hexplane {
 namespace {
 
-constexpr int kTile = 64;           // outputs, and inputs, of a block, whose four warps have a quarter each
-constexpr int kPart = kTile / 2;    // outputs, and inputs, of a warp
-constexpr int kDeep = 16;           // Gaussians of one stage
-constexpr int kStages = 4;          // in the pipeline of copies, of which the oldest is multiplied
-constexpr int kStride = kTile + 8;  // floats: no bank conflicts
+constexpr int kTile = 64;           // outputs and inputs per block; each of its four warps has a quarter of the tile
+constexpr int kPart = kTile / 2;    // outputs and inputs per warp
+constexpr int kDeep = 16;           // Gaussians per pipeline stage
+constexpr int kStages = 4;          // stages of the copy pipeline; the oldest one is multiplied
+constexpr int kStride = kTile + 8;  // in floats; avoids bank conflicts
 constexpr int kTileThreads = 128;
-constexpr int kBlocks = 512;  // about as many as are resident on a large GPU
+constexpr int kBlocks = 512;  // approximate number of resident blocks on a large GPU
 constexpr int kMaxSplits = 128;
 
 struct LayerTiles {
   const float *inputs[kMaxFieldLayers], *v_outputs[kMaxFieldLayers];    // [N, input_count], [N, output_count]
   int32_t input_count[kMaxFieldLayers], output_count[kMaxFieldLayers];  // padded
   int32_t first_tile[kMaxFieldLayers + 1];
-  int32_t first_value[kMaxFieldLayers + 1];  // of a layer in a partial sum: weights [outputs, inputs], then biases
+  int32_t first_value[kMaxFieldLayers + 1];  // start of each layer in a partial sum: weights [outputs, inputs], then biases
   int32_t layers, splits;
 
   __device__ int layer_of(const int32_t (&first)[kMaxFieldLayers + 1], int at) const {
@@ -35,8 +35,8 @@ struct Stage {
   float v[kDeep][kStride], x[kDeep][kStride];
 };
 
-// Four consecutive columns of the lane's Gaussians, `quad` and `quad + 4` of eight. The assignment of outputs and inputs to rows
-// and columns of the product is free, so these 16 bytes are operands of four products.
+// Four consecutive columns of the lane's Gaussians `quad` and `quad + 4` of eight. The assignment of outputs and inputs
+// to rows and columns of the product is arbitrary, so these 16 bytes are operands of four products.
 struct Operand {
   float v[2][4];
 
@@ -57,7 +57,7 @@ __global__ void __launch_bounds__(kTileThreads, 4) partial_sums(LayerTiles tiles
   const int64_t begin = count * blockIdx.y / tiles.splits, end = count * (blockIdx.y + 1) / tiles.splits;
   const int steps = int((end - begin + kDeep - 1) / kDeep);
 
-  // A thread copies 16 bytes of some rows, zeros past the end.
+  // A thread copies 16 bytes of some rows, and zeros past the end.
   constexpr int kPieces = kTile / 4, kRows = kTileThreads / kPieces;
   const int row = int(threadIdx.x) / kPieces, column = int(threadIdx.x) % kPieces * 4;
   const bool has_v = first_output + column < outputs, has_x = first_input + column < inputs;
@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(kTileThreads, 4) partial_sums(LayerTiles tiles
   }
   for (int step = 0; step < steps; ++step) {
     wait_for_copies<kStages - 2>();
-    __syncthreads();  // the copies of all threads have arrived, and nobody reads the previous stage any more
+    __syncthreads();  // the copies of all threads have arrived, and no thread reads the previous stage
     if (step + kStages - 1 < steps) copy(step + kStages - 1);
     commit_copies();
     if (idle) continue;
@@ -122,7 +122,7 @@ __global__ void __launch_bounds__(kTileThreads, 4) partial_sums(LayerTiles tiles
   }
 }
 
-// The index in the gradient of value `at` of a partial sum, or -1: padding.
+// Index in the gradient of value `at` of a partial sum, or -1 for padding.
 __device__ int place_in_gradient(const FieldNetwork& net, const LayerTiles& tiles, int at) {
   const int layer = tiles.layer_of(tiles.first_value, at);
   at -= tiles.first_value[layer];

@@ -1,4 +1,5 @@
-// What the passes over the planes share: a node's gradient, and Adam's update (Kingma and Ba 2015, algorithm 1) of its channels.
+// Shared by the passes over the planes: a node's gradient, and Adam's update (Kingma and Ba 2015, algorithm 1) of its
+// channels.
 #pragma once
 
 #include "../hexplane/plane_samples.cuh"
@@ -6,8 +7,8 @@
 
 namespace gsplat::hexplane {
 
-// `gradient_of` is called after the loads of the moments were issued, and `value_of` only if the update changes anything: most
-// nodes of a fine grid never have a Gaussian near, and cost two loads.
+// Update a node's channels. `gradient_of` is called after the moments' loads are issued, and `value_of` only if the
+// update changes the value. Most nodes of a fine grid never have a Gaussian nearby, and cost only two loads.
 template <int kLane, class Value, class Gradient>
 __device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, const Value& value_of, const Gradient& gradient_of,
                                        const AdamStep& adam) {
@@ -18,11 +19,11 @@ __device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, co
   for (int i = 0; i < kLane; ++i) idle = idle && gradient.v[i] == 0.0f && m.v[i] == 0.0f && v.v[i] == 0.0f;
   if (idle) return;
   Channels<kLane> p = value_of();
-  const AdamStep step = adam;  // read after the gradient was computed, which needs the registers
+  const AdamStep step = adam;  // read after the gradient, whose computation needs the registers
 #pragma unroll
   for (int i = 0; i < kLane; ++i) {
     const float g = gradient.v[i];
-    const bool finite = isfinite(g * g);  // a value that is not finite would stay in the moments
+    const bool finite = isfinite(g * g);  // a non-finite value would persist in the moments
     const float m_new = m.v[i] + step.fresh1 * (g - m.v[i]), v_new = v.v[i] + step.fresh2 * (g * g - v.v[i]);
     const float p_new = p.v[i] - step.rate * m_new / (sqrtf(v_new) * step.inv_bias2 + step.epsilon);
     m.v[i] = finite ? m_new : m.v[i];
@@ -34,7 +35,7 @@ __device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, co
   v.store(plane.second + at);
 }
 
-// Blocks of a launch over planes of different sizes, one slot = 3 * level + plane after the other.
+// Mapping of a launch's blocks to planes of different sizes, slot by slot; slot = 3 * level + plane.
 struct PlaneBlocks {
   int32_t first_block[3 * kMaxFieldLevels + 1];
   int32_t count;
@@ -46,7 +47,7 @@ __device__ __forceinline__ int slot_of_block(const PlaneBlocks& slots) {
   return slot;
 }
 
-// The Gaussians of a slot's space plane.
+// Return the sorted Gaussians of a slot's space plane.
 __device__ __forceinline__ SortedCells sorted_cells(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
                                                     int slot) {
   const int level = slot / 3, p = slot % 3;

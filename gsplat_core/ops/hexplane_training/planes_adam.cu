@@ -1,4 +1,4 @@
-// Adam over planes and network; or the planes' gradient itself, by the same passes.
+// Adam over planes and network, or the planes' gradient computed by the same passes.
 #include "../frame/frame.h"
 #include "cuda_branch.h"
 #include "cuda_scratch.h"
@@ -32,7 +32,7 @@ __global__ void __launch_bounds__(kThreads) update_network(NetworkParameters par
       scalars.step);
 }
 
-// A thread has consecutive channels of one node.
+// A thread processes consecutive channels of one node.
 template <int kLane, class Sink>
 __global__ void __launch_bounds__(kThreads, 5)
     space_nodes(FieldPlanes planes, FieldCells cells, FieldRows rows, PlaneBlocks slots, Sink sink) {
@@ -107,7 +107,7 @@ void visit_nodes(const FieldPlanes& planes, const FieldLines& lines, const Field
     time_nodes<kLane><<<time_blocks, kThreads, 0, branch.stream>>>(lines, line_gradient, time, planes.channels, time_slots, sink);
 }
 
-// Whether all planes and rows can be read 16 bytes at a time.
+// Return whether all planes and rows are aligned for 16-byte accesses.
 uintptr_t alignment(const FieldPlanes& planes, const FieldRows& rows, const float* line_gradient) {
   return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.dense_sums) | uintptr_t(line_gradient);
 }

@@ -1,10 +1,10 @@
-// The planes' gradient, and Adam over planes and network: checks and launches.
+// Host code of the planes' gradient, and of Adam over planes and network: checks and launches.
 #include "field_planes.h"
 
 namespace gsplat::hexplane {
 namespace {
 
-// N, from the rows of all slots, three per six planes.
+// Return N from the rows of all slots; a level of six planes has three slots.
 int64_t count_of(const Tensors& gradient, const Tensors& planes) {
   check(gradient.size() == 5, "gradient must be rows, fractions, dense sums, line gradient and starts, got ", gradient.size(),
         " tensors");
@@ -12,7 +12,7 @@ int64_t count_of(const Tensors& gradient, const Tensors& planes) {
   return gradient[0].size(1) / int64_t(planes.size() / 2);
 }
 
-// The gradient of the planes that hexplane_train_backward returned, as the passes over the planes take it.
+// Gradient tensors returned by hexplane_train_backward, converted to arguments of the passes over the planes.
 struct PlanesGradient {
   Tensor time, rows, fractions, dense_sums, v_lines, starts;
   FieldRows raw = {};
@@ -37,7 +37,7 @@ struct PlanesGradient {
   }
 };
 
-// Rate, step and status of an update, from their tensors, which must outlive the result.
+// Learning rate, step and status of an update. Their tensors must outlive this object.
 struct UpdateOptions {
   Tensor rate, step;
   OptionalTensor status;

@@ -1,10 +1,10 @@
-// Adam over the planes with penalties, whose gradients need the old values of a node's neighbours while the plane is updated in
-// place.
+// Adam over the planes with penalties. A penalty's gradient needs the old values of a node's neighbours, while the
+// plane is updated in place.
 //
-// Space planes: a block has a tile of nodes and goes down its rows. It keeps the old previous row and the old current row, which
-// its threads exchange in shared memory. Neighbours in other tiles are read from copies of all tiles' borders that a first pass
-// made, so blocks do not depend on each other's progress. Time planes: a thread goes along time, where all its neighbours are its
-// own.
+// Space planes: a block processes a tile of nodes row by row. It keeps the old previous and current rows, which its
+// threads exchange in shared memory. Neighbours in other tiles are read from copies of the tile borders made by a first
+// pass, so blocks do not depend on each other's progress. Time planes: a thread iterates along time, and all neighbours
+// belong to the same thread.
 #include "cuda_scratch.h"
 #include "plane_update.cuh"
 
@@ -13,21 +13,22 @@ namespace {
 
 constexpr int kTileThreads = 512, kTileRows = 32;
 
-// The tiles of all space planes; borders are copies of rows and columns beside the boundaries between tiles.
+// The tiles of all space planes. `borders` has copies of the rows and columns on both sides of the boundaries between
+// tiles.
 struct Tiles {
   PlaneBlocks blocks;
-  int32_t nodes;                         // of a tile along U
-  int32_t across[3 * kMaxFieldLevels];   // tiles along U
-  int64_t rows[3 * kMaxFieldLevels];     // in `borders`: [tiles along V + 1, 2, U * C], above and below a boundary
-  int64_t columns[3 * kMaxFieldLevels];  // [tiles along U + 1, 2, V, C], left and right of it
+  int32_t nodes;                        // nodes per tile along U
+  int32_t across[3 * kMaxFieldLevels];  // tiles along U
+  int64_t rows[3 * kMaxFieldLevels];  // offset in `borders` of [tiles along V + 1, 2, U * C], the rows above and below a boundary
+  int64_t columns[3 * kMaxFieldLevels];  // offset of [tiles along U + 1, 2, V, C], the columns left and right of a boundary
   float* borders;
 };
 
 struct Tile {
   int slot, level, p, width, height;
-  int column, row;  // of tiles
+  int column, row;  // position of the tile
   int first_u, end_u, first_v, end_v;
-  int u, channel;  // of the thread
+  int u, channel;  // position of the thread
   bool inside;
 
   __device__ Tile(const FieldPlanes& planes, const Tiles& tiles, int lane) {
@@ -77,7 +78,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   const AdamStep step = scalars->step;
   const int channels = planes.channels, width = tile.width, height = tile.height;
   const PlaneMoments& plane = state.space[tile.level][tile.p];
-  // Of a mean of squares: twice the difference over how many differences there are.
+  // Gradient factor of a mean of squared differences: 2 / (number of differences).
   const float along_u = width > 1 ? 2.0f * smoothness / (float(width - 1) * float(height) * float(channels)) : 0.0f;
   const float along_v = height > 1 ? 2.0f * smoothness / (float(width) * float(height - 1) * float(channels)) : 0.0f;
   const auto place = [&](int v) { return (int64_t(v) * width + tile.u) * channels + tile.channel; };
@@ -87,7 +88,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
     above = tile.row > 0 ? Channels<kLane>::load(tile.border_row(tiles, tile.row, 0, channels)) : current;
   }
   for (int v = tile.first_v; v < tile.end_v; ++v) {
-    float* row_now = row_values[v % 2];  // two buffers, so that one barrier per row is enough
+    float* row_now = row_values[v % 2];  // two buffers, so that one barrier per row suffices
     current.store(row_now + threadIdx.x * kLane);
     __syncthreads();
     if (!tile.inside) continue;
@@ -132,7 +133,7 @@ __global__ void __launch_bounds__(kThreads)
   const float bend = rows > 2 ? 2.0f * smoothness / (float(rows - 2) * float(size)) : 0.0f;
   const float away = sparsity / (float(rows) * float(size));
   const auto old = [&](int v) { return Channels<kLane>::load(plane.values + (v < rows ? v : rows - 1) * size + column); };
-  // bends[i]: second difference at rows v - 2 + i; 0 where it would skip the plane
+  // ^bends[i]: second difference at rows v - 2 + i; 0 where it would extend beyond the plane
   Channels<kLane> bends[3] = {Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f)};
   Channels<kLane> window[3] = {old(0), old(1), old(2)};  // old values of rows v, v + 1, v + 2
 #pragma unroll 2

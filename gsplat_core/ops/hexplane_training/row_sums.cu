@@ -1,20 +1,21 @@
-// Sums of gradient rows over many Gaussians: the gradient of the lines, where the Gaussians of a line's cell are contiguous in
-// the order of the plane that has the axis as its major; and the sums of dense cells of the space planes.
+// Sums of gradient rows over many Gaussians. The first is the gradient of the lines: the Gaussians of a line's cell are
+// contiguous in the order of the plane whose major axis is the line's axis. The second is the sums of dense cells of
+// the space planes.
 #include "cuda_scratch.h"
 #include "plane_update.cuh"
 
 namespace gsplat::hexplane {
 namespace {
 
-constexpr int kRun = 32;        // sorted Gaussians of one team
-constexpr int kRunBatch = 8;    // of their rows in flight
-constexpr int kDenseBatch = 4;  // the same for dense cells, which have four sums
+constexpr int kRun = 32;        // sorted Gaussians per team
+constexpr int kRunBatch = 8;    // rows in flight
+constexpr int kDenseBatch = 4;  // rows in flight for dense cells, which have four sums
 
-// One line's Gaussians, and where their sums go: those of run r in cell c go to index r + c, which no other run and cell have,
-// because neither decreases from one item to the next.
+// One line's Gaussians and the destinations of their sums. The sums of run r in cell c have index r + c. The index is
+// unique, because neither r nor c decreases from one item to the next.
 struct LineRuns {
   int32_t begin, end, minor_size, width;
-  float* sums;  // [runs + cells, 2, C]: for the left node, for the right one
+  float* sums;  // [runs + cells, 2, C]: for the left node and the right node
 
   __device__ LineRuns(const FieldPlanes& planes, const FieldCells& cells, int slot, int runs, float* all) {
     const int level = slot / 3, axis = slot % 3, plane = plane_of_major(axis);
@@ -58,7 +59,7 @@ __global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCe
   }
 }
 
-// A block adds up the runs of one node: of the cell on its right, whose left node it is, and of the cell on its left.
+// A block adds the run sums of one node, from the cells on its right and on its left.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads)
     add_runs(FieldPlanes planes, FieldLines lines, FieldCells cells, int runs, float* all, float* gradient) {
@@ -93,13 +94,13 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// A team goes through one run and sums the rows of dense cells, cell by cell, for the cells' four corners.
+// A team processes one run: it sums the rows of dense cells, cell by cell, for the cells' four corners.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads) dense_cell_sums(FieldCells cells, FieldRows rows, int channels, int runs) {
   const int run = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam;
   if (run >= runs) return;
   const int32_t begin = run * kDenseRun,
-                end = min(begin + kDenseRun, cells.starts[cells.cells]);  // after these come Gaussians that are left out
+                end = min(begin + kDenseRun, cells.starts[cells.cells]);  // followed by excluded Gaussians
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
     Channels<kLane> sums[4];
     uint32_t now = 0;

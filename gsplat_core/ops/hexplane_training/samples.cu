@@ -1,4 +1,4 @@
-// Gaussians sorted by cell, their features, and the gradient rows of their samples.
+// Sorts Gaussians by cell, and computes their features and the gradient rows of their samples.
 #include "../hexplane/plane_samples.cuh"
 #include "cub_device.cuh"
 #include "cuda_check.h"
@@ -52,7 +52,7 @@ __global__ void __launch_bounds__(kThreads) rank_items(FieldCells cells, int64_t
   if (cell < cells.cells && cells.starts[cell + 1] - cells.starts[cell] >= kDenseCell) cells.keys[i] = cell | kDenseBit;
 }
 
-// A team of lanes has one Gaussian at one level.
+// A team of lanes processes one Gaussian at one level.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads, 3)
     features_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, float* __restrict__ features) {
@@ -82,17 +82,16 @@ __global__ void __launch_bounds__(kThreads, 3)
   }
 }
 
-// A team of lanes has one Gaussian at all levels, so that the gradient of its position is one sum. Teams take Gaussians in the
-// order of the first plane's cells, in which neighbours read the same nodes.
+// A team of lanes processes one Gaussian at all levels, so that the gradient of its position is one sum. Teams take
+// Gaussians in the cell order of the first plane, in which neighbours read the same nodes.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads, 2)
     rows_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, const float* __restrict__ box,
                 const float* __restrict__ v_features, FieldRows rows, float* v_raw) {
   const int64_t index = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
-  const int64_t item =
-      index < cells.count ? cells.items[index] : cells.count;  // after the first plane's items come the next plane's
+  const int64_t item = index < cells.count ? cells.items[index] : cells.count;  // items of the next plane follow
   const bool inside = item < cells.count;
-  const int64_t n = inside ? item : 0;  // lanes without a Gaussian take part in the sums
+  const int64_t n = inside ? item : 0;  // lanes without a Gaussian take part in the warp's sums
   const int lane = int(threadIdx.x) % kTeam, channels = planes.channels;
   const float4 at4 = *reinterpret_cast<const float4*>(cells.coordinates + 4 * n);
   const bool active = inside && at4.w != 0.0f;
@@ -104,7 +103,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     for (int p = 0; p < 3; ++p) ranks[p] = cells.ranks[(3 * level + p) * cells.count + n];
     const int32_t* sizes = planes.sizes[level];
     const LinePosition places[3] = {position_on(at4.x, sizes[0]), position_on(at4.y, sizes[1]), position_on(at4.z, sizes[2])};
-    float v_place[3] = {};  // gradient of the position in cells
+    float v_place[3] = {};  // gradient of the position, in units of cells
     for (int c = lane * kLane; c < channels; c += kTeam * kLane) {
       const auto v = Channels<kLane>::load(v_features + (n * planes.levels + level) * channels + c);
       Channels<kLane> value[6], along_u[6], along_v[3];
@@ -140,7 +139,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     }
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) v_x[axis] += v_place[axis] * places[axis].slope;
-    // Stored after all loads of the level, which the compiler may not move across a store.
+    // Stores follow all loads of the level, because the compiler cannot move loads across a store.
 #pragma unroll
     for (int p = 0; p < 3; ++p) {
       if (lane != p) continue;

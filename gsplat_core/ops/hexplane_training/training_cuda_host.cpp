@@ -1,4 +1,4 @@
-// hexplane_train and its backward pass: checks, memory and the order of the launches.
+// Host code of hexplane_train and its backward pass: checks, memory and the order of the launches.
 #include <tuple>
 
 #include "cuda_branch.h"
@@ -15,7 +15,7 @@ FieldNetwork checked_network(const CudaCall& call, Tensors& weights, Tensors& bi
   return net;
 }
 
-// `order` has the items of FieldCells, their ranks and their keys.
+// Set the pointers of `cells`; `order` holds the items, their ranks and their keys.
 void set_cells(FieldCells& cells, const Tensor& coordinates, const Tensor& order, const Tensor& starts) {
   const int64_t items = order.size(1);
   int32_t* values = const_cast<int32_t*>(order.const_data_ptr<int32_t>());
@@ -24,8 +24,8 @@ void set_cells(FieldCells& cells, const Tensor& coordinates, const Tensor& order
   cells.starts = const_cast<int32_t*>(starts.const_data_ptr<int32_t>());
 }
 
-// (deltas [N, 16], coordinates [N, 4], lines, features [N, levels * C], hidden [layers - 1, N, padded width],
-// order [3, slots * N], starts [cells + 1])
+// Returns (deltas [N, 16], coordinates [N, 4], lines, features [N, levels * C], hidden [layers - 1, N, padded width],
+// order [3, slots * N], starts [cells + 1]).
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train(Tensor means, Tensor box, Tensor time,
                                                                                   Tensors planes, Tensors weights,
                                                                                   Tensors biases) {
@@ -46,7 +46,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_trai
   lines_only.lines = field.lines, lines_only.levels = field.planes.levels, lines_only.channels = field.planes.channels;
   void* packed = call.bytes(net.packed_bytes(4));
   place_gaussians(data(m), data(b), field.cells, call.stream);
-  CudaBranch branch(call.stream);  // sorting is needed by the backward pass only
+  CudaBranch branch(call.stream);  // only the backward pass needs the sorting
   sort_gaussians(field.planes, field.cells, call, branch.stream);
   prepare_field(field.times, lines_only, data(t), &net, packed, false, call.stream);
   field_features(field.planes, field.lines, field.cells, mutable_data(features), call.stream);
@@ -57,7 +57,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_trai
   return {deltas, coordinates, lines, features, hidden, order, starts};
 }
 
-// (network gradient, rows [2, slots * N, C], fractions, dense_sums, line gradient); adds the positions' gradient to v_raw.
+// Returns (network gradient, rows [2, slots * N, C], fractions, dense_sums, line gradient), and adds the positions'
+// gradient to v_raw.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tensor v_raw, Tensor box, Tensors state,
                                                                            Tensors planes, Tensors weights, Tensors biases) {
   check(state.size() == 6, "hexplane_train_backward: state must be the results of hexplane_train after the deltas, got ",
@@ -91,7 +92,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
   float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>(h.numel());
   float* v_head = call.array<float>(n * kRawColumns);
   network_backward(net, data(v_raw), data(h), v_features, v_hidden, v_head, n, call, call.stream);
-  CudaBranch branch(call.stream);  // network and lines run beside the space planes
+  CudaBranch branch(call.stream);  // network and lines overlap with the space planes
   network_weight_gradient(net, data(f), data(h), v_hidden, v_head, mutable_data(network_gradient), n, call, branch.stream);
   field_rows(field.planes, field.lines, field.cells, data(b), v_features, r, mutable_data(v_raw), call.stream);
   branch.fork();

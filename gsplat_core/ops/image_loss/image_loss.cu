@@ -1,5 +1,5 @@
-// The image loss with its gradients: count the pixels that each mean is over, then one pass for L1 and inverse depth, two more
-// for the similarity where it has a weight. Sums are per block, in double, added up in the order of the blocks.
+// Image loss with its gradients. The first kernel counts the pixels of each mean. One pass computes L1 and inverse
+// depth; two more compute the similarity if it has a weight. Sums are per block, in double, and added in block order.
 #include "image_loss.h"
 
 #include "../ssim/ssim.h"
@@ -9,14 +9,14 @@
 namespace gsplat::image_loss {
 namespace {
 
-constexpr float kLeastAlpha = 1e-10f;  // what a pixel's depth is divided by at least
+constexpr float kLeastAlpha = 1e-10f;  // lower bound of the divisor of a pixel's depth
 
 enum Count { kTissue, kKnownDepth, kCounts };
 enum Sum { kColour, kDepth, kSums };
 
 __device__ inline bool is_tissue(const DeviceImageLoss& in, int64_t pixel) { return in.mask == nullptr || in.mask[pixel] != 0; }
 
-// Expected depth of a pixel; 0 without depth.
+// Return the expected depth of a pixel; 0 without depth.
 __device__ inline float depth_at(const DeviceImageLoss& in, int64_t pixel) {
   if (in.target_depth == nullptr) return 0;
   if (in.alphas == nullptr) return in.depth[pixel];
@@ -38,7 +38,8 @@ __global__ void __launch_bounds__(kThreads) count_pixels(DeviceImageLoss in, int
   }
   tissue = __reduce_add_sync(0xffffffffu, tissue);
   known = __reduce_add_sync(0xffffffffu, known);
-  // Whole numbers: their sum does not depend on the order. Warps meet in their block first, for all blocks meet in one place.
+  // Integer sums do not depend on the order. Warps are reduced in their block first, because all blocks add to the same
+  // address.
   if (threadIdx.x % 32 == 0) {
     atomicAdd(totals + kTissue, tissue);
     atomicAdd(totals + kKnownDepth, known);
@@ -53,7 +54,7 @@ __device__ inline double warp_total(double value) {
   return value;
 }
 
-// Adds up both sums over the block; thread 0 has them.
+// Sum both values over the block; the result is valid in thread 0.
 __device__ inline void block_totals(double (&sums)[kSums]) {
   constexpr int kWarps = kThreads / 32;
   __shared__ double parts[kSums][kWarps];
@@ -68,7 +69,7 @@ __device__ inline void block_totals(double (&sums)[kSums]) {
   }
 }
 
-// |x - y| and its derivative times `slope`. Zero has no slope; a NaN in tissue shows in both.
+// |x - y| and its derivative times `slope`. The slope at zero is 0; NaN in tissue propagates to both.
 struct Difference {
   float value, slope;
 };
@@ -118,7 +119,7 @@ __global__ void __launch_bounds__(kThreads) differences(DeviceImageLoss in, cons
   if (threadIdx.x < kSums) block_sums[int64_t(blockIdx.x) * kSums + threadIdx.x] = sums[threadIdx.x];
 }
 
-// The three means and their weighted sum, by one block.
+// Compute the three means and their weighted sum, with one block.
 __global__ void __launch_bounds__(kThreads) finish(DeviceImageLoss in, const int64_t* counts, const double* block_sums,
                                                    int64_t blocks, const double* ssim_sums, int64_t ssim_blocks) {
   double sums[kSums] = {};
@@ -140,7 +141,7 @@ __global__ void __launch_bounds__(kThreads) finish(DeviceImageLoss in, const int
 }  // namespace
 
 void image_loss_on_device(const DeviceImageLoss& in, CudaScratch& scratch, cudaStream_t stream) {
-  constexpr int64_t kMostBlocks = 1024;  // of a few pixels per thread each: fewer sums to add up in the end
+  constexpr int64_t kMostBlocks = 1024;  // with a few pixels per thread; limits the number of partial sums
   const int64_t wanted = blocks_for(in.pixels), blocks = wanted < 1 ? 1 : wanted < kMostBlocks ? wanted : kMostBlocks;
   int64_t* const counts = scratch.array<int64_t>(kCounts);
   double* const block_sums = scratch.array<double>(blocks * kSums);

@@ -5,9 +5,9 @@ namespace GSPLAT_ISA::image_loss {
 
 using namespace gsplat::image_loss;
 
-constexpr int kBlock = 768;  // floats handled at a time: their tissue weights stay in the first-level cache
+constexpr int kBlock = 768;  // floats per step; their tissue weights stay in the L1 cache
 
-// Tissue (0 or 1) of each float of a block of whole pixels.
+// Expand the mask to the floats of a block of whole pixels, as 0 or 1.
 static void expand_mask(float* to, const uint8_t* mask, int64_t pixels, int channels) {
   if (channels == 3) {
     for (int64_t p = 0; p < pixels; ++p) {
@@ -30,7 +30,7 @@ GSPLAT_INLINE vfloat load_target(const uint8_t* p) {
   return __builtin_convertvector(bytes, vfloat) / 255.0f;
 }
 
-// |x - y| over tissue, or its square, and the derivative; a NaN under the tool is not seen, one in tissue is passed on.
+// |x - y| over tissue, or its square, and the derivative. NaN outside of tissue is ignored; NaN in tissue propagates.
 template <bool kSquared>
 GSPLAT_INLINE vfloat difference_of(vfloat x, vfloat y, vfloat tissue, float scale, float* gradient) {
   const vfloat d = select(tissue > 0, x - y, vfloat{});
@@ -49,7 +49,7 @@ static double colour_block(const float* x, const Target* y, const float* tissue,
   int i = 0;
   for (; i + kLanes <= n; i += kLanes)
     sums += difference_of<kSquared>(load(x + i), load_target(y + i), load(tissue + i), scale, gradient + i);
-  if (i < n) {  // the last few floats, in padded copies
+  if (i < n) {  // the remaining floats, in padded copies
     float xs[kLanes] = {}, ms[kLanes] = {}, gs[kLanes];
     Target ys[kLanes] = {};
     for (int lane = 0; i + lane < n; ++lane) xs[lane] = x[i + lane], ys[lane] = y[i + lane], ms[lane] = tissue[i + lane];
@@ -94,7 +94,7 @@ static void colour_rows(const ColourTask& task, int64_t row_begin, int64_t row_e
     colour_rows_to(task, task.target, row_begin, row_end);
 }
 
-// Where both depths are known and the mask is tissue, for kLanes pixels.
+// Mask of kLanes pixels at which both depths are known and the mask is tissue.
 GSPLAT_INLINE vint valid_depth(const float* depth, const float* target, const uint8_t* mask) {
   vint valid = (load(depth) > 0) & (load(target) > 0);
   if (mask) {
@@ -106,7 +106,8 @@ GSPLAT_INLINE vint valid_depth(const float* depth, const float* target, const ui
   return valid;
 }
 
-// Calls `on(offset, depth, target, mask, count)` for kLanes pixels at a time; the last few come in padded copies, invalid beyond.
+// Call `on(offset, depth, target, mask, count)` for kLanes pixels at a time. The remaining pixels are passed as copies
+// padded with invalid pixels.
 template <typename Body>
 GSPLAT_INLINE void for_row(const DepthTask& task, int64_t row, Body on) {
   const int64_t at = row * task.width;

@@ -10,12 +10,12 @@
 namespace gsplat::image_loss {
 namespace {
 
-// One call's images, checked; the tensors keep the memory alive that the pointers lead to.
+// Checked images of one call. The tensors own the memory of the pointers.
 struct Images {
   Tensor image, target;
   OptionalTensor mask, depth, target_depth;
-  int64_t height, width, channels, pixels;  // `channels` of the target, which an image may have more of
-  const float* target_values;               // or the bytes
+  int64_t height, width, channels, pixels;  // `channels` of the target; the image may have more
+  const float* target_values;               // null if the target is bytes
   const uint8_t *target_bytes, *tissue;
 
   Images(const Call& call, const Tensor& image_, const Tensor& target_, const OptionalTensor& mask_, const OptionalTensor& depth_,
@@ -52,7 +52,7 @@ struct Weights {
   bool squared;
 };
 
-// What a call returns.
+// Return values of a call.
 struct Results {
   Tensor loss, terms, v_image, v_depth;
 };
@@ -85,9 +85,9 @@ void run(Call& call, const Images& in, const Weights& weights, const Results& ou
 
 #else
 
-constexpr int64_t kRows = 16;  // rows worth a thread
+constexpr int64_t kRows = 16;  // minimum rows per task
 
-// Rows in order, whichever thread summed them.
+// Sum the rows in order, independent of the thread that computed them.
 template <typename T>
 T total(const std::vector<T>& rows) {
   return std::accumulate(rows.begin(), rows.end(), T(0));
@@ -158,7 +158,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tensor targe
 
 #if defined(GSPLAT_CUDA)
 
-// Of the frame path: the image has the sum of weight times z as a fourth channel, and the depth is that divided by alpha.
+// Loss of the frame path: the image's fourth channel is the weighted sum of z, and the depth is that channel divided by
+// alpha.
 std::tuple<Tensor, Tensor, Tensor, Tensor> frame_loss(Tensor image, Tensor alphas, Tensor target, OptionalTensor mask,
                                                       OptionalTensor target_depth, double ssim_weight, double depth_weight,
                                                       bool squared) {

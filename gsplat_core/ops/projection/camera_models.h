@@ -1,4 +1,5 @@
-// The three camera models: image point and Jacobian of a camera-space point, and their gradients, one Gaussian per lane.
+// The three camera models, one Gaussian per lane: image point and Jacobian of a camera-space point, and their
+// gradients.
 #pragma once
 
 #include "constants.h"
@@ -20,7 +21,7 @@ struct ImagePoint {
 
 struct Intrinsics {
   float fx, fy, cx, cy;
-  float slope_min[2], slope_max[2];  // where the pinhole's Jacobian is clamped: 0.3 half fields of view beyond the border
+  float slope_min[2], slope_max[2];  // limits of the slope in the pinhole Jacobian: 0.3 half fields of view beyond the border
 };
 
 GSPLAT_INLINE Intrinsics intrinsics_of(const float* k, float width, float height) {
@@ -56,11 +57,12 @@ struct Projector<kPinhole> {
     for (int a = 0; a < 2; ++a) {
       const vfloat s = min(max(t[a], splat(k.slope_min[a])), splat(k.slope_max[a]));
       const vint free = (t[a] > k.slope_min[a]) & (t[a] < k.slope_max[a]);
-      // through the slope: the image point f t, and the Jacobian's last column -f s / z where it is not clamped
+      // gradient through the slope: of the image point f t, and of the Jacobian's last column -f s / z where it is not
+      // clamped
       const vfloat v_t = f[a] * v_image[a] - select(free, f[a] * r * v_j[a][2], vfloat{});
       v[a] = v_t * r;
       v_z -= v_t * t[a] * r;
-      // through 1 / z
+      // gradient through 1 / z
       v_z += (f[a] * r * r) * (s * v_j[a][2] - v_j[a][a]);
     }
     return {v[0], v[1], v_z};
@@ -78,8 +80,8 @@ struct Projector<kOrtho> {
   }
 };
 
-// Equidistant: the image radius is f theta. With r = |(x, y)|, w = 1 / (r^2 + z^2), s = theta / r and q = (z w - s) / r^2:
-// ds/dx = q x, ds/dz = -w, dq/dx = e x with e = -(2 z w^2 + 3 q) / r^2, dq/dz = 2 w^2.
+// Equidistant fisheye: the image radius is f theta. With r = |(x, y)|, w = 1 / (r^2 + z^2), s = theta / r and q = (z w
+// - s) / r^2: ds/dx = q x, ds/dz = -w, dq/dx = e x with e = -(2 z w^2 + 3 q) / r^2, dq/dz = 2 w^2.
 template <>
 struct Projector<kFisheye> {
   struct Terms {
@@ -89,7 +91,7 @@ struct Projector<kFisheye> {
   static GSPLAT_METHOD Terms terms(const Point3& p) {
     const vfloat r2 = p.x * p.x + p.y * p.y, r = sqrt(r2), w = 1.0f / (r2 + p.z * p.z);
     const vfloat s = atan2(r, p.z) / r, q = (p.z * w - s) / r2, e = -(2 * p.z * w * w + 3 * q) / r2;
-    // Near the axis these quotients lose their digits, so they are taken from their series in (r / z)^2.
+    // Near the axis these quotients suffer from cancellation, so their series in (r / z)^2 are used.
     const vfloat inv = 1.0f / p.z, t = r2 * inv * inv, inv3 = inv * inv * inv;
     const vfloat s_axis =
         inv * (1 + t * (-1.f / 3 + t * (1.f / 5 + t * (-1.f / 7 + t * (1.f / 9 + t * (-1.f / 11 + t * (1.f / 13)))))));
@@ -116,7 +118,7 @@ struct Projector<kFisheye> {
     const vfloat v_s = gu * p.x + gv * p.y + a0 + b1;
     const vfloat v_q = a0 * p.x * p.x + cross * p.x * p.y + b1 * p.y * p.y;
     const vfloat v_w = -(a2 * p.x + b2 * p.y);
-    const vfloat radial = v_s * t.q + v_q * t.e - 2 * v_w * t.w * t.w;  // times x or y: through s, q and w
+    const vfloat radial = v_s * t.q + v_q * t.e - 2 * v_w * t.w * t.w;  // times x or y: gradient through s, q and w
     return {gu * t.s + t.q * (2 * a0 * p.x + cross * p.y) - a2 * t.w + radial * p.x,
             gv * t.s + t.q * (2 * b1 * p.y + cross * p.x) - b2 * t.w + radial * p.y,
             -v_s * t.w + 2 * t.w * t.w * (v_q - v_w * p.z)};

@@ -1,5 +1,5 @@
-// Projection of 3D Gaussians to screen-space ellipses (EWA splatting, Zwicker et al. 2001), forward and backward: what the host
-// code and the kernels of both devices share.
+// Projection of 3D Gaussians to screen-space ellipses (EWA splatting, Zwicker et al. 2001), forward and backward:
+// interface between the host code and the kernels of both devices.
 #pragma once
 
 #include <cstdint>
@@ -16,10 +16,11 @@ struct ProjectionSize {
   int64_t batches, cameras, gaussians;  // B, C, N
 };
 
-// Gaussians and cameras; rows of floats as torch keeps them. A kernel of the CPU gets one batch and camera, one of CUDA all.
+// Gaussians and cameras in torch's row-major layout. A CPU kernel receives one batch and camera, a CUDA kernel all of
+// them.
 struct ProjectionInput {
   const float* means;           // [B, N, 3]
-  const float* covars;          // [B, N, 6], or null with the next two given
+  const float* covars;          // [B, N, 6]; null if quats and scales are given
   const float* quats;           // [B, N, 4]
   const float* scales;          // [B, N, 3]
   const float* opacities;       // [B, N] or null
@@ -41,9 +42,9 @@ struct ProjectionOutput {
   float* compensations;  // [B, C, N] or null
 };
 
-// Gradients of the outputs; null where nothing came.
+// Gradients of the outputs; null where there is none.
 struct ProjectionOutputGradient {
-  const int32_t* radii;  // (0, 0) = culled
+  const int32_t* radii;  // (0, 0) marks culled Gaussians
   const float* means2d;
   const float* depths;
   const float* conics;
@@ -52,14 +53,15 @@ struct ProjectionOutputGradient {
 
 struct ProjectionInputGradient {
   float* means;
-  float* covars;  // or null with the next two given
+  float* covars;  // null if quats and scales are given
   float* quats;
   float* scales;
-  float* viewmat;   // 12 sums for each block of Gaussians: rotation by rows, then translation; or null
-  bool accumulate;  // CPU: add to means, covars, quats and scales (later cameras) instead of writing them
+  float* viewmat;  // 12 sums per block of Gaussians, or null: rotation row by row, then translation
+  // CPU: add to means, covars, quats and scales instead of overwriting them, for all cameras but the first
+  bool accumulate;
 };
 
-// The inputs of one camera.
+// Return the inputs of one camera.
 GSPLAT_HOST_DEVICE ProjectionInput of_camera(ProjectionInput in, const ProjectionSize& size, int64_t batch, int64_t camera) {
   const int64_t row = batch * size.gaussians, image = batch * size.cameras + camera;
   in.means += 3 * row;
@@ -72,17 +74,17 @@ GSPLAT_HOST_DEVICE ProjectionInput of_camera(ProjectionInput in, const Projectio
   return in;
 }
 
-// CPU: Gaussians `begin` to `end` - 1 of one camera.
+// CPU kernels for Gaussians `begin` to `end` - 1 of one camera.
 struct Kernels {
   void (*forward)(const ProjectionInput&, const ProjectionOutput&, int64_t begin, int64_t end);
   void (*backward)(const ProjectionInput&, const ProjectionOutputGradient&, const ProjectionInputGradient&, int64_t begin,
                    int64_t end);
 };
 
-// CUDA: all Gaussians and cameras; every pointer is to device memory.
+// CUDA versions for all Gaussians and cameras; all pointers are device memory.
 void project_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutput& out, cudaStream_t stream);
-// `to.viewmat` has memory for 12 sums of each of camera_sums(size) blocks, or is null; the sums are added up in `v_viewmats`
-// [B, C, 4, 4], which must be zero before. Sums are taken in a fixed order, and cameras in theirs.
+// `to.viewmat` is null or has memory for 12 sums of each of camera_sums(size) blocks. The sums are added to
+// `v_viewmats` [B, C, 4, 4], which must be zeroed. Sums over Gaussians and cameras are taken in a fixed order.
 void project_backward_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutputGradient& from,
                                 const ProjectionInputGradient& to, float* v_viewmats, cudaStream_t stream);
 int64_t camera_sums(const ProjectionSize& size);

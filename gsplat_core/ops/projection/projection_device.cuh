@@ -1,4 +1,4 @@
-// Projection on CUDA: parts that the separate op, rasterization in one call and the frame path share.
+// Parts of CUDA projection shared by the separate op, the fused rasterization and the frame path.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -24,15 +24,16 @@ __device__ inline Geometry load_geometry(const ProjectionInput& in, int64_t n) {
   return geometry_of(quat, scales);
 }
 
-// a b - c d without cancellation where the products are nearly equal (Kahan; Jeannerod et al. 2013).
+// a b - c d without cancellation if the products are nearly equal (Kahan; Jeannerod et al. 2013).
 __device__ inline float difference_of_products(float a, float b, float c, float d) {
   const float cd = __fmul_rn(c, d);
   return fmaf(a, b, -cd) + fmaf(-c, d, cd);
 }
 
-// Gradients of the projected mean and of the blurred covariance S = (a, b; b, c) (symmetric): S^-1 m and 1/2 S^-1 M S^-1, with m
-// and M the moments of first and second order. Computed along the axes u and w of the ellipse: in x and y, a thin splat's
-// component along its length, which is smaller by the squared ratio of the axes, would be lost to rounding.
+// Gradients of the projected mean and of the blurred covariance S = (a, b; b, c) (symmetric): S^-1 m and 1/2 S^-1 M
+// S^-1, with m and M the moments of first and second order. They are computed along the ellipse's axes u and w. In x
+// and y the component along the length of a thin splat would be lost to rounding, because it is smaller by the squared
+// ratio of the axes.
 struct EllipseGradient {
   float mean[2], covariance[3];
 };
@@ -52,10 +53,10 @@ __device__ inline EllipseGradient ellipse_gradient(float a, float b, float c, co
            0.5f * (y * y * uu + 2 * x * y * uw + x * x * ww)}};
 }
 
-// Sums of the gradients of a camera: its rotation by rows, its translation, and further values.
+// Number of gradient sums per camera: rotation row by row, then translation. Further values may follow.
 constexpr int kMatrixSums = 12;
 
-// The block's sums of kSums values per thread, in a fixed order: halves of a warp, then warp after warp.
+// Sum kSums values per thread over the block in a fixed order: halves of a warp, then warp by warp.
 template <int kSums, int kBlock>
 __device__ inline void sum_over_block(const float* v, float* to) {
   __shared__ float warps[kBlock / 32][kSums];
@@ -73,8 +74,8 @@ __device__ inline void sum_over_block(const float* v, float* to) {
   __syncthreads();
 }
 
-// A warp per image and sum; each lane adds up every 32nd block, and the lanes are added in a fixed order. `centers` receives the
-// values after the first kMatrixSums; it may be null.
+// One warp per image and sum: each lane adds every 32nd block, and the lanes are added in a fixed order. `centers`
+// receives the values after the first kMatrixSums; it may be null.
 template <int kSums>
 __global__ void sum_over_blocks(const float* sums, int64_t blocks, float* viewmats, float* centers) {
   const int64_t image = blockIdx.x;

@@ -7,7 +7,7 @@
 namespace gsplat::projection {
 namespace {
 
-// The checked inputs: they keep the memory alive that `input` points to.
+// Checked inputs, which own the memory that `input` points to.
 struct Scene {
   Tensor means, viewmats, intrinsics;
   OptionalTensor covars, quats, scales, opacities;
@@ -52,7 +52,7 @@ void backward(Call& call, const Scene& scene, const ProjectionOutputGradient& fr
 
 #else
 
-constexpr int64_t kBlock = 1024;  // Gaussians of one task: a multiple of every vector width
+constexpr int64_t kBlock = 1024;  // Gaussians per task; a multiple of every vector width
 
 template <class T>
 T* at(T* p, int64_t offset) {
@@ -140,7 +140,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_backward(
   const auto fits = [&](const OptionalTensor& t, int64_t columns) { return !t.has_value() || t->numel() == rows * columns; };
   check(radii.numel() == 2 * rows && fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_conics, 3) && fits(v_compensations, 1),
         "projection backward: the sizes of the gradients do not fit the ", rows, " projected Gaussians of the inputs");
-  // With no camera no kernel of the CPU writes anything.
+  // Without cameras no CPU kernel writes the outputs.
   const bool unwritten = C == 0, from_covars = scene.covars.has_value();
   const auto gradient = [&, B = B, N = N](bool wanted, int64_t columns) {
     if (!wanted) return call.empty({0});

@@ -1,4 +1,4 @@
-// One Gaussian in one camera, forward and backward, one Gaussian per lane; the processor's kernels and CUDA's share it.
+// Projection of one Gaussian per lane to one camera, forward and backward; shared by the CPU and CUDA kernels.
 #pragma once
 
 #include "../covariance/covariance_math.h"
@@ -12,15 +12,15 @@ namespace GSPLAT_ISA::projection {
 using namespace gsplat::projection;
 using namespace covariance;
 
-constexpr float kHuge = 1e30f;  // beyond this a number is taken for infinite: its square is
+constexpr float kHuge = 1e30f;  // larger numbers count as infinite, because their square is
 
-// False for NaN too.
+// Also false for NaN.
 GSPLAT_INLINE vint finite(vfloat x) { return (x > -kHuge) & (x < kHuge); }
 
-// What forward and backward both need about a camera.
+// Camera parameters shared by forward and backward.
 template <CameraModel model>
 struct View {
-  Matrix3 w;  // rotation of the camera, the same in every lane
+  Matrix3 w;  // rotation of the camera, identical in every lane
   vfloat translation[3];
   Intrinsics k;
 
@@ -42,7 +42,7 @@ struct View {
 struct Geometry {
   Symmetric3 sigma;
   vint valid;
-  UnitQuat quat;  // this and the next two where the covariance is made of them
+  UnitQuat quat;  // this and the next two only if the covariance is built from them
   Matrix3 rotation;
   vfloat scales[3];
 };
@@ -69,7 +69,7 @@ GSPLAT_INLINE Geometry geometry_of(const Symmetric3& sigma) {
 struct Ellipse {
   vfloat affine[2][3];  // A = J W
   vfloat half[2][3];    // A Sigma
-  vfloat a0, b, c0;     // A Sigma A^T, not blurred
+  vfloat a0, b, c0;     // A Sigma A^T, before the blur
 };
 
 template <CameraModel model>
@@ -96,11 +96,11 @@ GSPLAT_INLINE vfloat compensation_of(const Ellipse& e, vfloat det, float floor) 
 }
 
 struct Projected {
-  vint valid;  // where it is not, the rest is anything
+  vint valid;  // if false, the other members are undefined
   vfloat u, v, depth, conic[3], compensation, radius_x, radius_y;
 };
 
-// `opacity` may be null; without `compensate` the compensation is 0.
+// `opacity` may be null. Without `compensate` the compensation is 0.
 template <CameraModel model>
 GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& view, const vfloat mean[3],
                                 const Geometry& geometry, const vfloat* opacity, bool compensate) {
@@ -150,20 +150,20 @@ GSPLAT_INLINE auto with_camera_model(int model, const Run& run) {
   }
 }
 
-// `project` for the camera model of the input.
+// `project` for the input's camera model.
 GSPLAT_INLINE Projected project(const ProjectionInput& in, const vfloat mean[3], const Geometry& geometry, const vfloat* opacity,
                                 bool compensate) {
   return with_camera_model(
       in.model, [&](auto model) { return project(in, View<decltype(model)::value>(in), mean, geometry, opacity, compensate); });
 }
 
-// Gradient of the blurred 2D covariance, as a symmetric matrix (xx, xy, yy), from those of its inverse and compensation. At its
-// floor the compensation has no gradient.
+// Return the gradient of the blurred 2D covariance as a symmetric matrix (xx, xy, yy), from those of its inverse and of
+// the compensation. A compensation at its lower bound has no gradient.
 GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, const ProjectionInput& in, const vfloat v_conic[3], bool compensate,
                                          vfloat v_compensation, vfloat g[3]) {
   const vfloat a = e.a0 + in.eps2d, c = e.c0 + in.eps2d, b = e.b;
   const vfloat det = a * c - b * b, inverse = 1.0f / det;
-  const vfloat x = c * inverse, y = -b * inverse, z = a * inverse;  // the conic X; the gradient is -X V X
+  const vfloat x = c * inverse, y = -b * inverse, z = a * inverse;  // X is the conic; the gradient is -X V X
   const vfloat v0 = v_conic[0], v1 = 0.5f * v_conic[1], v2 = v_conic[2];
   const vfloat m00 = v0 * x + v1 * y, m01 = v0 * y + v1 * z, m10 = v1 * x + v2 * y, m11 = v1 * y + v2 * z;  // V X
   g[0] = -(x * m00 + y * m10);
@@ -179,19 +179,20 @@ GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, const ProjectionInput
   }
 }
 
-// Gradients of one Gaussian's projection.
+// Gradients of the outputs of one Gaussian's projection.
 struct ProjectedGradient {
   vfloat means2d[2], depth, conic[3], compensation;
 };
 
-// What they are for its inputs: of the covariance (of its upper triangle), or of quaternion and scales; and of the camera's
-// rotation by rows and translation.
+// Gradients of the inputs: the covariance (upper triangle), or quaternion and scales; and the camera's rotation row by
+// row and translation.
 struct BackProjected {
   vfloat mean[3], quat[4], scales[3], viewmat[12];
   Symmetric3 sigma;
 };
 
-// From the gradient g of the blurred 2D covariance (xx, xy, yy; as a symmetric matrix), of the image point and of the depth.
+// Backpropagate the gradient g of the blurred 2D covariance (xx, xy, yy; as a symmetric matrix), of the image point and
+// of the depth.
 template <CameraModel model>
 GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const View<model>& view, const vfloat mean[3],
                                              const Geometry& geometry, const Point3& p, const ImagePoint& image, const Ellipse& e,
@@ -223,7 +224,7 @@ GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const Vi
       to.viewmat[9 + i] = v_p[i];
     }
   if (in.covars != nullptr) {
-    to.sigma.v[1] *= 2;  // each off the diagonal stands for two elements of the matrix
+    to.sigma.v[1] *= 2;  // each off-diagonal value of the triangle occurs twice in the matrix
     to.sigma.v[2] *= 2;
     to.sigma.v[4] *= 2;
   } else {
