@@ -1,5 +1,5 @@
-// The gradient of `rasterize`, in two calls: from the picture to the splats, and from the splats to the inputs. Between the two
-// is where programs look at the gradient of means2d.
+// Gradient of `rasterize`, in two calls: from the image to the splats, and from the splats to the inputs. The split
+// exposes the gradient of means2d, which densification strategies read.
 #include <tuple>
 
 #include "scene_inputs.h"
@@ -13,10 +13,11 @@ Sizes sizes_of(const Tensor& t) {
   return sizes;
 }
 
-// What the forward pass left for the gradient: places in the list. `Saved` in rasterization.py has them in the same order.
+// Indices of the tensors that the forward pass saves for the gradient. `Saved` in rasterization.py has the same order.
 enum SavedTensor { kRecords, kConics, kOffsets, kSplatIds, kSorted, kStarts, kRowOf, kBehind, kAlphas, kExpected, kLast, kSaved };
 
-// The gradients of the splats' records and means2d, and the sums of |dL/dmeans2d|, which are empty if not asked for.
+// Return the gradients of the splats' records and of means2d, and the sums of |dL/dmeans2d|, which are empty unless
+// requested.
 std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(OptionalTensors saved, OptionalTensor v_image_in,
                                                              OptionalTensor v_alphas_in, std::vector<int64_t> image_dims,
                                                              std::vector<int64_t> options, std::vector<double> ranges) {
@@ -69,7 +70,7 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(OptionalTensors sav
   return {v_splats, v_means2d, v_absolute};
 }
 
-// The gradients of the inputs in their order; those that `needs` does not ask for are empty.
+// Return the gradients of the inputs in their order; those not requested by `needs` are empty.
 std::vector<Tensor> rasterize_inputs_backward(OptionalTensors given, Tensor radii_in, OptionalTensor row_of_in,
                                               OptionalTensors gradients, std::vector<int64_t> image_dims,
                                               std::vector<int64_t> options, std::vector<double> ranges, std::vector<bool> needs) {

@@ -1,4 +1,4 @@
-// The lists of the tiles, and the picture.
+// Tile lists, and the image.
 #include "../blending/blend_forward.cuh"
 #include "../frame/tile_sort.cuh"
 #include "dependent_launch.cuh"
@@ -13,9 +13,9 @@ using namespace frame;
 using Splat = Record<4>;
 using Stage = ForwardStage<4>;
 
-// The splats of a tile in the order of their depth: `sorted` has numbers of instances.
+// The splats of a tile in depth order; `sorted` holds instance numbers.
 struct TileSplats {
-  const Splat* records;  // of the image
+  const Splat* records;  // of the tile's image
   const int32_t* instance_splats;
   SortedIds sorted;
   int begin;
@@ -69,7 +69,7 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
   }
 }
 
-// The frame path's view of the lists of one image, or of all.
+// Return the frame path's Scene for the tile lists of one image, or of all images.
 frame::Scene frame_of(const Scene& scene, int64_t count, int64_t tile_rows) {
   frame::Scene of_frame = {};
   of_frame.count = count;
@@ -87,7 +87,8 @@ void scan(const Scene& scene, const Lists& lists, int32_t* status, const frame::
   frame_lists.tile_offsets = lists.tile_offsets;
   frame_lists.status = status;
   frame_lists.capacity = (int64_t(1) << 31) - 1;
-  // All images' tiles below one another, and as many Gaussians as there are threads: a block is of one image.
+  // The tiles of all images are stacked vertically. The number of Gaussians is padded to whole blocks, so that each
+  // block belongs to one image.
   frame::scan(frame_of(scene, scene.images() * scene.blocks() * frame::kGaussianThreads, scene.images() * scene.tile_height),
               frame_lists, scratch, stream);
 }
@@ -114,7 +115,7 @@ void fill(const Scene& scene, const Splats& splats, const Lists& lists, const fr
 void blend(const Scene& scene, const Splats& splats, const Lists& lists, const Pixels& out, cudaStream_t stream) {
   const int64_t tiles = scene.images() * scene.tiles();
   if (tiles == 0) return;
-  // As many bits as gsplat gives the tile: floor(log2(tiles)) + 1.
+  // As many bits as gsplat reserves for the tile: floor(log2(tiles)) + 1.
   const int tile_bits = 64 - __builtin_clzll(uint64_t(scene.tiles()));
   launch_dependent(blend_tiles, unsigned(tiles), kBlockThreads, stream, 0, scene, splats, lists, tile_bits, out);
 }

@@ -1,5 +1,5 @@
-// What the host code of the op needs beside CudaCall: tensors with little overhead, scratch memory cut from one allocation, and
-// numbers read from the device.
+// Additions to CudaCall for the op's host code: low-overhead tensor allocation, scratch arrays in one allocation, and
+// values read back from the device.
 #pragma once
 
 #include <vector>
@@ -10,8 +10,8 @@ namespace gsplat::rasterization {
 
 using Sizes = std::vector<int64_t>;
 
-// An uninitialised tensor on the device of a call. The same as CudaCall::empty, without torch's dispatcher, which would take half
-// of the time that the host spends in a forward pass.
+// Allocates uninitialised tensors on a call's device. Equivalent to CudaCall::empty but bypasses torch's dispatcher,
+// which would take half of the host time of a forward pass.
 class Allocator {
  public:
   explicit Allocator(const Tensor& on) : device_(on.get_device_index()) {}
@@ -41,7 +41,7 @@ inline float* float_data(const Tensor& t) { return t.numel() > 0 ? t.mutable_dat
 inline int32_t* int_data(const Tensor& t) { return t.numel() > 0 ? t.mutable_data_ptr<int32_t>() : nullptr; }
 inline int64_t* long_data(const Tensor& t) { return t.numel() > 0 ? t.mutable_data_ptr<int64_t>() : nullptr; }
 
-// Consecutive arrays in one allocation: `place` returns the offset of each, then `make` allocates.
+// Consecutive arrays in one allocation: `place` returns the offset of each array, then `make` allocates.
 class Arena {
  public:
   template <class T>
@@ -65,7 +65,8 @@ class Arena {
   std::optional<Tensor> tensor_;
 };
 
-// A few words of page-locked memory of this thread, to read from the device: from other memory the driver copies once more.
+// A few words of page-locked memory per thread for reads from the device. From pageable memory the driver would need an
+// extra copy.
 class PinnedWords {
  public:
   static constexpr int kCount = 16;

@@ -1,16 +1,17 @@
-// `rasterization()` in one call: what gsplat's chain of projection, tiles and compositing returns, from the Gaussians.
+// Host code of `rasterization()` in one call: from Gaussians to the outputs of gsplat's projection, tile intersection
+// and compositing.
 #include "scene_inputs.h"
 
 namespace gsplat::rasterization {
 namespace {
 
-constexpr int64_t kFewTiles = 4096;  // for so many a counter may have 128 bytes of its own
+constexpr int64_t kFewTiles = 4096;  // up to this number of tiles every counter has its own 128 bytes
 
-// Scratch memory that is needed until the length of the lists is known.
+// Scratch memory that is used until the length of the lists is known.
 struct ListScratch {
   Arena arena;
   frame::Scratch lists;
-  int32_t* status;           // [2, frame::kStatusSize]: of the lists, and of the packed rows
+  int32_t* status;           // [2, frame::kStatusSize]: status of the lists, then of the packed rows
   uint32_t* visible_counts;  // [images * blocks], packed
   int32_t* visible_starts;   // [images * blocks + 1], packed
   uint64_t* visible_states;
@@ -42,7 +43,7 @@ struct ListScratch {
   }
 };
 
-// Counts the visible splats; their number becomes status[frame::kStatusSize + frame::kStatusNeeded].
+// Count the visible splats; their number is written to status[frame::kStatusSize + frame::kStatusNeeded].
 void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& scratch, cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();
   if (blocks == 0) {
@@ -64,7 +65,7 @@ void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& s
   frame::scan(counters, lists, of_counters, stream);
 }
 
-// One forward pass: every tensor that it returns, in the order of `outputs`.
+// One forward pass. It holds all returned tensors; `outputs` returns them in order.
 struct Pass {
   const CudaCall& call;
   const Allocator memory;
@@ -121,8 +122,8 @@ struct Pass {
     if (packed) scan_visible(scene, splats, scratch, call.stream);
     PinnedWords& words = PinnedWords::of_thread();
     words.read(scratch.status, 2 * frame::kStatusSize, call.stream);
-    const Pixels pixels = make_pixels();  // while the device is at work
-    // The host waits here, once, for the lengths: what is returned is exactly as long.
+    const Pixels pixels = make_pixels();  // overlaps with the kernels already queued
+    // The only host synchronisation: it provides the list lengths, so that the returned tensors have the exact size.
     check_cuda(cudaStreamSynchronize(call.stream), "projecting the Gaussians");
     lists.length = words[frame::kStatusNeeded];
     check(lists.length < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
@@ -153,9 +154,10 @@ struct Pass {
     return {float_data(image), float_data(alphas), float_data(expected), training ? int_data(last) : nullptr};
   }
 
-  // Replaces the splats by their packed rows, and remembers what the gradient needs of them.
+  // Replace the splats by their packed rows, and keep the values that the gradient needs.
   void pack_rows(const Splats& splats, const ListScratch& scratch, int64_t rows, const Lists& lists) {
-    const Tensor dense[] = {means2d, depths, conics, opacities, tiles_per_gauss};  // until the kernels are queued
+    // Keeps the memory alive until the kernels are queued.
+    const Tensor dense[] = {means2d, depths, conics, opacities, tiles_per_gauss};
     dense_radii = radii;
     splat_ids = flatten_ids;
     row_of = memory.ints({scene.images() * scene.gaussians});

@@ -1,4 +1,4 @@
-// One Gaussian of a batch and its camera, for the forward and the backward kernel.
+// Inputs of one Gaussian and its camera, for the forward and the backward kernels.
 #pragma once
 
 #include "../projection/projection_device.cuh"
@@ -13,10 +13,10 @@ using namespace spherical_harmonics;
 
 constexpr unsigned kWholeWarp = 0xffffffffu;
 
-// The inputs of projection for one batch and one camera.
+// Return the inputs of projection for one batch and one camera.
 __device__ inline ProjectionInput seen_by(const Scene& scene, int64_t batch, int64_t image) {
   ProjectionInput in = scene.projection;
-  in.compensation_floor = kCompensationFloor;  // so that the compiler knows it
+  in.compensation_floor = kCompensationFloor;  // makes the value known to the compiler
   const int64_t row = batch * scene.gaussians;
   in.means += 3 * row;
   if (in.covars != nullptr) {
@@ -31,8 +31,8 @@ __device__ inline ProjectionInput seen_by(const Scene& scene, int64_t batch, int
   return in;
 }
 
-// Where the camera is: the first three numbers of the last column of the inverse of its matrix, by Cramer's rule, as
-// `camera_centers` in view_colors.py has it.
+// Compute the camera centre: the translation of the inverse view matrix, by Cramer's rule. `camera_centers` in
+// view_colors.py uses the same formula.
 __device__ inline void center_of(const float* m, float* center) {
   float crosses[3][3];
   for (int row = 0; row < 3; ++row) {
@@ -50,7 +50,7 @@ __device__ inline void center_of(const float* m, float* center) {
   for (int k = 0; k < 3; ++k) center[k] /= last + m[15] * determinant;
 }
 
-// By all threads of a block, for one image; ends with a barrier.
+// Load the camera centre of one image. All threads of a block must call it. Ends with a barrier.
 __device__ inline void load_center(const Scene& scene, int64_t image, float (&center)[3]) {
   if (threadIdx.x == 0) {
     if (scene.centers != nullptr) {
@@ -62,7 +62,7 @@ __device__ inline void load_center(const Scene& scene, int64_t image, float (&ce
   __syncthreads();
 }
 
-// run(std::integral_constant) for a degree of 0 to 4 or kPlainColors; the host has checked it.
+// Call run(std::integral_constant) for a degree of 0 to 4 or kPlainColors, which the host has checked.
 template <class Run>
 void with_degree(int degree, const Run& run) {
   switch (degree) {

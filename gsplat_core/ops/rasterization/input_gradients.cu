@@ -1,4 +1,4 @@
-// Per Gaussian: from the gradients of its splats, in the order of the cameras, to those of its parameters.
+// One thread per Gaussian: from the gradients of its splats, in camera order, to those of its parameters.
 #include "gaussians.cuh"
 
 namespace gsplat::rasterization {
@@ -7,7 +7,7 @@ namespace {
 constexpr int kWarps = frame::kGaussianThreads / 32;
 constexpr int kMoments = 6;
 
-// What came back for one splat.
+// Gradient of one splat's projected values, from the backward pass of blending.
 struct SplatGradient {
   float moments[kMoments], color[3], means2d[2], depth, conic[3], opacity;
 };
@@ -45,7 +45,8 @@ __device__ inline BackProjected project_back(const Scene& scene, const Projectio
   const float opacity = in.opacities[n];
   v_opacity += v.moments[0] / opacity;
   if (scene.antialiased || conics) {
-    // The opacity blended is the product with the compensation, and the first moment its dL/d log.
+    // The blended opacity is the product of opacity and compensation, and the first moment is the gradient of its
+    // logarithm.
     float more[3], v_compensation = 0;
     if (scene.antialiased) {
       const float a = e.a0 + in.eps2d, c = e.c0 + in.eps2d, det = a * c - e.b * e.b;
@@ -68,8 +69,8 @@ __device__ inline BackProjected project_back(const Scene& scene, const Projectio
   });
 }
 
-// The colour's way back to the coefficients, whose gradient is added to v_c, and to the direction: v_mean gets what it means for
-// the Gaussian's place, and the negative is the camera centre's. A channel that was raised to zero has no gradient.
+// Backpropagate the colour: add the coefficients' gradient to v_c, and set v_mean to the gradient through the view
+// direction. The camera centre's gradient is -v_mean. A channel clamped at zero has no gradient.
 template <int degree>
 __device__ inline void harmonics_back(const float (&center)[3], const float* mean, const float* c, const float* v_color,
                                       float* v_c, float (&v_mean)[3]) {
@@ -86,7 +87,8 @@ __device__ inline void harmonics_back(const float (&center)[3], const float* mea
 #pragma unroll
   for (int k = 0; k < kBases; ++k)
     for (int j = 0; j < 3; ++j) v_c[3 * k + j] = fmaf(b[k], v[j], v_c[3 * k + j]);
-  if constexpr (degree > 0) direction_gradient<degree>(direction, inverse, c, v, v_mean);  // a constant has no direction
+  if constexpr (degree > 0)
+    direction_gradient<degree>(direction, inverse, c, v, v_mean);  // degree 0 does not depend on the direction
 }
 
 template <int degree>
@@ -101,7 +103,7 @@ __device__ inline void store_row(float* to, int64_t row, const float* v) {
   for (int k = 0; k < columns; ++k) to[columns * row + k] = v[k];
 }
 
-// The coefficients of a warp while the gradients need them, then their gradients.
+// A warp's coefficients, later overwritten by their gradients.
 template <int degree>
 struct WarpColors {
   StagedHarmonics<degree> coefficients;
@@ -111,7 +113,7 @@ struct WarpColors {
     coefficients.load(rows, scene.color_row, wanted, reinterpret_cast<uintptr_t>(rows) % 16 == 0);
     coefficients.wait();
   }
-  // By the whole warp: the gradients of `count` Gaussians from `first` on.
+  // Store the gradients of `count` Gaussians from `first` on. The whole warp must call it.
   __device__ void store(const Scene& scene, const ColorSums<degree>& sums, float* to, int64_t first, int count, int lane) {
     __syncwarp();
     float* const row = coefficients.row(lane);
@@ -131,8 +133,9 @@ struct WarpColors<kPlainColors> {
   }
 };
 
-// A block is of one batch: a thread has one Gaussian and goes through the cameras in their order. Of one camera (kOne) the
-// colours' gradient is written before the geometry's is computed, which needs fewer registers.
+// All threads of a block process the same batch: each thread has one Gaussian and iterates over the cameras in order.
+// With one camera (kOne) the colours' gradient is written before the geometry's is computed, which needs fewer
+// registers.
 template <int degree, bool kViews, bool kOne>
 __global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
                                                            : degree < 4 ? 4
@@ -164,7 +167,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
     float v_center[3] = {};
     BackProjected g = {};
     if (degree > 0) {
-      __syncthreads();  // the centre before has been read
+      __syncthreads();  // all threads have read the previous centre
       load_center(scene, image, center);
     }
     if (colors) {

@@ -1,4 +1,4 @@
-// Projection, colours and tile counts of all splats, and the packed form of what projection returns.
+// Projection, colours and tile counts of all splats, and the packed form of projection's outputs.
 #include "../frame/instances.cuh"
 #include "dependent_launch.cuh"
 #include "gaussians.cuh"
@@ -9,7 +9,7 @@ namespace {
 using namespace blending;
 using namespace frame;
 
-// A warp's coefficients; nothing for plain colours.
+// A warp's coefficients; empty for plain colours.
 template <int degree>
 struct WarpColors {
   StagedHarmonics<degree> coefficients;
@@ -30,7 +30,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
   if (threadIdx.x < 25) camera[threadIdx.x] = threadIdx.x < 16 ? in.viewmat[threadIdx.x] : in.intrinsics[threadIdx.x - 16];
   in.viewmat = camera;
   in.intrinsics = camera + 16;
-  load_center(scene, image, center);  // with a barrier
+  load_center(scene, image, center);  // contains a barrier
 
   float mean[3] = {}, opacity = 0;
   Projected p;
@@ -57,7 +57,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
       warps[warp].coefficients.wait();
       if (p.valid) warps[warp].coefficients.add_color(bases, color);
     }
-    if (!(0 * color[0] + 0 * color[1] + 0 * color[2] == 0)) p.valid = 0;  // 0 times a number is 0, unless it is not finite
+    if (!(0 * color[0] + 0 * color[1] + 0 * color[2] == 0)) p.valid = 0;  // 0 x is 0 for finite x, otherwise NaN
     if constexpr (degree != kPlainColors)
       for (int j = 0; j < 3; ++j) color[j] = fmaxf(color[j] + 0.5f, 0.0f);
   }
@@ -78,7 +78,7 @@ __global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
   };
   for_each_small_tile(footprint, scene.tile_width, count);
   uint32_t tiles = uint32_t(footprint.small_count());
-  __syncwarp();  // the records of large footprints are written
+  __syncwarp();  // records of large footprints are visible to the warp
   for_each_large(footprint, [&](int owner) {
     const Record<4>* const records = reinterpret_cast<const Record<4>*>(out.records) + image * scene.gaussians;
     const int of_large = for_each_large_tile(footprint, records, n, owner, scene.tile_width, count);

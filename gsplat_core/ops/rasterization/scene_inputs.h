@@ -1,4 +1,4 @@
-// Checks of the ops' inputs, and the description of the scene that the kernels get.
+// Checks the ops' inputs, and fills the kernels' scene description.
 #pragma once
 
 #include "call.h"
@@ -9,14 +9,14 @@ namespace gsplat::rasterization {
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
 enum DepthMode : int64_t { kNoDepth = 0, kDepthSum = 1, kExpectedDepth = 2 };
 
-// Places in the lists that the ops take. `Inputs` and `View` in rasterization.py have them in the same order.
+// Indices into the tensor lists that the ops receive. `Inputs` and `View` in rasterization.py have the same order.
 enum Input { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kIntrinsics, kCenters, kBackgrounds, kInputs };
 enum Option { kWidth, kHeight, kCameraModel, kDegree, kChannels, kDepthMode, kAntialiased, kPacked, kAbsolute, kOptions };
 enum Range { kEps2d, kNearPlane, kFarPlane, kRadiusClip, kRanges };
 
 using OptionalTensors = std::vector<OptionalTensor>;
 
-// What is to be rendered, but for the tensors. `image_dims` are the batch dimensions and the number of cameras.
+// Non-tensor arguments of a render call. `image_dims` are the batch dimensions and the number of cameras.
 struct Request {
   const Sizes image_dims;
   const std::vector<int64_t> options;
@@ -45,7 +45,7 @@ struct Request {
   int64_t tile_height() const { return (options[kHeight] + frame::kTile - 1) / frame::kTile; }
   int64_t pixels() const { return images * options[kWidth] * options[kHeight]; }
 
-  // All of the scene but the pointers.
+  // Return the scene without its pointers.
   Scene scene(int64_t gaussians) const {
     check(gaussians * images < kMostInts, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ", gaussians * images);
     Scene s = {};

@@ -1,6 +1,6 @@
-// From the picture's gradient to that of the splats: per tile, from the back to the front, a row of sums for every instance; per
-// splat the sum of its rows. Every row is a sum over the tile's pixels in a fixed order, and rows are added in the order of the
-// instances: the bits are the same every time.
+// Gradient of the splats from the image's gradient: per tile, back to front, one row of sums per instance; then per
+// splat the sum of its rows. Rows are sums over the tile's pixels in a fixed order and are added in instance order, so
+// results are bitwise reproducible.
 #include "../blending/blend_backward.cuh"
 #include "rasterization.h"
 
@@ -14,8 +14,8 @@ constexpr int kRowFloat4s = kSplatFloats / 4;
 static_assert(quads_of(shape_size(kChannels, false), kChannels) == kRowFloat4s);
 static_assert(quads_of(shape_size(kChannels, true), kChannels) == kRowFloat4s);
 
-// The state of a pixel before the backward pass, and dL/d(its channels). The background counts as one more splat after the last,
-// and so does the gradient of alpha.
+// State of a pixel before the backward pass, and dL/d(its channels). The background and the gradient of alpha are
+// treated as one more splat behind the last.
 __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& from, int64_t image, int64_t pixel,
                                     float (&v_color)[kChannels]) {
   const float alpha = from.alphas[pixel], left = 1 - alpha;
@@ -39,7 +39,8 @@ __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& f
   return {left, left * v_left, from.last[pixel]};
 }
 
-// Where a row goes. With absolute sums these come in the middle of what is written, and are put at the row's end.
+// Destination of a row. With absolute sums these are in the middle of the written values, and are moved to the row's
+// end.
 template <bool kAbsolute>
 struct RowWriter {
   float4* row;
@@ -88,19 +89,19 @@ __device__ inline float4 from_lane_xor(const float4& v, int mask) {
                      __shfl_xor_sync(kAll, v.w, mask));
 }
 
-// a b - c d without the loss of digits where they are nearly the same (Kahan; Jeannerod et al. 2013).
+// a b - c d without cancellation if the products are nearly equal (Kahan; Jeannerod et al. 2013).
 __device__ inline float difference_of_products(float a, float b, float c, float d) {
   const float cd = __fmul_rn(c, d);
   return fmaf(a, b, -cd) + fmaf(-c, d, cd);
 }
 
-// Four lanes per splat, each with a float4 of the row. A splat with very many rows is left to the whole warp, in an order that
-// depends on their number alone.
+// Four lanes per splat, each with a float4 of the row. The whole warp sums a splat with very many rows; the order of
+// additions depends only on their number.
 __global__ void __launch_bounds__(kThreads)
     sums_of_splats(int64_t splats, const int32_t* starts, const float4* rows, SplatSums out) {
   constexpr int kMany = 64;
   const int64_t splat = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / 4;
-  const int lane = threadIdx.x & 31, q = min(lane % 4, kRowFloat4s - 1);  // the fourth lane repeats the third
+  const int lane = threadIdx.x & 31, q = min(lane % 4, kRowFloat4s - 1);  // the fourth lane duplicates the third
   const int start = splat < splats ? starts[splat] : 0, count = splat < splats ? starts[splat + 1] - start : 0;
   float4 sum = make_float4(0, 0, 0, 0);
   if (count <= kMany) {

@@ -1,4 +1,5 @@
-// A few numbers from the host to device memory, in the arguments of a launch: no copy that could wait, or be read too late.
+// Writes a few numbers from the host to device memory as kernel arguments. A copy could block, or read the host memory
+// after it has changed.
 #pragma once
 
 #include "cuda_stream.h"

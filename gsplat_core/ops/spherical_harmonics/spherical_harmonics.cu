@@ -5,7 +5,7 @@
 namespace gsplat::spherical_harmonics {
 namespace {
 
-constexpr int kSets = 32;  // of a warp, one per lane
+constexpr int kSets = 32;  // per warp, one per lane
 constexpr int kWarps = 4;
 constexpr int kBlockSets = kWarps * kSets;
 
@@ -19,7 +19,7 @@ __device__ UnitDirection unit_direction(const float* dirs, int64_t i) {
   return {{x * inverse, y * inverse, z * inverse}, inverse};
 }
 
-// A block has 128 sets and one row of directions.
+// All threads of a block of 128 sets process the same row of directions.
 template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4) forward(SphericalHarmonicsInput in, int64_t sets, float* __restrict__ colors) {
   constexpr int used = kBasesOf<degree>;
@@ -45,8 +45,8 @@ __global__ void __launch_bounds__(kBlockSets, 4) forward(SphericalHarmonicsInput
   for (int j = 0; j < 3; ++j) colors[3 * i + j] = color[j];
 }
 
-// A thread has one set of coefficients and goes through its rows in order: the sum comes out the same every time. A direction
-// whose colour has a gradient of zero adds nothing, not even the NaN that 0 times an infinite coefficient would be.
+// A thread has one set of coefficients and iterates over its rows in order, so the sum is reproducible. A direction
+// whose colour gradient is zero is skipped, so that 0 times an infinite coefficient does not produce NaN.
 template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4)
     backward(SphericalHarmonicsInput in, int64_t rows, int64_t sets, const float* __restrict__ v_colors,
@@ -65,7 +65,7 @@ __global__ void __launch_bounds__(kBlockSets, 4)
     if (set < sets && (in.mask == nullptr || in.mask[i]))
       for (int j = 0; j < 3; ++j) v[j] = v_colors[3 * i + j];
     const bool shown = !(v[0] == 0 && v[1] == 0 && v[2] == 0);
-    if (degree > 0 && v_dirs != nullptr) {  // a constant has no direction, not even a zero one
+    if (degree > 0 && v_dirs != nullptr) {  // degree 0 does not depend on the direction, which may be zero
       const unsigned wanted = __ballot_sync(~0u, shown) & ~fetched;
       if (wanted != 0) {
         const float* const rows = in.coeffs + first * in.bases * 3;

@@ -1,11 +1,11 @@
-// The basis functions and their gradients, one direction per lane; the processor's kernels and CUDA's share them.
+// Basis functions and their gradients, one direction per lane; shared by the CPU and CUDA kernels.
 #pragma once
 
 #include "simd.h"
 
 namespace GSPLAT_ISA::spherical_harmonics {
 
-// The basis functions at unit directions, one Gaussian per lane, in the field's order and signs.
+// Compute the basis functions at unit directions, in the order and with the signs used by 3DGS.
 template <int degree>
 GSPLAT_INLINE void bases_at(vfloat x, vfloat y, vfloat z, vfloat* b) {
   b[0] = splat(0.28209479177387814f);

@@ -40,7 +40,8 @@ static void forward_degree(const SphericalHarmonicsInput& in, float* colors, int
         color[0] = color[1] = color[2] = 0;
         continue;
       }
-      // Red, green, blue and one float too many at once; the last coefficient is taken from one float earlier.
+      // Load red, green, blue and one unused float at once. The last coefficient is loaded one float earlier, to stay
+      // in bounds.
       const float* c = in.coeffs + (first + lane) * in.bases * 3;
       vfloat4 even = {}, odd = {};
       for (int k = 0; k + 1 < used; ++k) (k & 1 ? odd : even) += b[k][lane] * load4(c + 3 * k);
@@ -74,7 +75,7 @@ static void backward_degree(const SphericalHarmonicsInput& in, const float* v_co
         for (int k = 0; k < used; ++k)
           for (int i = 0; i < 3; ++i) out[3 * k + i] += b[k][lane] * v[i];
       } else {
-        // Four floats at a time; the fourth is overwritten by the next, and the last row is written by itself.
+        // Store four floats at a time; the next store overwrites the fourth. The last row is stored separately.
         const vfloat4 v4 = {v[0], v[1], v[2], 0};
         for (int k = 0; k + 1 < used; ++k) {
           const vfloat4 g = b[k][lane] * v4;
@@ -93,12 +94,12 @@ static void backward_degree(const SphericalHarmonicsInput& in, const float* v_co
     const vfloat along = g[0] * unit[0] + g[1] * unit[1] + g[2] * unit[2];
     for (int i = 0; i < 3; ++i) g[i] = (g[i] - along * unit[i]) * inverse_norm;
     if (in.mask != nullptr) {
-      // Behind a mask the direction may be anything, a NaN too.
+      // A masked direction may hold any value, including NaN.
       vfloat seen;
       for (int lane = 0; lane < kLanes; ++lane) seen[lane] = lane < count && in.mask[first + lane];
       for (int i = 0; i < 3; ++i) g[i] = select(seen > 0, g[i], vfloat{});
     }
-    if constexpr (degree == 0) g[0] = g[1] = g[2] = vfloat{};  // a constant has no direction, not even a zero one
+    if constexpr (degree == 0) g[0] = g[1] = g[2] = vfloat{};  // degree 0 does not depend on the direction, which may be zero
     store_rows<3>(v_dirs, first, count, g);
   }
 }

@@ -7,7 +7,7 @@
 namespace gsplat::spherical_harmonics {
 namespace {
 
-// R rows of directions over M sets of coefficients, checked; the tensors keep the memory alive that `input` points to.
+// R rows of directions over M sets of coefficients, checked. The tensors own the memory that `input` points to.
 struct Scene {
   Tensor dirs, coeffs;
   OptionalTensor mask;
@@ -40,7 +40,7 @@ void backward(const Call& call, const Scene& scene, const float* v_colors, float
 
 #else
 
-constexpr int64_t kBlock = 1024;  // directions of one task
+constexpr int64_t kBlock = 1024;  // directions per task
 
 SphericalHarmonicsInput row_of(const Scene& scene, int64_t row) {
   SphericalHarmonicsInput in = scene.input;
@@ -55,7 +55,8 @@ void forward(const Call&, const Scene& scene, float* colors) {
   });
 }
 
-// Each block of sets goes through its rows in order: the sum over rows does not depend on the number of threads.
+// Each task processes all rows of a block of sets in order, so the sum over rows does not depend on the number of
+// threads.
 void backward(const Call&, const Scene& scene, const float* v_colors, float* v_dirs, float* v_coeffs) {
   for_blocks(1, scene.sets, kBlock, [&](int64_t, int64_t begin, int64_t end) {
     for (int64_t row = 0; row < scene.rows; ++row) {
@@ -84,7 +85,7 @@ std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, Tensor d
   const Tensor v_colors = call.floats(v_colors_, "v_colors");
   check(v_colors.numel() == scene.rows * scene.sets * 3, "v_colors must be [R, M, 3], got ", v_colors.numel(), " values");
   Tensor v_dirs = needs_dirs ? call.empty({scene.rows, scene.sets, 3}) : call.empty({0});
-  // Without rows no kernel of the CPU writes anything.
+  // Without rows no CPU kernel writes the gradient.
   Tensor v_coeffs = scene.rows == 0 ? call.zeros({scene.sets, scene.bases, 3}) : call.empty({scene.sets, scene.bases, 3});
   backward(call, scene, data(v_colors), needs_dirs ? mutable_data(v_dirs) : nullptr, mutable_data(v_coeffs));
   call.finish("spherical_harmonics_backward");

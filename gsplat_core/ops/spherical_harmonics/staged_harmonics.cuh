@@ -1,4 +1,5 @@
-// Spherical-harmonics coefficients in shared memory, and the gradient of a view direction, for all CUDA kernels that shade.
+// Spherical-harmonics coefficients in shared memory, and the gradient of a view direction; used by all CUDA kernels
+// that evaluate colours.
 #pragma once
 
 #include <cuda_fp16.h>
@@ -29,10 +30,10 @@ __device__ inline void copy_async(void* to, const void* from) {
   }
 }
 
-// Coefficients of a warp's 32 Gaussians, one row per lane: the 3 (degree + 1)^2 that the degree uses. A lane alone would touch as
-// many sectors of global memory as it reads numbers, so the warp copies its rows together. Rows are an odd number of 16-byte
-// words apart, so that eight lanes that read the same word of their rows have no bank conflict. Rows in global memory may be
-// longer than the degree needs.
+// Coefficients of a warp's 32 Gaussians, one row per lane: the 3 (degree + 1)^2 that the degree uses. A lane loading
+// its own row would touch one sector of global memory per value, so the warp copies its rows together. The row stride
+// is an odd number of 16-byte words, so that eight lanes reading the same word of their rows have no bank conflict.
+// Rows in global memory may be longer than the degree needs.
 template <int degree, class Coefficient = float>
 struct StagedHarmonics {
   static constexpr int kUsed = 3 * kBasesOf<degree>, kInQuad = 16 / sizeof(Coefficient);
@@ -41,7 +42,7 @@ struct StagedHarmonics {
 
   __device__ Coefficient* row(int lane) { return reinterpret_cast<Coefficient*>(rows) + lane * kStride; }
 
-  // Called by a warp; starts copies of the rows with a bit in `wanted`, which `wait` completes.
+  // Start copying the rows with a bit in `wanted`; `wait` completes the copies. The whole warp must call it.
   // `row_length`: coefficients per row in global memory. `aligned`: `from` is aligned to 16 bytes.
   __device__ void load(const Coefficient* from, int row_length, unsigned wanted, bool aligned) {
     const int lane = threadIdx.x & 31;
@@ -70,7 +71,7 @@ struct StagedHarmonics {
     __syncwarp();
   }
 
-  // The calling lane's coefficients as float32.
+  // Read the calling lane's coefficients as float32.
   __device__ void read(float (&values)[kInQuad * kQuads]) const {
     const uint4* const row = rows + (threadIdx.x & 31) * (kStride / kInQuad);
 #pragma unroll
@@ -83,7 +84,7 @@ struct StagedHarmonics {
     }
   }
 
-  // Adds the colour of the calling lane's Gaussian, for the bases of its view direction.
+  // Add the colour of the calling lane's Gaussian, given the basis functions of its view direction.
   __device__ void add_color(const float (&bases)[kBasesOf<degree>], float (&color)[3]) const {
     float values[kInQuad * kQuads];
     read(values);
@@ -92,7 +93,8 @@ struct StagedHarmonics {
       for (int j = 0; j < 3; ++j) color[j] = fmaf(bases[k], values[3 * k + j], color[j]);
   }
 
-  // Called by a warp after a __syncwarp: writes the first `count` rows, with zeros for coefficients that the degree does not use.
+  // Write the first `count` rows, with zeros for coefficients that the degree does not use. The whole warp must call it
+  // after a __syncwarp.
   __device__ void store(Coefficient* to, int row_length, int count) const {
     static_assert(sizeof(Coefficient) == 4);
     const int lane = threadIdx.x & 31;
@@ -119,7 +121,7 @@ struct StagedHarmonics {
   }
 };
 
-// Unit vector from the camera's centre to the Gaussian. Returns the inverse of their distance.
+// Compute the unit vector from the camera centre to the Gaussian. Returns the inverse of their distance.
 __device__ inline float unit_direction(const float (&center)[3], const float* mean, float (&direction)[3]) {
   float squared = 0;
   for (int k = 0; k < 3; ++k) {
@@ -131,8 +133,8 @@ __device__ inline float unit_direction(const float (&center)[3], const float* me
   return inverse;
 }
 
-// Gradient of a vector whose unit vector is `direction` and whose inverse length is `inverse`, from the gradient v of a colour
-// with the coefficients c.
+// Gradient of a vector whose unit vector is `direction` and whose inverse length is `inverse`, from the gradient v of a
+// colour with the coefficients c.
 template <int degree>
 __device__ inline void direction_gradient(const float (&direction)[3], float inverse, const float* c, const float (&v)[3],
                                           float (&gradient)[3]) {

@@ -1,6 +1,6 @@
-// Two passes over tiles of one channel. The first filters the four moments, vertically and then horizontally, and turns them into
-// the similarity and its derivatives by mean, squares and product; the second filters those, which gives the gradient: the filter
-// is symmetric.
+// Two passes over tiles of one channel. The first filters the four moments vertically, then horizontally, and computes
+// from them the similarity and its derivatives with respect to mean, squares and product. The second filters these
+// derivatives with the same symmetric filter, which gives the gradient.
 #include "cuda_scratch.h"
 #include "ssim.h"
 
@@ -8,16 +8,16 @@ namespace gsplat::ssim {
 namespace {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
-constexpr int kTile = 32;                   // pixels on a side
-constexpr int kHalo = kTile + 2 * kRadius;  // with what the filter reaches
+constexpr int kTile = 32;                   // pixels per side
+constexpr int kHalo = kTile + 2 * kRadius;  // including the filter's radius on both sides
 constexpr int kRows = kThreads / kTile;     // rows of a tile that are written at once
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
-// A Gaussian of 1.5 pixels; the sum is 1. From the centre outwards.
+// Half of a Gaussian with a sigma of 1.5 pixels, from the centre outwards; the full filter sums to 1.
 __device__ constexpr float kTap[kRadius + 1] = {0.266011724862f,  0.213005537711f,   0.10936068951f,
                                                 0.0360007721284f, 0.00759875813524f, 0.00102838008448f};
 
-// A column or row of a tile in shared memory filtered around its element `at`.
+// Return a column or row of a tile in shared memory, filtered around its element `at`.
 template <int kStep>
 __device__ inline float filter(const float* at) {
   float sum = kTap[0] * at[0];
@@ -26,7 +26,7 @@ __device__ inline float filter(const float* at) {
   return sum;
 }
 
-// The tile of this block: which channel and where.
+// Channel and position of this block's tile.
 struct Place {
   int left, top, channel;
   __device__ Place() : left(blockIdx.x * kTile), top(blockIdx.y * kTile), channel(blockIdx.z) {}
@@ -36,8 +36,8 @@ struct Pair {
   float x, y;
 };
 
-// Both images at a pixel, 0 outside of the picture and where there is no tissue: selected, not multiplied, for a NaN under the
-// tool must not spread.
+// Load both images at a pixel; 0 outside of the image and where there is no tissue. The mask selects instead of
+// multiplying, so that NaN outside of tissue does not spread.
 __device__ inline Pair masked_pair(const DeviceSsim& in, int row, int column, int channel) {
   if (row < 0 || row >= in.height || column < 0 || column >= in.width) return {0, 0};
   const int64_t pixel = int64_t(row) * in.width + column;
@@ -49,7 +49,7 @@ __device__ inline Pair masked_pair(const DeviceSsim& in, int row, int column, in
 
 __device__ inline bool is_tissue(const DeviceSsim& in, int64_t pixel) { return in.mask == nullptr || in.mask[pixel] != 0; }
 
-// dL/d(similarity) of a pixel's channel.
+// Return dL/d(similarity) of a pixel's channel.
 __device__ inline float weight_of(const DeviceSsim& in, int64_t pixel, int channel) {
   float weight = in.scale;
   if (in.tissue != nullptr) weight = *in.tissue > 0 ? float(double(in.scale) / (double(*in.tissue) * in.channels)) : 0;
@@ -57,7 +57,7 @@ __device__ inline float weight_of(const DeviceSsim& in, int64_t pixel, int chann
   return is_tissue(in, pixel) ? weight : 0;
 }
 
-// The sum over the block in a fixed order.
+// Return the sum over the block, in a fixed order.
 __device__ inline double block_total(double value) {
   __shared__ double parts[kThreads];
   parts[threadIdx.x] = value;
@@ -119,7 +119,7 @@ __global__ void __launch_bounds__(kThreads) similarity(DeviceSsim in, float* der
   if (threadIdx.x == 0) in.sums[(int64_t(blockIdx.z) * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = dissimilar;
 }
 
-// dL/dx = G * dL/dmean + 2 x (G * dL/dsquares) + y (G * dL/dproduct), with G the filter.
+// dL/dx = G * dL/dmean + 2 x (G * dL/dsquares) + y (G * dL/dproduct), where G is the filter.
 __global__ void __launch_bounds__(kThreads) gradient(DeviceSsim in, const float* derivatives) {
   __shared__ float derivative[3][kHalo][kHalo + 1], filtered[3][kTile][kHalo + 1];
   const Place p;

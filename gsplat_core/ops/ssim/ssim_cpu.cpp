@@ -1,6 +1,6 @@
-// One pass over the rows: a ring of 11 input rows gives the four moments of a row (vertical, then horizontal filter), these give
-// the similarity and its derivatives by the moments, and a second ring of 11 filtered derivative rows gives the gradient 5 rows
-// behind. Channels stay interleaved: a horizontal neighbour is `channels` floats away.
+// One pass over the rows. A ring of 11 input rows gives the four moments of a row (vertical, then horizontal filter).
+// The moments give the similarity and its derivatives with respect to them. A second ring of 11 filtered derivative
+// rows gives the gradient, 5 rows behind. Channels stay interleaved: a horizontal neighbour is `channels` floats away.
 #include "simd.h"
 #include "ssim.h"
 
@@ -18,14 +18,14 @@ GSPLAT_INLINE int slot_of(int64_t row) { return int((row + 10 * T) % T); }  // r
 
 struct Strip {
   const SsimTask& task;
-  int64_t first_px;  // first pixel that the strip owns
-  int64_t pixels;    // pixels that it owns
+  int64_t first_px;  // first pixel of the strip without its halo
+  int64_t pixels;    // pixels of the strip without its halo
   // Column 0 of every buffered row is pixel first_px - 2R.
   float* image;       // ring [T][S]
   float* target;      // ring
   float* tissue;      // ring, 0 or 1
-  float* blurred;     // three rings: derivatives by mean, square and product, filtered horizontally
-  float* moments;     // 4 rows, filtered vertically: mean of x, of y, of x^2 + y^2, of xy
+  float* blurred;     // three rings: derivatives with respect to mean, squares and product, filtered horizontally
+  float* moments;     // 4 rows, filtered vertically: means of x, y, x^2 + y^2, xy
   float* derivative;  // 3 rows
   float* similarity;  // 1 row
   float* upstream;    // 1 row
@@ -38,7 +38,7 @@ static void fill(float* to, int64_t n, float value) {
   for (int64_t i = 0; i < n; ++i) to[i] = value;
 }
 
-// Repeats a pixel's mask byte for each of its channels, as 0 or 1.
+// Expand a pixel's mask byte to each of its channels, as 0 or 1.
 static void expand_mask(float* to, const uint8_t* mask, int64_t pixels, int channels) {
   if (channels == 3) {
     for (int64_t p = 0; p < pixels; ++p) {
@@ -52,7 +52,7 @@ static void expand_mask(float* to, const uint8_t* mask, int64_t pixels, int chan
   for (int64_t p = 0; p < pixels; ++p) fill(to + p * channels, channels, mask[p] ? 1.0f : 0.0f);
 }
 
-// Puts one row of both images into the rings, zero outside of the image and where there is no tissue.
+// Load one row of both images into the rings; 0 outside of the image and where there is no tissue.
 static void load_row(const Strip& s, int64_t row) {
   const SsimTask& task = s.task;
   const int64_t at = slot_of(row) * S;
@@ -78,7 +78,7 @@ static void load_row(const Strip& s, int64_t row) {
     expand_mask(m, task.mask + row * task.width + from, to - from, c);
   else
     fill(m, n, 1);
-  // Selected, not multiplied: a NaN under the tool must not spread.
+  // The mask selects instead of multiplying, so that NaN outside of tissue does not spread.
   const float* image = task.image + source;
   for (int64_t i = 0; i < n; ++i) x[i] = m[i] > 0 ? image[i] : 0;
   if (task.target_bytes) {
@@ -90,7 +90,7 @@ static void load_row(const Strip& s, int64_t row) {
   }
 }
 
-// Taps in the order of the ring's slots for the window around `row`, so that a ring is read front to back.
+// Reorder the taps by ring slot for the window around `row`, so that a ring is read sequentially.
 static void rotate_taps(float* rotated, const float* taps, int64_t row) {
   for (int k = 0; k < T; ++k) rotated[slot_of(row + k - R)] = taps[k];
 }
@@ -126,8 +126,8 @@ GSPLAT_INLINE vfloat filter_row(const float* at, const vfloat* w, int channels) 
   return sum;
 }
 
-// Similarity S = A1 A2 / (B1 B2) of one row and, times the weight of its pixel, its derivatives by mean of x, squares and
-// product.
+// Compute the similarity S = A1 A2 / (B1 B2) of one row, and its derivatives with respect to mean of x, squares and
+// product, times the pixel's weight.
 static void similarity_row(const Strip& s, int64_t row, int halo_px) {
   const SsimTask& task = s.task;
   const int c = task.channels;
@@ -167,7 +167,7 @@ static void blur_derivatives(const Strip& s, int64_t row) {
   }
 }
 
-// dL/dx = G * dL/dmean + 2 x (G * dL/dsquares) + y (G * dL/dproduct), with G the filter, which is symmetric.
+// dL/dx = G * dL/dmean + 2 x (G * dL/dsquares) + y (G * dL/dproduct), where G is the symmetric filter.
 static void add_gradient_row(const Strip& s, int64_t row) {
   float taps[T];
   rotate_taps(taps, s.task.taps, row);
@@ -206,7 +206,7 @@ static void load_upstream(const Strip& s, int64_t row) {
   for (int64_t i = 0; i < (to - from) * c; ++i) out[i] = source[i];
 }
 
-// The outputs of a row that the band owns: its sum and its map.
+// Write the sum and the map of a row that belongs to the band.
 static void emit_row(const Strip& s, int64_t strip, int64_t row) {
   const SsimTask& task = s.task;
   const int first = s.begin(0), last = s.end(0);

@@ -20,7 +20,7 @@ static void fill_taps(float* taps) {
 
 void run_ssim(SsimTask& task) {
   fill_taps(task.taps);
-  // A band recomputes two radii of rows, so it should be several times as high.
+  // A band recomputes two radii of rows, so its height should be several times larger.
   constexpr int64_t kBandRows = 48;
   torch::stable::parallel_for(0, task.height, kBandRows, [&](int64_t begin, int64_t end) {
     thread_local std::vector<float> scratch(kSsimScratchFloats);
@@ -33,7 +33,7 @@ void run_ssim(SsimTask& task) {
 
 namespace {
 
-// Two images of one size, checked.
+// Two checked images of the same size.
 struct Images {
   Tensor image, target;
   int64_t height, width, channels;
@@ -49,7 +49,7 @@ struct Images {
   }
 };
 
-// Writes the map, or adds the gradient of `upstream` times the map; the other is null.
+// Write `map`, or add to `gradient` the gradient of `upstream` times the map; the other pointer is null.
 void run(Call& call, const Images& images, const float* upstream, float* map, float* gradient) {
 #if defined(GSPLAT_CUDA)
   check(images.height <= kSsimMostRows && images.width <= kSsimMostRows, "image must have at most ", kSsimMostRows,

@@ -1,4 +1,5 @@
-// What each disparity costs at each pixel: differences of single pixels summed along the row by warps, then down the columns.
+// Matching costs of every disparity at every pixel: warps sum pixel differences along the rows, then threads sum them
+// down the columns.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "volume.cuh"
@@ -6,9 +7,10 @@
 namespace gsplat::stereo_matching {
 namespace {
 
-constexpr int kSegmentColumns = 64, kSegmentRows = 32;  // of what a warp or thread sums: longer ones compute less twice
+// Pixels summed per warp or thread; longer segments recompute less overlap.
+constexpr int kSegmentColumns = 64, kSegmentRows = 32;
 
-// A pixel of one picture: slope and brightness, and their range half a pixel to both sides.
+// Slope and brightness of a pixel, and their range within half a pixel to both sides.
 struct __align__(8) Look {
   uint8_t slope, slope_low, slope_high, brightness, brightness_low, brightness_high, unused[2];
 };
@@ -34,7 +36,7 @@ __device__ inline Range range_of(int before, int here, int after) {
   return {uint8_t(min(here, min(one, other))), uint8_t(max(here, max(one, other)))};
 }
 
-// looks: [2, height, width], of the left picture and of the right one.
+// looks: [2, height, width], of the left and of the right image.
 __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
   const int64_t pixels = int64_t(pair.height) * pair.width, i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= 2 * pixels) return;
@@ -46,7 +48,7 @@ __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
   looks[i] = {uint8_t(slope), s.low, s.high, uint8_t(brightness), b.low, b.high, {}};
 }
 
-// How far a value is out of the other one's range, the lesser of both ways.
+// Distance of each value from the other value's range; returns the smaller of the two.
 __device__ inline int difference(int a, int a_low, int a_high, int b, int b_low, int b_high) {
   return max(0, min(max(a - b_high, b_low - a), max(b - a_high, a_low - b)));
 }
@@ -57,7 +59,7 @@ __device__ inline int pixel_cost(const Look& a, const Look& b) {
   return by_slope + min(by_brightness, kBrightnessMost);
 }
 
-// Sums over the window's columns [height, width, count]: a warp for each segment of a row.
+// Sum over the window's columns [height, width, count], with one warp per segment of a row.
 template <int kEach>
 __global__ void __launch_bounds__(kThreads) sum_along_rows(Pair pair, const Look* looks, uint16_t* sums) {
   const int lane = threadIdx.x % 32, segments = (pair.width + kSegmentColumns - 1) / kSegmentColumns;
@@ -84,8 +86,8 @@ __global__ void __launch_bounds__(kThreads) sum_along_rows(Pair pair, const Look
   }
 }
 
-// Sums over the whole window as costs: a thread for eight disparities of a segment of a column. Two sums of 16 bits share
-// a word; neither gets negative, nor too large for it.
+// Sum over the whole window and convert to costs, with one thread per eight disparities of a column segment. Two 16-bit
+// sums share a word; neither becomes negative or overflows.
 __global__ void __launch_bounds__(kThreads) sum_down_columns(Pair pair, const uint4* sums, uint2* costs) {
   const int64_t row = int64_t(pair.width) * pair.count / 8, at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (at >= row) return;

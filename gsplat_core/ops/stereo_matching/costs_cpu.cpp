@@ -1,12 +1,12 @@
-// What each disparity costs at each pixel: differences of single pixels, then their sums over a window, row by row.
+// Matching costs of every disparity at every pixel: pixel differences, then their sums over a window, row by row.
 #include "disparity_vectors.h"
 
 namespace GSPLAT_ISA::stereo_matching {
 namespace {
 
-constexpr int kKeptRows = kWindowSide + 1;  // those of the window, and the one that leaves it
+constexpr int kKeptRows = kWindowSide + 1;  // the window's rows, and the row that leaves it
 
-// A row of one picture: values, and their range half a pixel to both sides.
+// A row of one image: values, and their range within half a pixel to both sides.
 struct Range {
   uint8_t *value, *low, *high;
 };
@@ -26,7 +26,7 @@ GSPLAT_INLINE Row take_row(uint8_t*& scratch, int64_t size) {
   return {{each[0], each[1], each[2]}, {each[3], each[4], each[5]}};
 }
 
-// The ranges of a row of values.
+// Compute the ranges of a row of values.
 GSPLAT_INLINE void fill_range(const uint8_t* values, int64_t width, const Range& to) {
   const auto fill = [&](int64_t x, int64_t l, int64_t r) {
     const int here = values[x], before = (here + values[l]) >> 1, after = (here + values[r]) >> 1;
@@ -39,7 +39,7 @@ GSPLAT_INLINE void fill_range(const uint8_t* values, int64_t width, const Range&
   if (width > 1) fill(width - 1, width - 2, width - 1);
 }
 
-// A row of `picture`. slopes: [width].
+// Compute the features of a row of `picture`. slopes: [width].
 GSPLAT_INLINE void fill_row(const Pair& pair, const uint8_t* picture, int64_t y, const Row& to, uint8_t* slopes) {
   const int64_t width = pair.width;
   const uint8_t* const here = picture + y * width;
@@ -56,7 +56,8 @@ GSPLAT_INLINE void fill_row(const Pair& pair, const uint8_t* picture, int64_t y,
   fill_range(here, width, to.brightness);
 }
 
-// What matches column x with disparity number d gets to width - 1 - x + d: disparities lie one after the other.
+// Mirror the right row: the match of column x at disparity number d is stored at width - 1 - x + d, so that disparities
+// are contiguous.
 GSPLAT_INLINE void reverse(const Pair& pair, const Range& from, const Range& to) {
   const int64_t last = int64_t(pair.width) - 1 - pair.lowest;
   for (int64_t at = 0; at < pair.width - 1 + pair.count; ++at) {
@@ -65,7 +66,7 @@ GSPLAT_INLINE void reverse(const Pair& pair, const Range& from, const Range& to)
   }
 }
 
-// How far values are out of the others' range, the lesser of both ways.
+// Distance of each value from the other value's range; returns the smaller of the two.
 template <class Bytes>
 GSPLAT_INLINE Bytes difference(const Range& left, int64_t x, const Range& right, int64_t at) {
   const auto here = [&](const uint8_t* row) { return Bytes{} + row[x]; };
@@ -76,7 +77,7 @@ GSPLAT_INLINE Bytes difference(const Range& left, int64_t x, const Range& right,
   return less(from_left, more(beyond(b, here(left.high)), beyond(here(left.low), b)));
 }
 
-// Differences of a row's pixels [width, count].
+// Compute the differences of a row's pixels [width, count].
 template <int kWide>
 GSPLAT_INLINE void pixel_costs(const Row& left, const Row& right, int64_t width, int count, uint8_t* costs) {
   using Bytes = typename Vector<kWide>::Bytes;
@@ -90,7 +91,7 @@ GSPLAT_INLINE void pixel_costs(const Row& left, const Row& right, int64_t width,
   }
 }
 
-// Adds the pixels of one row to the sums of columns [width, count], and takes those of another away.
+// Add the pixels of one row to the column sums [width, count], and subtract those of another row.
 template <int kWide>
 GSPLAT_INLINE void move_down(const uint8_t* enters, const uint8_t* leaves, int64_t size, uint16_t* columns) {
   using Bytes = typename Vector<kWide>::Bytes;
@@ -102,7 +103,7 @@ GSPLAT_INLINE void move_down(const uint8_t* enters, const uint8_t* leaves, int64
   }
 }
 
-// Sums of columns [width, count] to costs: sums over the window.
+// Sum the column sums [width, count] over the window's width and convert them to costs.
 template <int kWide>
 GSPLAT_INLINE void window_costs(const uint16_t* columns, int64_t width, int count, uint8_t* costs) {
   using Bytes = typename Vector<kWide>::Bytes;

@@ -1,4 +1,4 @@
-// Vectors of bytes and of 16-bit words over the disparities of a pixel, of a width that divides their number; for the CPU's
+// Vectors of bytes and of 16-bit words over a pixel's disparities, with a width that divides their number. For CPU
 // kernels.
 #pragma once
 
@@ -28,7 +28,7 @@ GSPLAT_INLINE void store_as(void* to, Values values) {
   __builtin_memcpy(to, &values, sizeof(values));
 }
 
-// Of numbers, and lane by lane of vectors.
+// Minimum and maximum of numbers, or lane by lane of vectors.
 template <class Values>
 GSPLAT_INLINE Values less(Values a, Values b) {
   return a < b ? a : b;
@@ -39,7 +39,7 @@ GSPLAT_INLINE Values more(Values a, Values b) {
 }
 GSPLAT_INLINE int64_t within(int64_t i, int64_t size) { return less(more(i, int64_t(0)), size - 1); }
 
-// Calls work with the widest of 64, 32 and 16 lanes, as a constant, that divides `count` and is no wider than kMost.
+// Call work with the widest of 64, 32 and 16 lanes, as a constant, that divides `count` and does not exceed kMost.
 template <int kWide>
 struct Width {
   static constexpr int value = kWide;
@@ -54,7 +54,7 @@ GSPLAT_INLINE void with_width(int count, const Work& work) {
     work(Width<16>());
 }
 
-// The least of the lanes.
+// Return the minimum over the lanes.
 template <class Words>
 GSPLAT_INLINE uint16_t least_word(Words values) {
   uint16_t each[sizeof(Words) / 2];
@@ -85,7 +85,7 @@ GSPLAT_INLINE uint8_t least_byte(Bytes values) {
 #endif
 }
 
-// In costs_cpu.cpp and winners_cpu.cpp.
+// Defined in costs_cpu.cpp and winners_cpu.cpp.
 int64_t cost_scratch(const Pair& pair);
 void sum_costs(const Pair& pair, uint8_t* costs, int64_t begin, int64_t end, uint8_t* scratch);
 void winners(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, int64_t begin, int64_t end,

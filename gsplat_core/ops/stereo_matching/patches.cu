@@ -1,5 +1,5 @@
-// Small patches of disparities are dropped: each pixel is linked with those beside it that differ little, and each patch has the
-// number of its first pixel in the end, whatever the order in which threads link them.
+// Removes small patches of disparities. Each pixel is linked with its neighbours of similar disparity. The label of a
+// patch is the index of its first pixel, whatever the order in which threads link pixels.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "volume.cuh"
@@ -20,7 +20,8 @@ __global__ void __launch_bounds__(kThreads) begin_patches(int pixels, int32_t* p
 __device__ inline void link(const int32_t* sixteenths, int32_t* parents, int a, int b) {
   const int here = sixteenths[a], there = sixteenths[b];
   if (here == kUnknown || there == kUnknown || abs(here - there) > kPatchStep) return;
-  // The later root gets the earlier one as its parent, unless another thread was faster: then what that one wrote is linked.
+  // Make the earlier root the parent of the later one. If another thread has changed the later root's parent, link the
+  // value that it wrote.
   while (true) {
     a = root_of(parents, a), b = root_of(parents, b);
     if (a == b) return;
@@ -40,7 +41,7 @@ __global__ void __launch_bounds__(kThreads) link_pixels(int pixels, int width, c
 __global__ void __launch_bounds__(kThreads) count_pixels(int pixels, int32_t* parents, int32_t* sizes) {
   const int i = int(blockIdx.x) * kThreads + threadIdx.x;
   const int root = i < pixels ? root_of(parents, i) : -1;
-  // One addition for all lanes of a warp that are in one patch: most patches are large.
+  // One addition for all lanes of a warp in the same patch, because most patches are large.
   const unsigned together = __match_any_sync(kAllLanes, root);
   if (root >= 0 && __ffs(int(together)) - 1 == int(threadIdx.x % 32)) atomicAdd(sizes + root, __popc(together));
   if (root >= 0) parents[i] = root;

@@ -1,4 +1,5 @@
-// The paths along rows and columns: a warp for each, all of them at once. Each writes its messages into a volume of its own.
+// The paths along rows and columns, processed concurrently with one warp each. Each direction writes its messages to
+// its own volume.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "volume.cuh"
@@ -6,10 +7,11 @@
 namespace gsplat::stereo_matching {
 namespace {
 
-constexpr int kAhead = 8;         // pixels whose costs are read before they are needed
-constexpr int kPathThreads = 64;  // of a block: paths are few and long, so they are spread over all multiprocessors
+constexpr int kAhead = 8;  // pixels whose costs are prefetched
+constexpr int kPathThreads =
+    64;  // threads per block; paths are few and long, so small blocks spread them over all multiprocessors
 
-// Where a path begins, and how far its pixels are apart.
+// Start of a path, and the distance between its pixels.
 struct Path {
   int64_t begin, step;
   int length;
@@ -35,8 +37,8 @@ __global__ void __launch_bounds__(kPathThreads) follow(Pair pair, const uint8_t*
   const int64_t begin = path.begin * pair.count + lane * kEach, step = path.step * pair.count;
   const Bytes* __restrict__ const from = reinterpret_cast<const Bytes*>(costs + begin);
   Bytes* __restrict__ const to = reinterpret_cast<Bytes*>(messages + blockIdx.y * volume + begin);
-  const int64_t hop = step / kEach;  // a multiple: the number of disparities is one of 16
-  // By how much each disparity costs more than the best one, at most kLargeStep. At first each is as good.
+  const int64_t hop = step / kEach;  // exact, because the number of disparities is a multiple of 16
+  // Cost of each disparity above the best one, at most kLargeStep. Initially 0 for every disparity.
   int kept[kEach];
 #pragma unroll
   for (int k = 0; k < kEach; ++k) kept[k] = used ? 0 : kLargeStep;

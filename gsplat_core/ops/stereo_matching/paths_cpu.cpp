@@ -4,23 +4,23 @@
 namespace GSPLAT_ISA::stereo_matching {
 namespace {
 
-constexpr int kMargin = 16;  // bytes before and after what is kept of a pixel: a change to a disparity that is not there
+constexpr int kMargin = 16;  // padding in bytes before and after a pixel's entries, read for disparities out of range
 
-// What is kept of the pixels of a path: by how much each disparity costs more than the best one, at most kLargeStep.
+// State of a path per pixel: the cost of each disparity above the best one, at most kLargeStep.
 struct Kept {
   uint8_t* bytes;
   int count;
   GSPLAT_METHOD uint8_t* of(int64_t pixel) const { return bytes + pixel * stride(count) + kMargin; }
   static GSPLAT_METHOD int64_t stride(int count) { return count + 2 * kMargin; }
   static GSPLAT_METHOD int64_t size(int64_t pixels, int count) { return pixels * stride(count); }
-  // A path that begins here: every disparity is as good, and none is beyond the ends.
+  // Start a path: every disparity costs the same, and disparities out of range are excluded.
   GSPLAT_METHOD void begin(int64_t pixel) const {
     uint8_t* const all = of(pixel) - kMargin;
     for (int i = 0; i < stride(count); ++i) all[i] = i < kMargin || i >= kMargin + count ? kLargeStep : 0;
   }
 };
 
-// One pixel further. kFirst: the first path sets the messages, the others add theirs.
+// Advance by one pixel. kFirst: the first path sets the messages, later paths add to them.
 template <int kWide, bool kFirst>
 GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* costs, int count, uint8_t* after, uint8_t* messages) {
   using Bytes = typename Vector<kWide>::Bytes;
@@ -38,8 +38,8 @@ GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* costs, int count, 
     store_as(after + d, less(load_as<Bytes>(totals + d) - best, Bytes{} + uint8_t(kLargeStep)));
 }
 
-// To the right and to the left by turns: neither waits for the other one's sums. Whichever comes to a pixel first sets its
-// message.
+// Alternate between the rightward and the leftward path, so that their dependency chains overlap. The path that reaches
+// a pixel first sets its message.
 template <int kWide>
 GSPLAT_INLINE void along_row(const uint8_t* costs, uint8_t* messages, int64_t width, int count, const Kept& kept) {
   for (int64_t pixel = 0; pixel < 4; ++pixel) kept.begin(pixel);

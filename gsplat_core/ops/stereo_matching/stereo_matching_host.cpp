@@ -11,10 +11,10 @@ namespace {
 
 #if !defined(GSPLAT_CUDA)
 
-constexpr int64_t kBandRows = 64;      // a band computes differences of eight rows more
-constexpr int64_t kBlockColumns = 64;  // of what a thread does at once
+constexpr int64_t kBandRows = 64;      // each band additionally computes the differences of eight rows
+constexpr int64_t kBlockColumns = 64;  // columns per task
 
-// Calls work(begin, end, scratch) for blocks of `block` of the `items`, on torch's threads.
+// Call work(begin, end, scratch) for blocks of `block` of the `items`, on torch's threads.
 template <class Scratch, class Work>
 void for_ranges(int64_t items, int64_t block, int64_t scratch_size, const Work& work) {
   torch::stable::parallel_for(0, (items + block - 1) / block, 1, [&](int64_t from, int64_t to) {

@@ -1,4 +1,5 @@
-// How a warp holds the disparities of a pixel: each lane kEach of them, one after the other; lanes beyond their number have none.
+// Distribution of a pixel's disparities over a warp: each lane holds kEach consecutive ones. Lanes beyond their number
+// hold none.
 #pragma once
 
 #include "stereo_matching.h"
@@ -32,7 +33,7 @@ __device__ inline int byte_of(typename Packed<kEach>::type packed, int k) {
   return int(packed >> (8 * k)) & 255;
 }
 
-// Work with the least power of two, as a constant, that is enough for each lane of a warp.
+// Call work with the smallest sufficient number of disparities per lane, a power of two, as a constant.
 template <class Work>
 void with_each(int count, const Work& work) {
   if (count <= 32)
@@ -45,10 +46,10 @@ void with_each(int count, const Work& work) {
     work(std::integral_constant<int, 8>());
 }
 
-// In costs.cu, paths.cu, winners.cu: each queues its work on the stream. A volume is [height, width, count].
-// sums: scratch of two bytes for each cost.
+// Defined in costs.cu, paths.cu and winners.cu; each queues its kernels on the stream. A volume is [height, width,
+// count]. sums: scratch of two bytes per cost.
 void sum_costs(const Pair& pair, uint8_t* costs, uint16_t* sums, CudaScratch& scratch, cudaStream_t stream);
-void follow_paths(const Pair& pair, const uint8_t* costs, uint8_t* messages, cudaStream_t stream);  // kPaths volumes
+void follow_paths(const Pair& pair, const uint8_t* costs, uint8_t* messages, cudaStream_t stream);  // messages: kPaths volumes
 void choose(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, CudaScratch& scratch,
             cudaStream_t stream);
 void drop_patches(const Pair& pair, int32_t* sixteenths, CudaScratch& scratch, cudaStream_t stream);

@@ -1,4 +1,5 @@
-// From costs and messages to disparities: a warp for the best one of a pixel, then the check from the right eye.
+// From costs and messages to disparities: one warp finds the best disparity of a pixel, followed by the left-right
+// consistency check.
 #include "cuda_check.h"
 #include "cuda_scratch.h"
 #include "volume.cuh"
@@ -8,8 +9,9 @@ namespace {
 
 constexpr uint32_t kNone = ~0u;
 
-// The best disparity of each pixel in sixteenths, and, at the right eye's pixel that belongs to it, the least key of all that are
-// matched with that one. A key is a total and the number of a disparity: of equal totals the lowest disparity's is the least.
+// Find the best disparity of each pixel in 1/16 pixel. For the matching pixel of the right image, also store the
+// minimum key of all pixels matched with it. A key is a total cost combined with the disparity number, so that ties
+// resolve to the lowest disparity.
 template <int kEach>
 __global__ void __launch_bounds__(kThreads)
     find_best(Pair pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, uint32_t* right) {
@@ -36,7 +38,7 @@ __global__ void __launch_bounds__(kThreads)
   key = __reduce_min_sync(kAllLanes, key);
   const uint32_t least = key >> 8;
   const int best = int(key & 255);
-  uint32_t beside = 0;  // the totals below and above the best
+  uint32_t beside = 0;  // total costs below and above the best disparity
   bool rival = false;
 #pragma unroll
   for (int k = 0; k < kEach; ++k) {
@@ -49,7 +51,7 @@ __global__ void __launch_bounds__(kThreads)
   const bool known = !__any_sync(kAllLanes, rival);
   if (lane != 0) return;
   int within = 0;
-  if (best > 0 && best < pair.count - 1) {  // the lowest point of a parabola
+  if (best > 0 && best < pair.count - 1) {  // vertex of a parabola
     const int below = int(beside & 0xffff), above = int(beside >> 16), bend = max(below + above - 2 * int(least), 1);
     within = ((below - above) * kSixteenths + bend) / (2 * bend);
   }
@@ -58,7 +60,7 @@ __global__ void __launch_bounds__(kThreads)
   if (known && there >= 0 && there < pair.width) atomicMin(right + pixel - x + there, key);
 }
 
-// Whether the right eye's pixel that belongs to a disparity prefers another one.
+// Return true if the matching pixel of the right image prefers another disparity.
 __device__ inline bool differs(const Pair& pair, const uint32_t* row, int x, int disparity) {
   const int there = x - disparity;
   if (there < 0 || there >= pair.width || row[there] == kNone) return false;
@@ -108,7 +110,8 @@ void match_on_device(const Pair& pair, const Matched& matched, CudaScratch& scra
   const int64_t pixels = int64_t(pair.height) * pair.width;
   uint8_t* const costs = scratch.array<uint8_t>(pixels * pair.count);
   uint8_t* const messages = scratch.array<uint8_t>(kPaths * pixels * pair.count);
-  sum_costs(pair, costs, reinterpret_cast<uint16_t*>(messages), scratch, stream);  // there are no messages yet
+  // The sums use the messages' memory, which is free until the paths run.
+  sum_costs(pair, costs, reinterpret_cast<uint16_t*>(messages), scratch, stream);
   follow_paths(pair, costs, messages, stream);
   choose(pair, costs, messages, matched.sixteenths, scratch, stream);
   drop_patches(pair, matched.sixteenths, scratch, stream);

@@ -1,4 +1,4 @@
-// From costs and messages to disparities: the best ones, checked, without small patches.
+// From costs and messages to disparities: the best ones, checked for consistency, without small patches.
 #include "disparity_vectors.h"
 
 namespace GSPLAT_ISA::stereo_matching {
@@ -6,12 +6,12 @@ namespace {
 
 constexpr uint32_t kNone = ~0u;
 
-// The total of a disparity with its number: of equal totals the lowest disparity's is the least.
+// Total cost combined with the disparity number, so that ties resolve to the lowest disparity.
 GSPLAT_INLINE uint32_t key_of(int total, int disparity) { return uint32_t(total) << 8 | uint32_t(disparity); }
 
 struct Best {
   int disparity, total;
-  int32_t sixteenths;  // kUnknown where another one, that is not beside it, is nearly as good
+  int32_t sixteenths;  // kUnknown if a disparity other than a neighbour is nearly as good
 };
 
 template <int kWide>
@@ -33,11 +33,11 @@ GSPLAT_INLINE Best best_of(const uint8_t* costs, const uint8_t* messages, int co
     first_of = less(first_of, load_as<Words>(totals + d) == least ? lanes + uint16_t(d) : none);
   const int best = least_word(first_of);
   for (int d = 0; d < count; d += kWide) {
-    const Words beside = lanes + uint16_t(d - best + 1);  // 0, 1, 2 for the best and its neighbours
+    const Words beside = lanes + uint16_t(d - best + 1);  // 0, 1, 2 for the best disparity and its neighbours
     rival = less(rival, beside > uint16_t(2) ? load_as<Words>(totals + d) : none);
   }
   int sixteenths = 0;
-  if (best > 0 && best < count - 1) {  // the lowest point of a parabola
+  if (best > 0 && best < count - 1) {  // vertex of a parabola
     const int below = totals[best - 1], above = totals[best + 1], bend = more(below + above - 2 * least, 1);
     sixteenths = ((below - above) * kSixteenths + bend) / (2 * bend);
   }
@@ -47,7 +47,7 @@ GSPLAT_INLINE Best best_of(const uint8_t* costs, const uint8_t* messages, int co
 
 GSPLAT_INLINE int floor_of(int sixteenths) { return sixteenths >> 4; }
 
-// Whether the right eye's pixel that belongs to a disparity prefers another one.
+// Return true if the matching pixel of the right image prefers another disparity.
 GSPLAT_INLINE bool differs(const Pair& pair, const uint32_t* right, int64_t x, int disparity) {
   const int64_t there = x - disparity;
   if (there < 0 || there >= pair.width || right[there] == kNone) return false;
@@ -55,7 +55,8 @@ GSPLAT_INLINE bool differs(const Pair& pair, const uint32_t* right, int64_t x, i
   return other > disparity + kLeftRightMost || other < disparity - kLeftRightMost;
 }
 
-// The best disparities of a row, and, at the right eye's pixels that belong to them, the least key of all that are matched there.
+// Find the best disparities of a row. For the matching pixels of the right image, also store the minimum key of all
+// pixels matched with them.
 template <int kWide>
 GSPLAT_INLINE void find_row(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int64_t y, int32_t* sixteenths,
                             uint32_t* right) {
@@ -119,7 +120,8 @@ void drop_patches(const Pair& pair, int32_t* sixteenths, int32_t* scratch) {
     if (sizes[root_of(parents, i)] <= kPatchPixels) sixteenths[i] = kUnknown;
 }
 
-// Least and most of the rows around, with kJumpRadius columns beside the picture, and whether a hole is among the nearest.
+// Compute the minimum and maximum over the surrounding rows, padded by kJumpRadius columns, and whether one of the
+// nearest rows has a hole.
 void surfaces(const Pair& pair, const Matched& matched, int64_t begin, int64_t end, int32_t* scratch) {
   const int64_t width = pair.width, wide = width + 2 * kJumpRadius;
   int32_t *const least = scratch, *const most = scratch + wide, *const holes = scratch + 2 * wide;
@@ -141,7 +143,7 @@ void surfaces(const Pair& pair, const Matched& matched, int64_t begin, int64_t e
       int32_t low = INT32_MAX, high = kUnknown, hole = 0;
       for (int k = 0; k <= 2 * kJumpRadius; ++k) low = less(low, least[x + k]), high = more(high, most[x + k]);
       for (int k = -kHoleRadius; k <= kHoleRadius; ++k) hole |= holes[x + kJumpRadius + k];
-      // As numbers without a sign: where nothing is known the difference is none of theirs, and there is a hole.
+      // Unsigned comparison: with unknown neighbours the difference is arbitrary, but then `hole` is set.
       to[x] = uint8_t((hole == 0) & (uint32_t(high) - uint32_t(low) <= uint32_t(kJumpMost)));
     }
   }

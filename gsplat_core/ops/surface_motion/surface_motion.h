@@ -1,4 +1,4 @@
-// Motion of surface points in the world, from the flow between two pictures of a pinhole camera. CPU only.
+// World-space motion of surface points from the optical flow between two images of a pinhole camera. CPU only.
 #pragma once
 
 #include <cstdint>
@@ -7,16 +7,16 @@
 
 namespace gsplat::surface_motion {
 
-constexpr int kViewNumbers = 18;   // the upper three rows of world-to-camera, fx, fy, cx, cy, width, height
-constexpr float kNearest = 1e-6f;  // depth below which a point is not in front of a camera (NEAREST in Python)
-constexpr int kInverseSteps = 2;   // iterations to find where a pixel came from (INVERSE_STEPS in Python)
+constexpr int kViewNumbers = 18;   // upper three rows of world-to-camera, fx, fy, cx, cy, width, height
+constexpr float kNearest = 1e-6f;  // minimum depth of a point in front of a camera (NEAREST in Python)
+constexpr int kInverseSteps = 2;   // iterations of the flow inversion (INVERSE_STEPS in Python)
 
 struct View {
   float rotation[9], translation[3];
   float fx, fy, cx, cy, width, height;
 };
 
-// Flow [height, width, 2] in pixels of `picture_width` x `picture_height`, however many cells it has.
+// Flow [height, width, 2] in pixels of `picture_width` x `picture_height`; the grid may be coarser than the image.
 struct Flow {
   const float* cells;
   int64_t height, width;
@@ -24,10 +24,10 @@ struct Flow {
 };
 
 struct Kernels {
-  // Points [N, 3] as they are in the first picture; how they move to the second.
+  // Computes the motion of points [N, 3], given at the time of the first image, to the second image.
   void (*ahead)(const View& before, const View& after, const Flow& flow, const float* points, float* motion, int64_t begin,
                 int64_t end);
-  // Points as they are in the second picture; how they moved there.
+  // Computes the motion of points, given at the time of the second image, since the first image.
   void (*arrived)(const View& before, const View& after, const Flow& flow, const float* points, float* motion, int64_t begin,
                   int64_t end);
 };

@@ -1,4 +1,4 @@
-// A vector of points at a time; the flow's cells are gathered lane by lane.
+// Processes a vector of points at a time; the flow's cells are gathered lane by lane.
 #include "simd.h"
 #include "surface_motion.h"
 #include "transposed_rows.h"
@@ -13,11 +13,11 @@ struct Pixels {
   vfloat x, y;
 };
 
-// Points as a camera sees them.
+// Points in camera space and their pixels.
 struct Seen {
   vfloat depth;
   Pixels at;
-  vint inside;  // the picture, and in front of the camera
+  vint inside;  // inside of the image and in front of the camera
 };
 
 GSPLAT_INLINE Seen seen_by(const View& view, const vfloat* p) {
@@ -31,8 +31,8 @@ GSPLAT_INLINE Seen seen_by(const View& view, const vfloat* p) {
   return s;
 }
 
-// The flow at pixels, bilinear between the cells' centres; beyond the outermost centres that of the edge, also for what is no
-// number.
+// Sample the flow at pixels, bilinearly between cell centres. Positions beyond the outermost centres, and NaN, are
+// clamped to the edge.
 GSPLAT_INLINE Pixels flow_at(const Flow& flow, const Pixels& pixels) {
   const vfloat x = min(max(pixels.x * (float(flow.width) / flow.picture_width) - 0.5f, vfloat{}), splat(float(flow.width - 1)));
   const vfloat y =
@@ -59,7 +59,7 @@ GSPLAT_INLINE Pixels flow_at(const Flow& flow, const Pixels& pixels) {
   return {mixed[0], mixed[1]};
 }
 
-// Motion in pixels as motion in the world at the depth at which `view` sees the points.
+// Convert motion in pixels to world-space motion at the points' depth in `view`.
 GSPLAT_INLINE void to_world(const View& view, vfloat depth, const Pixels& moved, vint inside, vfloat* world) {
   const vfloat x = select(inside, moved.x * depth / view.fx, vfloat{}), y = select(inside, moved.y * depth / view.fy, vfloat{});
   for (int i = 0; i < 3; ++i) world[i] = x * view.rotation[i] + y * view.rotation[3 + i];

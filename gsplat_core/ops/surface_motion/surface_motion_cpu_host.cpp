@@ -6,7 +6,7 @@
 namespace gsplat::surface_motion {
 namespace {
 
-constexpr int64_t kGrain = 2048;  // points worth a thread
+constexpr int64_t kGrain = 2048;  // minimum points per task
 
 View view_of(const std::vector<double>& numbers, const char* name) {
   check(int64_t(numbers.size()) == kViewNumbers, name, " must have ", kViewNumbers, " numbers, got ", numbers.size());

@@ -10,8 +10,8 @@ __device__ int64_t image_of(const SplatBoxes& in, int64_t splat) {
   return in.image_ids != nullptr ? in.image_ids[splat] : splat / in.per_image;
 }
 
-// A thread counts or writes the tiles of its splat; the warp does it together for a splat with many, or the other lanes would
-// wait for that one.
+// A thread counts or writes the tiles of its splat. For a splat with many tiles the whole warp does so, because the
+// other lanes would otherwise wait.
 constexpr int kTallRows = 16, kManyTiles = 32;
 
 __device__ int tiles_of(const SplatBoxes& in, const TileBox& box) {
@@ -20,7 +20,8 @@ __device__ int tiles_of(const SplatBoxes& in, const TileBox& box) {
   return tiles;
 }
 
-// Tile counts, and what the depth sort needs: depths as bits, so positive ones in front of negative ones, as gsplat sorts.
+// Compute tile counts and the keys of the depth sort. Depths are sorted by their bits, so positive depths precede
+// negative ones, as in gsplat.
 __global__ void measure_splats(SplatBoxes in, int32_t* tile_counts, uint32_t* keys, uint32_t* splats) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = threadIdx.x % 32;
@@ -51,7 +52,7 @@ __global__ void counts_in_order(int64_t count, const uint32_t* splats, const int
   if (i <= count) counts[i] = i == count ? 0 : tile_counts[splats != nullptr ? splats[i] : i];
 }
 
-// Writes the tiles of one splat from `at` on: every `step`th of a row from the `lane`th on.
+// Write the tiles of one splat from `at` on. A lane writes every `step`th tile of a row, starting with its own index.
 __device__ void emit_splat(const SplatBoxes& in, int64_t splat, int64_t at, int lane, int step, const TileInstances& to) {
   const uint32_t first_tile = uint32_t(image_of(in, splat) * in.tile_width * in.tile_height) + to.capacity;
   for_tile_rows(tile_box(in, splat), float(in.tile_size), [&](int row, int first, int end) {
@@ -80,7 +81,7 @@ __global__ void emit(SplatBoxes in, TileOrder order, TileInstances to) {
   }
 }
 
-// How many of the `count` sorted values key(0), key(1), ... are below `value`.
+// Return the number of the `count` sorted values key(0), key(1), ... below `value`.
 template <class Key>
 __device__ int64_t count_below(int64_t count, int64_t value, const Key& key) {
   int64_t low = 0, high = count;
@@ -108,7 +109,7 @@ __global__ void offsets_of_ids(const int64_t* ids, int64_t count, int64_t images
   offsets[at] = int32_t(count_below(count, key, [&](int64_t i) { return ids[i] >> 32; }));
 }
 
-// The bits that n values need, as gsplat counts them: floor(log2(n)) + 1.
+// Number of bits for n values, as gsplat counts them: floor(log2(n)) + 1.
 int gsplat_bits(int64_t n) { return n > 0 ? 64 - __builtin_clzll(uint64_t(n)) : 1; }
 
 __global__ void ids_of_instances(SplatBoxes in, const uint32_t* tiles, const int32_t* splats, int64_t count, int tile_bits,

@@ -1,8 +1,8 @@
-// The exact test of an ellipse against the tiles, and the two passes of the counting sort.
+// Exact intersection test of an ellipse and the tiles, and the two passes of the counting sort.
 //
-// A splat reaches the pixels where o exp(-sigma) >= 1/255: an ellipse. Its part inside a row of tiles is convex, so it touches a
-// contiguous run of tiles, given by its extent in x over the row's pixel centres (Gaussian splat extents after StopThePop,
-// Radl et al. 2024, and AccuTile; the extent in a strip is our own derivation, below).
+// A splat reaches the pixels where o exp(-sigma) >= 1/255: an ellipse. Its part within a row of tiles is convex, so it
+// touches a contiguous run of tiles, given by its extent in x over the row's pixel centres. Tight extents follow
+// StopThePop (Radl et al. 2024) and AccuTile; the extent within a strip is derived below.
 #include "simd.h"
 #include "tiles.h"
 
@@ -12,12 +12,13 @@ using namespace gsplat::tiles;
 
 namespace {
 
-// Of one splat per lane: a dx^2 + 2 b dx dy + c dy^2 = k around (x, y), solved for dx: slope dy +- sqrt(offset - curve dy^2).
+// Ellipses of one splat per lane: a dx^2 + 2 b dx dy + c dy^2 = k around (x, y), solved for dx: slope dy +- sqrt(offset
+// - curve dy^2).
 struct Ellipses {
   vfloat x, y;
   vfloat slope, offset, curve;
   vfloat top;    // dy of the rightmost point; the leftmost is at -top
-  vmask proper;  // elsewhere the conic is no proper ellipse in float32, and the box alone decides
+  vmask proper;  // if false, the conic is not a proper ellipse in float32, and only the box is used
 };
 
 struct Conics {
@@ -26,7 +27,7 @@ struct Conics {
 
 GSPLAT_INLINE Ellipses make_ellipses(vfloat x, vfloat y, Conics q, vfloat k) {
   const vfloat zero = {}, ac = q.a * q.c;
-  // A determinant lost to rounding only widens the ellipse.
+  // The margin makes rounding errors of the determinant only widen the ellipse.
   const vfloat det = fma(-q.b, q.b, ac) - 5e-7f * ac, inverse = 1.0f / q.a;
   const vfloat top = -q.b * sqrt(k / (q.c * det));
   const vmask proper = above(q.a, zero) & above(q.c, zero) & above(det, 1e-6f * ac) & at_least(splat(1e30f), larger(top, -top));
@@ -38,16 +39,17 @@ struct Runs {
   vint first, end;
 };
 
-// What the ellipses touch in row `row` of their boxes, which reach from column box_first to box_end.
+// Return the tiles that the ellipses touch in row `row` of their boxes, whose columns are box_first to box_end.
 GSPLAT_INLINE Runs runs_of(const Ellipses& e, vfloat row, float tile_size, vfloat box_first, vfloat box_end) {
   const vfloat zero = {}, low = fma(row, splat(tile_size), 0.5f - e.y), high = low + (tile_size - 1);
   const vfloat at_right = smaller(larger(e.top, low), high), at_left = smaller(larger(-e.top, low), high);
   const vfloat right_square = fma(-e.curve * at_right, at_right, e.offset),
                left_square = fma(-e.curve * at_left, at_left, e.offset);
-  constexpr float kSlack = 2e-3f;  // pixels, against rounding
+  constexpr float kSlack = 2e-3f;  // pixels, tolerance for rounding
   const vfloat right = fma(e.slope, at_right, e.x) + sqrt(larger(right_square, zero)) + kSlack;
   const vfloat left = fma(e.slope, at_left, e.x) - sqrt(larger(left_square, zero)) - kSlack;
-  // Tile t holds the pixel centres t size + 0.5 ... t size + size - 0.5; a gap between two tiles' centres is in neither.
+  // Tile t contains the pixel centres t size + 0.5 ... t size + size - 0.5. The gap between the centres of two adjacent
+  // tiles belongs to neither.
   const vfloat inverse = splat(1.0f / tile_size);
   const vfloat first = truncate(smaller(larger((left + 0.5f) * inverse, box_first), box_end));
   const vfloat past = first + where(above(left, fma(first + 1.0f, splat(tile_size), splat(-0.5f))), splat(1.0f), zero);
@@ -57,7 +59,7 @@ GSPLAT_INLINE Runs runs_of(const Ellipses& e, vfloat row, float tile_size, vfloa
   return {to_int(from), to_int(to)};
 }
 
-// The contour: sigma <= k / 2, a little outside of alpha = 1/255; negative where there is none.
+// The contour sigma <= k / 2, slightly outside of alpha = 1/255; negative if the splat reaches no pixel.
 GSPLAT_INLINE vfloat contours(vfloat opacity) {
   const vfloat k = fma(log2(opacity * 255.0f), splat(1.3862944f), splat(1e-3f));  // 2 ln(255 o)
   return where(above(opacity, vfloat{}) & at_least(splat(3e38f), opacity), k, splat(-1.0f));
@@ -65,19 +67,19 @@ GSPLAT_INLINE vfloat contours(vfloat opacity) {
 
 GSPLAT_INLINE vmask finite(vfloat v) { return at_least(splat(3.4028235e38f), larger(v, -v)) & at_least(v, v); }
 
-// Splats in depth order lie anywhere in memory: the span of a later one is on its way meanwhile.
+// Prefetch the span of a later splat: splats in depth order are scattered in memory.
 GSPLAT_INLINE void prefetch_span(const TileSpan* spans, const uint32_t* order, int64_t i, int64_t end) {
   constexpr int64_t kAhead = 16;
   if (i + kAhead < end) __builtin_prefetch(spans + order[i + kAhead]);
 }
 
-// Where the counters of this splat's image start.
+// Return the index of the first counter of this splat's image.
 GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
   const int64_t image = in.image_ids != nullptr ? in.image_ids[splat] : splat < in.per_image ? 0 : splat / in.per_image;
   return image * in.tile_width * in.tile_height;
 }
 
-// visit(tile) for every touched tile, row by row.
+// Call visit(tile) for every touched tile, row by row.
 template <class Visit>
 GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t id, const TileSpan& span, const Visit& visit) {
   const int64_t origin = int64_t(span.y) * in.tile_width + span.x;
@@ -107,7 +109,7 @@ void spans(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, in
   const vfloat width = splat(float(in.tile_width)), height = splat(float(in.tile_height));
   for (int64_t first = begin; first < end; first += kLanes) {
     const int n = end - first < kLanes ? int(end - first) : kLanes;
-    alignas(64) float fields[9][kLanes] = {};  // radii of 0 where there is no splat
+    alignas(64) float fields[9][kLanes] = {};  // unused lanes have radii of 0
     for (int i = 0; i < n; ++i) {
       const int64_t at = first + i;
       fields[0][i] = in.means2d[2 * at];
@@ -121,7 +123,7 @@ void spans(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, in
     }
     const vfloat x = load(fields[0]), y = load(fields[1]), rx = load(fields[2]), ry = load(fields[3]);
     vmask visible = above(rx, zero) & above(ry, zero) & finite(x) & finite(y) & finite(load(fields[4]));
-    // gsplat's box: floor and ceil of (mean -+ radius) / tile size, inside the image.
+    // gsplat's box: floor and ceil of (mean -+ radius) / tile size, clamped to the image.
     const vfloat x0 = truncate(smaller(larger((x - rx) / size, zero), width)),
                  y0 = truncate(smaller(larger((y - ry) / size, zero), height));
     const vfloat x1 = ceiling(smaller(larger((x + rx) / size, zero), width)),
@@ -172,7 +174,7 @@ void count(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, i
   }
 }
 
-// The bits that n values need, as gsplat counts them: floor(log2(n)) + 1.
+// Number of bits for n values, as gsplat counts them: floor(log2(n)) + 1.
 GSPLAT_INLINE int bits_for(int64_t n) { return 64 - __builtin_clzll(uint64_t(n)); }
 
 struct Key {

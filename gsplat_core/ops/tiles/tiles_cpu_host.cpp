@@ -4,10 +4,10 @@
 namespace gsplat::tiles {
 namespace {
 
-// Items worth a thread: a splat takes about 2 ns in a pass of the depth sort, 10 ns in one over its tiles.
+// Minimum items per task: a splat takes about 2 ns in a pass of the depth sort, and 10 ns in a pass over its tiles.
 constexpr int64_t kRadixChunk = 1 << 16, kTilesChunk = 1 << 13;
 
-// The first pass over the splats, and the sorts that follow it.
+// The first pass over the splats, and the subsequent sorts.
 struct Binning {
   const SplatBoxes& boxes;
   int64_t count, tiles;
@@ -32,7 +32,8 @@ struct Binning {
           " tiles in all, more than 2^31 - 1; render fewer images at a time or with a larger tile_size");
   }
 
-  // Visible splats by depth (as bits, so positive depths in front of negative ones, as gsplat sorts), ties by index.
+  // Return the visible splats by depth, ties by index. Depths are sorted by their bits, so positive depths precede
+  // negative ones, as in gsplat.
   std::unique_ptr<uint32_t[]> depth_order(int64_t& visible) const {
     struct Item {
       uint32_t key, splat;
@@ -49,7 +50,7 @@ struct Binning {
     }
     auto order = uninitialised<uint32_t>(visible);
     if (visible == 0) return order;
-    // The nearer the depths lie together, the fewer digits they differ in.
+    // The narrower the range of depths, the fewer digits have to be sorted.
     const int width = high == low ? 1 : 32 - __builtin_clz(high - low);
     const int passes = (width + 11) / 12, digit = (width + passes - 1) / passes;
     const uint32_t mask = (1u << digit) - 1;
@@ -87,8 +88,8 @@ struct Binning {
     return order;
   }
 
-  // Every tile's splats in depth order; `offsets` receives where each tile starts. With a capacity the list is of this length:
-  // the nearest splats whose tiles fit in whole, behind entries of -1 that are in no tile.
+  // Return every tile's splats in depth order; `offsets` receives the start of each tile. With a capacity the list has
+  // that length: leading entries of -1, which belong to no tile, then the nearest splats that fit completely.
   Tensor sorted(const Call& call, int32_t* offsets, int64_t* keys, std::optional<int64_t> capacity) const {
     int64_t visible, listed = total;
     const auto order = depth_order(visible);
@@ -112,7 +113,7 @@ struct Binning {
     return flatten_ids;
   }
 
-  // By splat, not sorted.
+  // Return the tiles in splat order, without sorting.
   Tensor by_splat(const Call& call, int64_t* keys) const {
     Tensor flatten_ids = call.empty({total}, ScalarType::Int);
     const int32_t* const counts = tile_counts.const_data_ptr<int32_t>();

@@ -2,7 +2,7 @@
 
 namespace gsplat::tiles {
 
-// An image_id that is no image's is in no list: to refuse it as the CPU does, the host would have to wait.
+// Instances with an out-of-range image_id are dropped; to reject them as the CPU does, the host would have to wait.
 TileLists make_lists(Call& call, const Splats& splats, const ListOptions& options) {
   const SplatBoxes& boxes = splats.boxes;
   TileLists lists = {call.empty({boxes.count}, ScalarType::Int), {}, {}, {}, {}};
@@ -20,7 +20,8 @@ TileLists make_lists(Call& call, const Splats& splats, const ListOptions& option
                                : cudaMemsetAsync(out, 0, sizeof(int64_t), call.stream),
                "keeping the number of instances");
   } else if (boxes.count > 0) {
-    // The host waits here, once, for the number of instances: the lists that are returned are exactly as long.
+    // The only host synchronisation: it provides the number of instances, so that the returned lists have the exact
+    // length.
     check_cuda(cudaMemcpyAsync(&instances.count, total, sizeof(int64_t), cudaMemcpyDeviceToHost, call.stream),
                "reading the number of instances");
     check_cuda(cudaStreamSynchronize(call.stream), "sorting the splats by depth");
