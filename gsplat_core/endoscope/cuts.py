@@ -1,15 +1,10 @@
-"""Scene change detection: cuts between shots, returns to an earlier scene, and changes of size or content.
+"""Scene change detection: cuts between shots, returns to an earlier scene, and changes of size or frame rate.
 
-Pictures are compared by their content independent of exposure.
-
-Similarity of two pictures' content independent of exposure, for detecting cuts and returns.
-
-Measures on 64x48 pixels: *Difference* is the median difference of log levels after removing each
-channel's gain. *Colours* is the overlap of the hue histograms. *Structure* searches blocks of one
-picture near their place in the other (normalised correlation) and takes the median over blocks.
-*Moved* searches quarters of one picture in the whole other one and takes the best of five. Moving
-tissue, a jump of the view, tools and exposure changes leave one of the last two high. Between
-different scenes both are low.
+Pictures are compared by their content, independent of exposure, at 64x48 pixels. *Difference* is the median difference
+of log levels after removing each channel's gain. *Colours* is the overlap of the hue histograms. *Structure* searches
+blocks of one picture near their position in the other (normalised correlation) and takes the median over blocks.
+*Moved* searches quarters of one picture in the whole other picture and takes the best of five. With moving tissue, a
+jump of the view, tools or exposure changes, *Structure* or *Moved* stays high. Between different scenes both are low.
 """
 
 from __future__ import annotations
@@ -45,7 +40,7 @@ class Likeness:
     colours: float
     """1 for equal colours, 0 for none in common."""
     structure: float
-    """1 if every block is found near its place; 0.3 to 0.65 for unrelated pictures."""
+    """1 if every block is found near its position; 0.3 to 0.65 for unrelated pictures."""
     moved: float
     """1 if a quarter of one picture is found in the other; 0.4 to 0.8 for unrelated pictures."""
 
@@ -57,7 +52,7 @@ class View:
         """Prepare an RGB uint8 picture [H, W, 3] of any size."""
         small = reduced(image, WIDTH_PX, HEIGHT_PX)
         self.bright: NDArray[np.bool_] = lowest_and_highest(small)[1] >= DARK
-        # Channels are contiguous, which makes medians fast.
+        # Make channels contiguous, because medians are then fast.
         logs = np.ascontiguousarray(LOGS[small].transpose(2, 0, 1))
         for channel in logs:
             lit = channel[self.bright]
@@ -149,7 +144,7 @@ LONGEST_DOUBT_FRAMES = 6
 confirmed by the next frame matching the unmatched one.
 """
 KEPT_VIEWS = 4
-"""Number of views kept of the present scene; twice as many are kept of earlier ones."""
+"""Number of views kept of the present scene. Twice as many are kept of earlier scenes."""
 VIEW_EVERY = 15
 """Number of frames between two kept views."""
 RATE_RATIO = 1.4
@@ -171,7 +166,7 @@ class SceneVerdict:
 
 
 class CutDetector:
-    """Scene change detector of a stream. Call `observe` for usable frames and `skip` for others.
+    """Scene change detector of a stream. Call `observe` for usable frames and `skip` for unusable ones.
 
     A cut is reported with the second frame of the new scene, because a single odd frame is not a
     cut. A bounded number of reduced pictures is kept.
@@ -265,7 +260,7 @@ class FrameRate:
         if len(self._recent) < RATE_FRAMES:
             return False
         now_ns = float(np.median(self._recent))
-        # Require all intervals, not only their median: an unsteady clock is no other rate.
+        # Require that all intervals differ, not only their median. An unsteady clock is not a new rate.
         if self._usual_ns is None:
             self._usual_ns = now_ns
             return False

@@ -53,7 +53,7 @@ def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None) -> Sam
         image: RGB uint8 [H, W, 3].
         kept: [H, W], 0 outside the tissue, or None.
     """
-    # The last averaging is in floats: in 8 bits a change of 1 % in a dark channel would be lost.
+    # Average in floats in the last reduction. In 8 bits a change of 1 % in a dark channel would be lost.
     small = reduced(image, 4 * WIDTH_PX, 4 * HEIGHT_PX).astype(np.float32)
     small = np.asarray(cv2.resize(small, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA), np.float32)
     valid = (small > DARKEST_LEVEL) & (small < BRIGHTEST_LEVEL)
@@ -108,7 +108,7 @@ SETTLED_CHANGE = 0.02
 SETTLED_FRAMES = 6
 """Number of settled frames after which the gain is held again."""
 MOST_REFERENCES = 12
-"""Number of reference pictures."""
+"""Largest number of reference pictures kept."""
 REFERENCE_EVERY = 4
 """Number of frames between references; 12 references every 4 frames cover 1.6 s at 30 frames/s."""
 YOUNG_REFERENCES = 4
@@ -204,7 +204,7 @@ class ExposureEstimator:
         self.following, self._steady = True, 0
 
     def _changed(self, sample: Sample, references: Iterable[Reference], zone: float, clear: float) -> bool:
-        """Return True if the references show a clearly different gain, and apply it."""
+        """Return True if the references show a clearly different gain. In that case the gain is set to it."""
         found = self._compare(sample, references)
         if found is None:
             return False
@@ -269,7 +269,7 @@ class ExposureEstimator:
         if not known.any():
             return None
         measured = total / np.maximum(weights, 1e-9)
-        # A channel that is clipped or dark everywhere changes like the others.
+        # Change a channel that is clipped or dark everywhere like the mean of the other channels.
         others = float((measured - self._log_gain)[known].mean())
         return np.where(known, measured, self._log_gain + others), alike[0][0], alike[0][1]
 

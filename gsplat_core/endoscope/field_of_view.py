@@ -133,7 +133,7 @@ class FieldOfView:
         inside = _inside(outline, (height, width)).astype(np.uint8)
         margin = round(MARGIN_SHARE * max(height, width))
         if margin:
-            # The picture's own edge gets no margin.
+            # The margin is not applied along the picture's own edge.
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
             inside = np.asarray(cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1))
         self.mask = inside
@@ -159,7 +159,7 @@ def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Ou
     limit = level + SURROUND_RANGE
     dark = (brightest <= limit) & (brightest - darkest <= SURROUND_RANGE)
     lit = cv2.morphologyEx((~dark).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    # The largest lit region is the field; text and logos are separate regions.
+    # The largest lit region is the field. Text and logos form separate regions.
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(lit, connectivity=4)
     if count < 2:
         return None

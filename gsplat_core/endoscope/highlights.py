@@ -78,10 +78,10 @@ def _disc(radius_px: int) -> NDArray[np.uint8]:
 
 
 def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the largest darkest channel that is not a highlight, reduced by `SHRINK` (rounded up).
+    """Return for each pixel the largest level of the darkest channel that is not a highlight, reduced by `SHRINK`.
 
-    It is one level below the local mean plus an offset. Black pixels are excluded from the mean. Where the sum
-    exceeds 255, the result is 255, so that even a saturated area is not a highlight there.
+    The level is the local mean of the surroundings plus `ABOVE_SURROUNDINGS`, minus one. Black pixels are excluded from
+    the mean. Where the sum exceeds 255, the result is 255, so that even a saturated area is not a highlight there.
     """
     width, height = (-(-side // SHRINK) for side in low.shape[::-1])
     small, lit = (

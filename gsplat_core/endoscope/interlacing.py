@@ -85,7 +85,7 @@ def without_combs(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     over = cv2.subtract(grey_odd, cv2.max(grey_above, grey_below))
     under = cv2.subtract(cv2.min(grey_above, grey_below), grey_odd)
     stands_out = (np.asarray(cv2.max(over, under)) > STAND_OUT_LEVELS).view(np.uint8)
-    # Include the ends of a comb's tooth, which are less distinct than its middle.
+    # Include the ends of a comb's tooth, which differ less from the neighbouring lines than its middle.
     near = cv2.dilate(stands_out, np.ones((1, 5), np.uint8))
     odd[:] = cv2.copyTo(cv2.addWeighted(above, 0.5, below, 0.5, 0), near, np.ascontiguousarray(odd))
     return result

@@ -18,9 +18,9 @@ SAMPLES = 128
 LEAST_TISSUE = 0.02
 """Share of tissue below which a frame is not trained on."""
 LOST_TOOL_SHARE = 0.05
-"""Share of a tool in the previous mask from which its sudden absence is a lost mask."""
+"""Share of tool pixels in the previous mask from which a mask without any tool counts as lost."""
 LOST_FRAMES = 5
-"""Largest number of frames with a lost mask; then the tool has left."""
+"""Largest number of consecutive frames with a lost mask. After that the tool counts as withdrawn."""
 FARTHEST_MM = 2000.0
 """Largest plausible depth for an endoscope, in millimetres."""
 WRONG_DEPTH_SHARE = 0.2
@@ -28,7 +28,7 @@ WRONG_DEPTH_SHARE = 0.2
 USUAL_DEPTH_RATIO = 4.0
 """Ratio of the median depth to that of earlier frames, in either direction, from which a frame's depth is discarded."""
 UNUSUAL_FRAMES = 10
-"""Largest number of such frames; then the new distance is accepted."""
+"""Largest number of consecutive discarded frames. After that the new distance is accepted."""
 
 
 class MaskCheck:
@@ -77,7 +77,7 @@ class DepthCheck:
         known = sampled[possible & (sampled > 0)]
         if len(known) and self._at_another_scale(float(np.median(known))):
             return CheckedDepth(None, "depth at another scale")
-        # Both are NaN if any value is.
+        # Minimum and maximum are NaN if any value is NaN.
         if depth.min() >= 0 and depth.max() <= FARTHEST_MM:
             return CheckedDepth(depth)
         return CheckedDepth(np.where(self._possible(depth), depth, 0).astype(np.float32), "depth repaired")
@@ -100,6 +100,6 @@ class DepthCheck:
 
 
 def _some(plane: NDArray[Any]) -> NDArray[Any]:
-    """Subsample a plane."""
+    """Return every n-th row and column of a plane, about `SAMPLES` along its shorter side."""
     step = max(STEP_PX, min(plane.shape) // SAMPLES)
     return np.ascontiguousarray(plane[::step, ::step])

@@ -1,12 +1,8 @@
 """Loading, checking and running of a user's ONNX model that takes one picture, on the CPU.
 
-Files are read without the onnx package, bounded in size and self-contained. Input and output conventions come from the model's metadata or from a JSON file
-next to it.
-
-Safe reading of ONNX files without the onnx package: bounded in size and self-contained.
-
-A model can store weights in other files named by path. Loading them would let a foreign model read any file of the
-machine, so such models are rejected and the runtime gets bytes instead of a path.
+Files are read without the onnx package and bounded in size. A model can store weights in other files named by path.
+Loading them would let a foreign model read any file of the machine. Such models are rejected, and the runtime gets
+bytes instead of a path. Input and output conventions come from the model's metadata or from a JSON file next to it.
 """
 
 from __future__ import annotations
@@ -26,7 +22,8 @@ from gsplat_core.io.files import read_regular
 MOST_BYTES = 512 * 2**20
 MOST_NESTING = 64
 _EXTERNAL_DATA, _DATA_LOCATION, _EXTERNAL = 13, 14, 1
-"""Field numbers of a tensor in onnx.proto, and the value of the second field that marks external data."""
+"""Field numbers in onnx.proto of a tensor's external data and its location, and the location value for external data.
+"""
 _PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
@@ -248,7 +245,7 @@ class OnnxNetwork(Generic[Settings]):
         return np.asarray(output)
 
     def refused(self, why: str) -> InvalidSetting:
-        """Return the error for an unusable network; `why` continues the sentence after its name."""
+        """Return the error for an unusable network. `why` is the predicate of the message's sentence."""
         return InvalidSetting(f"{self.what} {self.path} {why}")
 
     def _size(self, height: int, width: int) -> tuple[int, int]:
@@ -310,9 +307,9 @@ def _session(onnxruntime: Any, data: bytes, threads: int) -> Any:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    # Waiting threads sleep, since the CPU is shared with training.
+    # Let waiting threads sleep, because training uses the same CPU.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Named explicitly, because one of the default providers sends its input to a remote service.
+    # Name the provider explicitly. One of the default providers sends its input to a remote service.
     return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 
 class Turns:
-    """Schedule by the stream's time, called for each picture. After a picture that passed all
-    checks, the next ones are spread evenly over the period.
+    """Schedule of checks by the stream's time. After a picture that passed all checks, the next check of each kind is
+    due at another time, spread evenly over the period.
     """
 
     def __init__(self, looks: int, every_s: float) -> None:
@@ -38,7 +38,7 @@ class Turns:
 
 
 BANDS = 4
-"""Number of horizontal bands compared separately; a torn picture changes only in some of them."""
+"""Number of horizontal bands compared separately. A torn picture changes only in some of the bands."""
 SAMPLES_PER_SIDE = 64
 USUAL_DECAY = 0.1
 LEAST_CHANGE = 0.2
@@ -61,7 +61,7 @@ MOST_INTERVAL_RATIO = 1.7
 
 
 class OrdinaryPictures:
-    """Test for ordinary pictures of a stream, called for each frame. It keeps a reduced picture and a few numbers."""
+    """Test for ordinary pictures of a stream, called for each frame. Its state is a reduced picture and a few numbers."""
 
     def __init__(self) -> None:
         self.reset()

@@ -17,11 +17,12 @@ SMALLEST_FOR_NOISE_PX = 32
 
 
 BLACK_LEVEL = 20
-"""Level below which a picture is black, except for `odd_share` of it."""
+"""Level below which a picture is black, except for `ODD_SHARE` of its pixels."""
 ONE_COLOUR_LEVELS = 3
-"""Deviation from the most frequent colour within which a picture is single-coloured, except for `odd_share` of it."""
+"""Deviation from the most frequent colour within which a picture has one colour, except for `ODD_SHARE` of its pixels.
+"""
 ODD_SHARE = 0.03
-"""Tolerated share of other pixels, such as a line of text or a logo."""
+"""Tolerated share of other pixels in a black or single-coloured picture, such as a line of text or a logo."""
 NOISE_SHARE = 0.5
 """Difference of neighbouring pixels relative to that of unrelated ones, from which a picture is
 noise. Tissue has 0.01 to 0.04.
@@ -31,7 +32,7 @@ SAME_LEVELS = 2
 SAME_SHARE = 0.9995
 """Share of equal pixels from which a picture repeats the previous one."""
 FROZEN_S = 0.25
-"""Seconds without a new picture after which the stream is frozen; before, frames are duplicates."""
+"""Seconds without a new picture after which the stream is frozen. Earlier repetitions count as duplicates."""
 FROZEN_FRAMES = 8
 """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
 TORN_SHARE = 0.08
@@ -43,7 +44,7 @@ black borders and recorder overlays.
 
 
 class SequenceCheck:
-    """Check of each picture against the previous one. It keeps one reduced picture and a number per row."""
+    """Check of each picture against the previous one. Its state is one reduced picture and one number per row."""
 
     def __init__(self) -> None:
         self._previous: NDArray[np.uint8] | None = None
@@ -69,7 +70,7 @@ class SequenceCheck:
             self._new_since_ns = pts_ns
             return self._unusable(image, small)
         _, differs = cv2.threshold(cv2.absdiff(small, previous), SAME_LEVELS, 1, cv2.THRESH_BINARY)
-        # Fraction per row, over all channels.
+        # Share of changed pixels in each row, over all channels.
         share = cv2.reduce(differs.reshape(height, -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
         if share.mean() <= 1 - SAME_SHARE:
             return self._unusable(image, small) or self._repeated(pts_ns)
@@ -77,7 +78,7 @@ class SequenceCheck:
         changed = share > 0.01
         torn = self._torn(small, changed)
         if not torn:
-            # Fast at first, then averaged over about the last 50 frames.
+            # Adapt quickly at first, then average over about the last 50 frames.
             self._frames_seen += 1
             self._row_moves += (changed - self._row_moves) / min(self._frames_seen, 50)
         return self._unusable(image, small) or ("torn" if torn else None)
@@ -95,7 +96,7 @@ class SequenceCheck:
 
     def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
         """Return True if enough pixels have one grey level for a single colour; faster than comparing colours."""
-        # One more level on either side, since grey is rounded.
+        # Allow one more level on either side, since grey values are rounded.
         wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
         below = np.append(0, levels.cumsum())
         return bool((below[wide:] - below[:-wide]).max() >= (1 - ODD_SHARE) * pixels)

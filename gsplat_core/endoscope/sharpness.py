@@ -6,7 +6,8 @@ blur reduces it in one direction only. The usual value is the median of recent f
 that is or becomes permanently soft therefore passes.
 
 Smoke reduces contrast (spread of log brightness) and saturation and brightens dark regions, which a tool does not.
-Smoke gathers slowly, so the usual values are those of frames without smoke, until it has lasted for the same time.
+Smoke gathers slowly, so the usual values are those of frames without smoke. Smoke that lasts longer than `RECENT_S`
+becomes the usual state.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ RECENT_S = 1.5
 Smoke that lasts longer becomes the usual state.
 """
 RECENT_FRAMES = 5
-"""Smallest number of frames for the median, for low frame rates. All frames pass before."""
+"""Smallest number of frames for the median, for low frame rates. Until there are as many, all frames pass."""
 CLEAR_FRAMES = 300
 """Number of good frames for the usual contrast, saturation and haze (medians)."""
 
@@ -110,8 +111,8 @@ class SharpnessGate:
         """
         elapsed_s = 0.0 if self._last_ns is None else (pts_ns - self._last_ns) * 1e-9
         self._last_ns = pts_ns
-        # Bound the interval: a gap must not dominate the median, and a constant clock must not stop
-        # the window.
+        # Bound the interval. A gap must not dominate the median, and a clock that stands still must not keep
+        # old frames in the window.
         elapsed_s = min(max(elapsed_s, 1e-3), RECENT_S / RECENT_FRAMES)
         seen = appearance(image, kept)
         self._unseen_s = 0.0 if seen is not None else self._unseen_s + elapsed_s

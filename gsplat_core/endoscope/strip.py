@@ -64,7 +64,7 @@ class StripDetector:
         if self._bands:
             some = image[:: self._step, :: self._step]
             turn, slice_of = divmod(self._frames, EXAMINE_EVERY)
-            # One border per frame, to distribute the cost evenly.
+            # Examine one border per frame, to distribute the cost evenly.
             for band in self._bands[slice_of::EXAMINE_EVERY]:
                 band.add(some)
             if slice_of == EXAMINE_EVERY - 1 and (turn + 1) % DECIDE_EVERY == 0:
@@ -86,7 +86,7 @@ class StripDetector:
         drawn = np.zeros(self._small, bool)
         for band in self._bands:
             band.mark(drawn)
-        # Require two decisions in a row, so that resting tissue is not taken for a strip.
+        # Require two decisions in a row, so that resting tissue is not mistaken for a strip.
         before, self._before = self._before, drawn
         found = (
             drawn if before is None else drawn & cv2.dilate(before.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
@@ -142,7 +142,7 @@ class _Band:
         edges = (strength >= EDGE_LEVELS) & (steadiness >= EDGE_STEADINESS)
         depth, length = edges.shape
         least = round(EDGE_SHARE * length)
-        # Join an edge that is tilted by a pixel or interrupted by letters.
+        # Close gaps of an edge that is tilted by a pixel or interrupted by letters.
         joined = cv2.morphologyEx(
             cv2.dilate(edges.astype(np.uint8), np.ones((3, 1), np.uint8)), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8)
         )
@@ -150,7 +150,8 @@ class _Band:
         seen = runs.any(axis=0)
         first = np.where(seen, runs.argmax(axis=0), depth)
         if seen.mean() >= WHOLE_SHARE:
-            # The rest of its edge is indistinguishable from the background.
+            # The rest of the strip's edge does not differ from the background. Use the median position of the visible
+            # part.
             first = np.where(seen, first, int(np.median(first[seen])))
         return np.arange(depth)[:, None] >= first
 

@@ -1,11 +1,9 @@
 """Tool segmentation by colour, edges and temporal consistency, for video without masks.
 
-Grey regions of a picture are classified first.
-
-Tissue under white light is red, while steel, plastic and cloth are greyer. The redness of tissue and the tint of grey
-vary between scopes, so no fixed colour is used. The threshold is the valley between two peaks of the stream's own
-redness distribution. Pale tissue, glare and shadow are grey as well. A tool is distinguished from them by a sharp
-outline, by reaching the border or being large, and by not being mostly overexposed.
+Grey regions of a picture are candidates. Tissue under white light is red, while steel, plastic and cloth are greyer.
+The redness of tissue and the tint of grey vary between scopes, so no fixed colour is used. The threshold is the valley
+between two peaks of the stream's own redness distribution. Pale tissue, glare and shadow are grey as well. A tool is
+distinguished from them by a sharp outline, by reaching the border or being large, and by not being mostly overexposed.
 """
 
 from __future__ import annotations
@@ -43,8 +41,8 @@ KNOWN_DISCOUNT = 0.75
 DARKEST = 0.15
 """Share of the mean brightness below which colour is ignored."""
 EDGE_AT = 0.6
-"""Position of a tool's edge between its own redness and that of the surroundings. Above 0.5 it
-removes more tissue rather than keep parts of a tool.
+"""Position of a tool's edge between its own redness and that of the surroundings. A value above 0.5 removes some tissue
+rather than keep parts of a tool.
 """
 GROWTH_PX = 4
 MARGIN_PX = 1
@@ -125,7 +123,7 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
     own = cv2.mean(view.redness, found)[0]
     seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
     around = cv2.dilate(seen, neighbourhood(9), dst=np.empty_like(seen))
-    # Nearer to the tool's own redness than to that of the surroundings.
+    # Include pixels nearer to the tool's own redness than to that of the surroundings.
     like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness, dst=around), (1 - EDGE_AT) * own)
     if not view.whole:
         like_tool &= view.inside
@@ -166,8 +164,8 @@ def _outline(view: Regions, grey: Bytes) -> Bytes:
 
 
 def _well_inside(inside: Bytes) -> Bytes:
-    """Return 1 where all pixels within a distance of three are in the field of view; beyond the
-    picture counts as inside.
+    """Return 1 where all pixels within a distance of three are in the field of view. Pixels beyond the picture's edge
+    count as inside.
     """
     return np.asarray(cv2.erode(inside, neighbourhood(7)), np.uint8)
 
@@ -326,7 +324,7 @@ def view_of(image: NDArray[np.uint8]) -> View:
     cv2.max(cv2.max(red, green, dst=brightness), blue, dst=brightness)
     inside = field_of_view(brightness)
     levels = cv2.calcHist([brightness], [0], inside, [256], [0, 256]).ravel().astype(np.float64)
-    # The ratio of channels is noise in dark regions; this offset pulls it to 0.
+    # The ratio of channels is noise in dark regions. This offset pulls it to 0.
     floor = max(3.0, 0.06 * mean_level(levels))
     # Halfway between the mean of the other channels, which is less noisy, and the smaller one,
     # which separates yellow from grey.
@@ -345,7 +343,7 @@ def field_of_view(brightness: Bytes) -> Bytes:
     around = cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     cv2.floodFill(around, None, (0, 0), 2)
     inside = cv2.threshold(around[1:-1, 1:-1], 1, 1, cv2.THRESH_BINARY_INV, dst=dark)[1]
-    # The outermost pixels mix with the black surround.
+    # Exclude the outermost pixels, which mix with the black surround.
     cv2.erode(inside, neighbourhood(3), dst=dark, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     return dark
 

@@ -41,7 +41,6 @@ ROTATION_TOLERANCE = 2e-3
 """Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
-"""Depth origins that are never metric."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 

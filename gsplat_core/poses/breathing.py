@@ -1,20 +1,13 @@
 """Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the tissue.
 
-The breathing and heart frequencies are searched for without a known trajectory. A test shows whether the scope's own
-motion can be separated from breathing at all.
-
-Test of whether the scope's own motion can be separated from breathing.
-
-The trajectory prior attributes to the tissue the part of a motion at the breathing frequency that a smooth trajectory
-does not have (`trajectory_prior`). At neighbouring frequencies, half a cycle per recording away, the tissue has no
-motion. Anything attributed to it there is scope motion, and an error of the same size is expected at the breathing
-frequency. A scope that moves nearly as fast as the tissue breathes shows at both neighbours.
-
-Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the points.
-
 Poses estimated for static tissue contain its breathing. This module searches for breathing and heart frequencies that
 explain the observations better. It then optimises cameras, points and periodic motion together (`moving_bundle`). A
-prior of the scope's trajectory (`trajectory_prior`) is re-estimated as the trajectory improves.
+prior of the scope's trajectory (`TrajectoryPrior`) is re-estimated as the trajectory improves.
+
+The prior attributes to the tissue the part of a motion at the breathing frequency that a smooth trajectory does not
+have. `separability` tests the result at neighbouring frequencies, half a cycle per recording away, where the tissue has
+no motion. Any motion attributed to the tissue there is scope motion. An error of the same size is expected at the
+breathing frequency. A scope that moves nearly as fast as the tissue breathes shows at both neighbours.
 
 There is no result if no frequency explains the observations clearly better, if the recording shows less than one and a
 half breaths, or if the scope itself moves nearly as fast as the tissue.
@@ -47,9 +40,9 @@ from gsplat_core.threads import one_thread
 
 BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
 LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5
-"""Breathing cycles that the recording must contain for a frequency to be accepted, and to be tried.
-A smooth scope trajectory explains less than `LEAST_CYCLES` equally well. Slower frequencies are
-still tried, because otherwise their double would win.
+"""Breathing cycles that the recording must contain for a frequency to be accepted, and to be tried. A smooth scope
+trajectory explains a motion of less than `LEAST_CYCLES` equally well. Slower frequencies are still tried, because
+otherwise twice their value would be selected.
 """
 STEP_CYCLES = 0.25
 """Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the heart."""
@@ -69,7 +62,7 @@ frequencies, because any extra frequency lowers the cost a little.
 
 @dataclass(frozen=True)
 class _Try:
-    """Result of adjusting the bundle with one set of frequencies."""
+    """Bundle adjusted with one set of frequencies, and its cost."""
 
     hz: tuple[float, ...]
     bundle: MovingBundle
@@ -184,8 +177,8 @@ def _changed(hz: tuple[float, ...], which: int, change: float) -> tuple[float, .
 BESIDE_CYCLES = 0.5
 """Distance of the neighbouring frequencies, in cycles over the recording."""
 CLEARLY = 2.0
-"""Smallest ratio of the motion attributed to the tissue to that at the neighbouring frequencies;
-below it poses may get worse.
+"""Smallest accepted ratio of the motion attributed to the tissue to that at the neighbouring frequencies. Below it the
+separated poses may be worse than the static ones.
 """
 
 
@@ -211,7 +204,9 @@ def separability(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[fl
 
 
 def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[float]) -> float:
-    """Return the root mean square motion at the first frequency beyond that of a trajectory like `like`."""
+    """Return the root mean square motion at the first frequency that a trajectory with the prior of `like` does not
+    explain.
+    """
     swings = waves(times_s, hz)
     prior = learned_from(like, times_s, swings)
     y, _ = coordinates(poses)
@@ -252,8 +247,8 @@ FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 40, 16
 SAMPLED = 0.4
 """Highest frequency searched, as a share of the frame rate."""
 LEAST_SHARED, PLACE_ROUNDS = 24, 10
-"""Observations of moving points that an intermediate frame needs to be placed by them, and the
-number of adjustment steps for it.
+"""Fewest observations of moving points for refining the pose of an intermediate frame, and the number of adjustment
+steps for it.
 """
 GOLDEN = 0.5 * (5**0.5 - 1)
 

@@ -1,19 +1,12 @@
 """Bundle adjustment of camera poses and static points by minimising the reprojection error.
 
-Contains the Levenberg-Marquardt iteration that all adjustments share, and a fast pose of a single camera from known static points.
+`adjust` uses Levenberg-Marquardt with Cauchy's robust weights. The points are eliminated by the Schur complement, so
+the linear system has six unknowns per camera (Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, sections
+4.2 to 6.1). The iteration, projection derivatives and segment sums are shared with `moving_bundle`.
 
-Levenberg-Marquardt iteration, projection derivatives and segment sums shared by the bundle adjustments.
-
-Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, section 4.2.
-
-Pose of a single camera from known static points, fast enough to run on every frame of a stream.
-
-Gauss-Newton with Cauchy's robust weights. The Cauchy scale follows the current median error, so a start that is off
-by many pixels converges as well as a good one. `bundle.adjust` solves the same problem for many cameras.
-
-Levenberg-Marquardt with Cauchy's robust weights. The points are eliminated by the Schur complement, so the linear
-system has six unknowns per camera. Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, sections 4.3 and
-6.1.
+`placed` estimates the pose of a single camera from known static points, fast enough for every frame of a stream. It
+uses Gauss-Newton with Cauchy's weights. The Cauchy scale follows the current median error, so a start that is off by
+many pixels converges as well as a good one.
 """
 
 from __future__ import annotations
@@ -115,7 +108,7 @@ def placed(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Ar
         The pose [4, 4] and the reprojection error of each point [N] in pixels.
     """
     left, pose = 0, pose.copy()
-    # Orthonormalise: rounding errors in products of poses accumulate from frame to frame.
+    # Orthonormalise, because rounding errors in products of poses accumulate from frame to frame.
     u, _, v = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = u @ v
     for _ in range(ROUNDS):

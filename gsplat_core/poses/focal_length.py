@@ -1,11 +1,9 @@
-"""Focal length of an uncalibrated moving scope, estimated from its pictures, with a range of uncertainty.
+"""Focal length of an uncalibrated moving scope, estimated from its pictures, with a range of plausible values.
 
-Focal length of an uncalibrated moving scope, estimated from its pictures, with a range of plausible values.
-
-Key frames are bundle-adjusted once for each of several focal lengths, and the one with the least robust error wins.
-The focal length is unobservable if the scope hardly turns, because a longer lens with a deeper scene gives the same
-pictures. The same holds if the tissue moves by itself. The error is then nearly constant over a wide range, and the
-focal length is reported as unknown.
+Key frames are bundle-adjusted once for each of several focal lengths. The focal length with the least robust error is
+selected. It is unobservable if the scope hardly turns, because a longer lens with a deeper scene gives the same
+pictures. It is also unobservable if the tissue moves by itself. The error is then nearly constant over a wide range,
+and the focal length is reported as unknown.
 """
 
 from __future__ import annotations
@@ -34,8 +32,8 @@ CANDIDATES = 8
 REFINEMENTS = 4
 """Focal lengths evaluated by the golden-section search, two per step."""
 NEARLY_AS_WELL = 0.01
-"""Relative increase of the error up to which a focal length is as plausible as the best one. Tissue
-motion changes the error by as much.
+"""Relative increase of the error up to which a focal length is as plausible as the best one. Tissue motion alone
+changes the error by this much.
 """
 WIDEST = 1.5
 """Largest ratio of the plausible range's ends for the focal length to count as known."""
@@ -127,7 +125,7 @@ def _search(start: Bundle, side_px: float) -> FocalLength:
     first = _Try(start, math.inf)
     focals = np.geomspace(SHORTEST * side_px, LONGEST * side_px, CANDIDATES)
     tries: dict[float, _Try] = {}
-    # Outwards from the assumed focal length; each adjustment starts from its neighbour's scene.
+    # Proceed outwards from the assumed focal length. Each adjustment starts from its neighbour's scene.
     for side in (focals[focals >= start.focal_px], focals[focals < start.focal_px][::-1]):
         near = first
         for focal_px in side:

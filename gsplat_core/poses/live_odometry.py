@@ -1,13 +1,13 @@
 """Visual odometry of a stream with bounded memory and time per frame.
 
 Tissue corners are tracked on reduced pictures (`stream_tracks`). Each frame's camera starts at the pose predicted by
-constant motion and is optimised until the points fit. A key frame is added once the pictures have moved far enough;
-its new corners get the depth of known ones around them. A few bundle adjustment steps over the newest key frames
-refine poses and points with every frame (`local_map`). As in `odometry`, the scene starts as a plane at `RELATIVE_DISTANCE`
-unless the first frame has depth.
+constant motion and is optimised until the points fit. A key frame is added once the pictures have moved far enough. Its
+new corners get the depth of the known corners around them. A few bundle adjustment steps over the newest key frames
+refine poses and points with every frame (`local_map`). As in `odometry`, the scene starts as a plane at
+`RELATIVE_DISTANCE` unless the first frame has depth.
 
-A returned pose is never revised. The tissue is assumed static, so global motion by breathing or the heart is part of
-the poses.
+A returned pose is never revised. The tissue is assumed static, so the poses include global motion by breathing or the
+heart.
 """
 
 from __future__ import annotations
@@ -89,29 +89,31 @@ FITTING = 0.4
 GIVEN_UP_PX = 8.0
 """Reprojection error in pixels above which a point is no longer tracked."""
 MOVED_PX = 16.0
-"""Median displacement of the points since the last key frame from which a new one is added, in pixels."""
+"""Median displacement of the points since the last key frame from which a new key frame is added, in pixels."""
 OFF_PX = 0.4
-"""Median reprojection error from which a key frame is added at the earliest `OFF_EVERY` frames
-after the last one, in pixels. A larger error means that the points' positions no longer fit.
+"""Median reprojection error in pixels from which a new key frame is added, but not within `OFF_EVERY` frames of the
+last one. Such an error means that the points' positions no longer fit.
 """
 OFF_EVERY = 5
 LEFT = 0.7
 """Share of the last key frame's points below which a new key frame is added."""
 ADJUSTED = 2
-"""Number of frames after a key frame in which the newest key frames are adjusted."""
+"""Number of frames after a key frame during which the newest key frames are adjusted."""
 FIRST_KEYS = 6
 """Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`."""
 FIRST_MOVED_PX = 0.5
 FOLLOWED_KEYS = 3
-"""Nearest earlier key frames whose points are searched at their predicted positions when a key frame is added."""
+"""Number of nearest earlier key frames whose points are searched at their predicted positions when a key frame is
+added.
+"""
 MATCHED_KEYS, NEAR_KEYS = 2, 12
-"""Key frames matched by features when a key frame is added. They are taken in turn from the
-`NEAR_KEYS` nearest ones and the key frames of earlier maps.
+"""Number of key frames matched by features when a key frame is added. The candidates, taken in rotation, are the
+`NEAR_KEYS` nearest key frames and the key frames of earlier maps.
 """
 MATCHED_WHEN_LOST = 5
-"""Key frames matched by features when a frame could not be placed."""
+"""Number of key frames matched by features when a frame could not be placed."""
 MOST_LEFT = 2
-"""Earlier maps whose key frames are kept for recognition."""
+"""Number of earlier maps whose key frames are kept for recognition."""
 CORRECTED_PX = 1.0
 """Median error of a recognised key frame's points from which the poses since then are corrected, in
 pixels. Bundle adjustment handles smaller errors.
@@ -270,7 +272,9 @@ class LiveOdometry:
         return None
 
     def _relocalise(self, picture: SmallPicture) -> bool:
-        """Relocalise a picture that could not be placed by the key frames of all kept maps. Returns True on success."""
+        """Find the pose of a picture that tracking could not place, by matching key frames of all kept maps. Returns
+        True on success.
+        """
         maps = [self.map, *self._left]
         found = self._recognition.find(
             picture, [(key, each) for each in maps for key in each.keys[::-1]], MATCHED_WHEN_LOST

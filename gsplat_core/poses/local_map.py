@@ -26,13 +26,13 @@ WINDOW = 12
 ANCHORS = 5
 """Number of earlier key frames sharing points with the window that are kept fixed."""
 MOST_KEY_FRAMES = 40
-"""Largest number of key frames. When it is exceeded, the one closest to another is removed."""
+"""Largest number of key frames. When it is exceeded, the key frame closest to another key frame is removed."""
 NEIGHBOURS = 5
-"""Known points around a new one whose median depth initialises it."""
+"""Number of known points around a new point whose median depth initialises it."""
 MOST_SIGHTINGS = 1500
-"""Budget of observations per adjustment: the number of steps is this divided by the observations of the window ..."""
+"""Budget of an adjustment. The number of steps is this value divided by the number of adjusted observations."""
 MOST_ROUNDS = 5
-"""... but at most this many steps."""
+"""Largest number of steps per adjustment, whatever the budget of observations."""
 
 
 @dataclass
@@ -139,8 +139,9 @@ class LocalMap:
         return [before[index] for index in order[:most]]
 
     def adjust(self) -> None:
-        """Run a few steps of bundle adjustment over the newest key frames. The earliest key frame is fixed. With fewer
-        than two anchors its median point depth is kept as well, because the scale is then free.
+        """Run a few steps of bundle adjustment over the newest key frames and their anchors. The anchors are fixed, or
+        the earliest key frame if there are none. With fewer than two anchors the scale is free, so the median point
+        depth of the earliest key frame is kept as well.
         """
         window = self.keys[-WINDOW:]
         anchors = self._anchors(window)

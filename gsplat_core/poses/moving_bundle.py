@@ -1,25 +1,18 @@
 """Bundle adjustment of cameras in front of periodically moving tissue.
 
-The trajectory has a prior: smooth, and without a component at the breathing and heart frequencies. Tissue motion is a
-smooth vector field over the surface.
+The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. Cameras, rest
+positions and vectors are estimated together by Levenberg-Marquardt with Cauchy weights, with rest positions eliminated
+(Schur complement). The unit of length is the tissue's median distance.
 
-Prior of a scope's trajectory: smooth, and without a component at the breathing and heart frequencies.
+The vectors vary smoothly over the surface and are given at nodes among its points (`SurfaceField`). Their prior is a
+Gaussian random field with a linear part, which includes rigid motion, and a local part with a correlation length
+(kriging with a linear trend).
 
-Pictures show the scope relative to the tissue. Rigid motion of both at a breathing frequency is ambiguous. It is
-resolved by modelling the trajectory as a Gaussian process with a Matérn kernel of order 7/2. The kernel's length and
-noise are learned from the trajectory by restricted maximum likelihood, excluding the component at the given
-frequencies. A trajectory without that component is then more likely. The remaining uncertainty decreases with the
-length of the recording.
-
-Smooth vector field over a tissue surface, given by vectors at nodes among its points.
-
-The prior is a Gaussian random field with a linear part, which includes rigid motion, and a local part with a
-correlation length (kriging with a linear trend). Lengths are in units of the tissue's distance.
-
-The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. The vectors vary
-smoothly over the surface. Cameras, rest positions and vectors are estimated together by Levenberg-Marquardt with Cauchy
-weights, with rest positions eliminated (Schur complement). Rigid motion common to tissue and scope is unobservable from
-pictures; the trajectory prior decides it. The unit of length is the tissue's median distance.
+Pictures show the scope relative to the tissue, so rigid motion common to both at a breathing frequency is ambiguous.
+The prior of the trajectory resolves it (`TrajectoryPrior`). The trajectory is a Gaussian process with a Matérn kernel
+of order 7/2. The kernel's length and noise are learned from the trajectory by restricted maximum likelihood, excluding
+the component at the given frequencies. A trajectory without that component is then more likely. The remaining
+uncertainty decreases with the length of the recording.
 """
 
 from __future__ import annotations
@@ -212,7 +205,7 @@ def _spread(points: Tensor, middle: Tensor, most: int) -> Tensor:
 
 
 SIGMA = 0.002
-"""Standard deviation of a ray (x / z). It corresponds to 0.6 pixels at a width of 320 and includes
+"""Standard deviation of an observed ray (x / z). It corresponds to 0.6 pixels at a picture width of 320 and includes
 the correlation of errors over time.
 """
 RELIEF = 0.3
@@ -220,7 +213,7 @@ RELIEF = 0.3
 NEAREST = 0.05
 """Smallest depth used in projections, in units of the median depth."""
 HELD = 1e3
-"""Stiffness that holds the tissue's common rigid motion constant when there is no trajectory prior."""
+"""Stiffness with which the tissue's common rigid motion is held constant if there is no trajectory prior."""
 
 
 @dataclass(frozen=True)
@@ -310,7 +303,7 @@ def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Places:
-    """Blocks of the normal equations needed to eliminate the rest positions."""
+    """Blocks of the normal equations for eliminating the rest positions."""
 
     inverse: Tensor
     """Inverse blocks of the rest positions, [P, 3, 3]."""

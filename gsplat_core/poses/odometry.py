@@ -37,10 +37,10 @@ LEAST_POINTS = 24
 """Fewest known points that a frame must observe to be placed."""
 MOST_FRAMES = 3000
 KEY_FRAMES = 60
-"""Number of key frames of a short recording; longer ones have at least one in `FARTHEST_APART` frames."""
+"""Number of key frames of a short recording. Longer recordings have at least one in `FARTHEST_APART` frames."""
 FARTHEST_APART = 10
 NEIGHBOURS = 5
-"""Known points around a new one whose median depth initialises it."""
+"""Number of known points around a new point whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
 GROWTH = 1.3
 """Growth factor of the number of key frames from one bundle adjustment to the next."""
@@ -53,8 +53,8 @@ class Breathing:
     frequencies_hz: tuple[float, ...]
     """Breathing frequency, or breathing and heart frequencies."""
     uncertain: float
-    """Root mean square of the motion that may be attributed to the wrong one of scope and tissue,
-    in the trajectory's unit.
+    """Root mean square of the motion in the trajectory's unit that may be attributed wrongly, to the scope instead of
+    the tissue or vice versa.
     """
 
 

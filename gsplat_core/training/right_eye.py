@@ -1,9 +1,8 @@
-"""Observations of a stereo scope's right eye: camera pose, colour matching by a gain and an offset per channel, and tissue mask.
-
-Colour matching of a stereo scope's eyes: a gain and an offset per channel, applied to the right picture.
+"""Observations of a stereo scope's right eye: camera pose, colour matching and tissue mask.
 
 Sensors and light paths differ slightly between the eyes, and the difference changes slowly. Without correction the
-two pictures would pull every colour back and forth.
+two pictures would pull every colour back and forth. A gain and an offset per channel are therefore applied to the
+right picture.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from gsplat_core.training.observations import Observation, RightEye, scene_colou
 from gsplat_core.transfers import tensor_of
 
 LOOKED_AT_PX = 80
-"""Width of the compared pictures in pixels."""
+"""Width in pixels of the reduced pictures that are compared."""
 LOOK_EVERY = 10
 """Number of frames between comparisons."""
 FOLLOWS = 0.2
@@ -41,9 +40,9 @@ SHIFT_STAYS = 4
 LEAST_OVERLAP = 0.4
 """Smallest overlap of the two views, as a share of the width."""
 QUANTILES = (10, 50, 90)
-"""Compared quantiles in per cent; highlights and shadows, which differ between the eyes, are outside."""
+"""Compared quantiles in per cent. Highlights and shadows, which differ between the eyes, are outside their range."""
 FLAT_LEVELS = 8.0
-"""Distance of the outer quantiles in levels below which a channel gives no gain."""
+"""Difference of the outer quantiles in levels below which no gain is estimated for a channel."""
 MOST_GAIN = 2.0
 NOISE_LEVELS = 1.5
 """Largest change of a quantile in levels that counts as estimation noise; such a correction is not applied."""
@@ -124,7 +123,7 @@ def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: i
     a, b = left.astype(np.float64), right.astype(np.float64)
     height, width = a.shape
     shifts = np.arange(-most, most + 1)
-    # Products of all column pairs; overlapping columns of one shift are on one diagonal.
+    # The matrix contains the products of all column pairs. The overlapping columns of one shift are on one diagonal.
     products = a.T @ b
     together = np.array([np.trace(products, offset=-shift) for shift in shifts])
     begins = np.maximum(shifts, 0), np.maximum(-shifts, 0)
@@ -229,7 +228,7 @@ class BothEyes:
         """Return a function that yields the prepared right picture. For a GPU the preparation
         starts at once in another thread.
         """
-        colours = self._colours  # of this stream, even if another one starts meanwhile
+        colours = self._colours  # kept for this frame, because `forget` may replace it before the thread runs
         if self._preparer is None:
             return lambda: self._prepare(frame, camera, right, colours)
         return self._preparer.submit(self._prepare, frame, camera, right, colours).result
@@ -301,7 +300,7 @@ def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -
     hidden |= _smeared(
         tool & ~known, sorted((FARTHEST * shift_px * columns / width, NEAREST * shift_px * columns / width))
     )
-    # Dilate by a cell, since narrow parts may fall between cells and masks end slightly early.
+    # Dilate by a cell, because narrow parts of a tool may fall between cells and masks end slightly early.
     hidden = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
     return np.asarray(cv2.resize(1 - hidden, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
 

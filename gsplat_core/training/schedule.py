@@ -1,7 +1,7 @@
 """Distribution of training steps over the newest frame and the frames before it.
 
-`WindowSchedule` mixes both within the budget of a frame. `NewestFirstSchedule` spends the budget on the newest frame alone and rehearses earlier frames
-afterwards, while a live stream waits for its next frame.
+`WindowSchedule` mixes both within the budget of a frame. `NewestFirstSchedule` spends the budget on the newest frame
+alone. It rehearses earlier frames afterwards, while a live stream waits for its next frame.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ REHEARSED_CORRECTION = 0.5
 neighbouring times, which are corrected themselves.
 """
 DEPTH_EVERY = 4
-"""On a GPU, every n-th rehearsal step compares depth if its frame has it, and trains colours
-instead of correcting them. The right eye has odd numbers, so these steps are on the left eye. Steps
-of `observe` never compare depth, because their last changes are displayed.
+"""On a GPU, every n-th rehearsal step compares depth if its frame has it, and trains colours instead of correcting
+them. Right-eye steps have odd numbers, so the depth steps train the left eye. Steps of `observe` never compare depth,
+because the displayed picture shows their last changes.
 """
 
 
@@ -100,7 +100,7 @@ class Schedule(ABC):
         """Usual duration of a step in seconds; None if unknown."""
         self._in_flight = StepsInFlight(device)
         self._unsettled: Observation | None = None
-        """Frame whose steps are queued and not yet checked for overflow of the tile lists."""
+        """Observation whose steps are queued and not yet checked for overflow of the tile lists."""
 
     @abstractmethod
     def train(
@@ -124,7 +124,7 @@ class Schedule(ABC):
 
     @abstractmethod
     def forget(self) -> None:
-        """Prepare for another scene. The step time stays known."""
+        """Prepare for another scene. The estimated step time is kept."""
 
     def settle(self, step: TrainingStep | None) -> None:
         """Wait for the queued steps and repeat those that overflowed the tile lists."""
@@ -169,8 +169,8 @@ class WindowSchedule(Schedule):
         if first_loss is None:
             return ObserveReport(observation.seq, 0, None, step.gaussians.count, spending.ending)
         extra = 0
-        # Read the loss only now, so that the host does not wait for a GPU before its queue is
-        # filled.
+        # Read the loss only after all steps are queued. The host would otherwise wait with an empty GPU
+        # queue.
         if not budget.is_timed and self._is_jump(first_loss, first):
             extra = spending.made * JUMP_EXTRA
         for turn in range(extra):
@@ -212,7 +212,11 @@ class NewestFirstSchedule(Schedule):
     """
 
     def __init__(self, live: LiveTraining, config: ReconstructorConfig, device: torch.device) -> None:
-        """Raise InvalidSetting if `live` asks for a correction of colours that `config` does not allow."""
+        """Create the schedule.
+
+        Raises:
+            InvalidSetting: if `live` requests colour correction that `config` does not allow.
+        """
         super().__init__(device)
         check_colours(live.colour_relaxation, config, device)
         self._live = live

@@ -2,8 +2,8 @@
 
 Adam moves every parameter by about its learning rate even if pictures hardly constrain it. Unconstrained parameters
 therefore drift. Thin Gaussians become needles, opacities and colours diverge, quaternions grow, depths spread along the
-line of sight of a static camera, and Gaussians that drift off the tissue never return. The tissue then gets holes,
-which new Gaussians fill until the capacity is exhausted and the quality falls.
+line of sight of a static camera, and Gaussians that drift off the tissue never return. The tissue then gets holes. New
+Gaussians fill the holes until the capacity is exhausted and the quality falls.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ WIDEST = 8.0
 MOST_SPLIT = 0.02
 """Share of the Gaussians split in one round."""
 SURFACE_STEPS = 100_000
-"""Time constant in steps with which depths relax to those around them; long, because the order
-along a line of sight is also learned.
+"""Time constant in steps with which depths relax to those of the Gaussians around. It is long, because training also
+learns the order along a line of sight.
 """
 SURFACE_CELL = 2.0
 """Side of the cells with averaged depth, in default spacings of Gaussians."""
@@ -163,8 +163,10 @@ class Upkeep:
         return torch.where(seen.shown, factor, 1.0)
 
     def _useless(self, step: TrainingStep, seen: Seen) -> Tensor:
-        """Return which idle Gaussians can be removed, bool [N]: those outside the picture if the camera never moved,
-        and all but one per grid cell inside, since a tool that hides them may leave.
+        """Return which idle Gaussians can be removed, bool [N].
+
+        Inside the picture, these are all but one per grid cell, since a tool that hides them may leave. Outside the
+        picture, these are all if the camera never moved, otherwise none.
         """
         idle = step.idle(IDLE)
         inside = idle & seen.inside
@@ -223,7 +225,7 @@ class PostponedGrowth:
         elif before != camera and has_moved(camera, before, step.distance(camera)):
             self._camera_before = camera
             fill_new_tissue(step, frame, observation, before, self._config, self._out_of_view)
-        # After the scene was moved by the flow, a revealed edge contains nothing to train.
+        # The flow moved the scene away from a revealed edge, so training has no Gaussians there.
         if motion.has_revealed(REVEALED_SHARE * camera.width_px):
             self._cover(step, frame, observation, motion)
 
@@ -253,7 +255,7 @@ def _repeated(cells: Tensor, counted: Tensor) -> Tensor:
     """Mark the `counted` elements whose integer cell [N, 2] occurs earlier, bool [N]."""
     count = len(cells)
     number = cells[:, 1].double() * 2**20 + cells[:, 0].double()
-    # Give each of the others a unique cell.
+    # Give every uncounted element a unique cell.
     number = torch.where(counted, number, -1.0 - torch.arange(count, device=cells.device))
     ordered, order = number.sort(stable=True)
     marks = torch.zeros(count, dtype=torch.bool, device=cells.device)

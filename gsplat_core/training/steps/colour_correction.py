@@ -1,15 +1,10 @@
 """Corrections of colours with fixed geometry.
 
-A live stream corrects colours from the residual of a picture by SIRT (Gilbert 1972). `fit_colours` solves the least-squares problem; blending is linear in
-the colours.
-
-Correction of colours from the residual of a picture by SIRT (Gilbert 1972), an iteration from tomography without a
-learning rate.
-
-A picture is linear in the colours of its splats: I_p = sum_k w_kp c_k, with blending weights w. Each colour moves by
-the weighted mean of the residual over the pixels that show it. The weights of a pixel sum to at most 1, so the
-squared error never grows for a relaxation up to 2. Low-frequency residuals vanish in the first step, and colours
-without residual do not move.
+A picture is linear in the colours of its splats: I_p = sum_k w_kp c_k, with blending weights w. A live stream corrects
+colours from the residual of a picture by SIRT (Gilbert 1972), an iteration from tomography without a learning rate.
+Each colour moves by the weighted mean of the residual over the pixels that show it. The weights of a pixel sum to at
+most 1, so the squared error never grows for a relaxation up to 2. Low-frequency residuals vanish in the first step, and
+colours without residual do not move. `colour_change` repeats the iteration to fit a whole picture.
 """
 
 from __future__ import annotations
@@ -28,7 +23,7 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 
 MOST_RELAXATION = 2.0
-"""Upper bound of the relaxation; from here on the iteration need not converge."""
+"""Upper bound of the relaxation. The iteration need not converge at or above it."""
 LEAST_WEIGHT_PX = 0.3
 """Offset added to a splat's weight in pixels, so that barely visible splats take little of the residual."""
 
@@ -57,7 +52,7 @@ class ResidualTarget:
         shape = (*image.shape[:2], 4)
         self._wanted = torch.zeros(shape, device=image.device)
         self._tissue = torch.zeros(shape, device=image.device)
-        """Mask three times, then 0."""
+        """Weights [H, W, 4]: the tissue mask in the three colour channels, 0 in the depth channel."""
 
     def take(self, image: Tensor, mask: Tensor) -> None:
         """Queue the copy of the next observation: uint8 picture [H, W, 3] and mask [H, W]."""
@@ -87,7 +82,7 @@ def check_colours(relaxation: float, config: ReconstructorConfig, device: torch.
 
 
 LEAST_WEIGHT = 1e-6
-"""Smallest weight of a Gaussian in the picture, in pixels; invisible ones have no gradient either."""
+"""Smallest sum of blending weights in pixels; avoids a division by zero for invisible Gaussians."""
 
 
 def colour_change(gaussians: Gaussians, camera: Camera, picture: Tensor, counts: Tensor, steps: int) -> Tensor:

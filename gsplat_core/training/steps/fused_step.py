@@ -45,7 +45,9 @@ class StepInputs:
         self._corrects = False
 
     def take(self, observation: Observation, corrects: bool) -> None:
-        """Queue the copy of an observation for a step with or without colour correction; skipped if it is already here."""
+        """Queue the copy of an observation for a step with or without colour correction. An unchanged observation is
+        not copied again.
+        """
         if corrects and self.target is None:
             self.target = ResidualTarget(self.image)
         if observation is self._taken and corrects == self._corrects:
@@ -82,7 +84,9 @@ class FusedStep:
         self._weights = weights
         self._camera = camera
         self._inputs = {False: StepInputs(camera, device, with_depth=weights.depth > 0)}
-        """Graph inputs by whether they belong to the right eye, so alternating eyes are each copied once."""
+        """Graph inputs by whether they belong to the right eye. Separate inputs save repeated copies when the eyes
+        alternate.
+        """
         self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
         """Controls that include the learning rates of the Gaussians in the backward pass, of
         positions after it, and of the field, followed by the colour relaxation.
@@ -97,8 +101,8 @@ class FusedStep:
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
         self._captured: dict[tuple[bool, bool], CapturedSequence[Tensor]] = {}
-        """Graphs by whether colours are corrected and whether they are the right eye's. They share memory, which is
-        safe because they never run concurrently and read nothing from each other's buffers.
+        """Graphs by whether colours are corrected and whether they train the right eye. The graphs share memory. This
+        is safe because they never run concurrently and no graph reads another one's buffers.
         """
         self._warm: set[tuple[bool, bool]] = set()
         self._of_right = False
@@ -137,11 +141,11 @@ class FusedStep:
         self._gaussians = gaussians
         self._adam.steps += 1
         kind = corrects, self._of_right
-        if kind not in self._warm:  # the first launch loads kernels, which is impossible during a capture
+        if kind not in self._warm:  # The first launch loads kernels, which is impossible during a capture.
             self._warm.add(kind)
             return self._sequence()
         if self._was_replaced():
-            self._captured.clear()  # their memory is reused by the next captures
+            self._captured.clear()  # frees their memory for the next captures
         if kind not in self._captured:
             self._captured[kind] = CapturedSequence(self._sequence, self._step.device, self._memory, warm_up=False)
         return self._captured[kind].replay().clone()
@@ -206,7 +210,7 @@ class FusedStep:
         if correction is not None:
             change = gradient[:, COLOUR].clone()
         if right_sh is not None:
-            right_sh.copy_(seen.sh - scene.sh)  # with what Adam added
+            right_sh.copy_(seen.sh - scene.sh)  # store Adam's update as the right eye's difference
         if correction is not None or right_sh is not None:
             gradient[:, COLOUR].zero_()
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)

@@ -171,8 +171,8 @@ class FusedAdam:
     def append(self, count: int, *, usual: bool = False) -> None:
         """Append rows that share the step count.
 
-        With zero moments their first steps are 3 to 6 times as large as usual, increasing with the
-        step count. With `usual`, their second moments are the mean of the others.
+        With zero moments, the first steps of new rows are 3 to 6 times as large as usual, increasing with the step
+        count. With `usual`, their second moments are the mean of the other rows.
         """
         self._need_rows()
         if count < 0:

@@ -1,10 +1,8 @@
-"""Loss of a rendered frame and its gradient at the Gaussians, computed directly by ops without autograd, and the assignment of colour gradients to the eyes.
+"""Loss of a rendered frame and its gradient at the Gaussians, computed directly by ops without autograd.
 
-Assignment of colour gradients to the eyes of a stereo scope.
-
-Both eyes train the geometry. Each eye's colours are trained by its own pictures only, because view-dependent
-differences such as highlights would otherwise pull every colour back and forth. Temporal colour changes are learned
-from the left eye and apply to both.
+Both eyes of a stereo scope train the geometry. Each eye's colours are trained by its own pictures only, because
+view-dependent differences such as highlights would otherwise pull every colour back and forth. Temporal colour changes
+are learned from the left eye and apply to both.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.colour_correction import colour_correction
 
 LEFT, RIGHT = "sh", "right_sh"
-"""Tensor names in `Gaussians`. The right eye sees the sum of both."""
+"""Tensor names of the eyes' colours in `Gaussians`. The right eye sees the sum of both."""
 
 
 def with_eye(gradients: Mapping[str, Tensor], of_right: bool) -> dict[str, Tensor]:

@@ -22,8 +22,8 @@ from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, los
 
 
 class AutogradTraining:
-    """Backpropagates gradients at the deformed Gaussians through `field.forward` to the field's
-    parameters and the canonical Gaussians.
+    """Trainer of any deformation field by autograd. It backpropagates gradients at the deformed Gaussians through
+    `field.forward` to the field's parameters and the canonical Gaussians.
 
     Works for every field on every device. Parameters may be replaced by larger ones when Gaussians
     are added; moments of existing rows are kept.
