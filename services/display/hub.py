@@ -87,11 +87,11 @@ def dimmed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 SLOW = "slow client"
 DEAD_S = 30.0
-"""Seconds without a taken picture after which a viewer is dropped."""
+"""Seconds after which a viewer that takes no picture is disconnected."""
 
 
 class Viewer(AsyncIterator[EncodedPicture]):
-    """Iterator over the newest picture at each step. Skipped pictures are counted.
+    """Iterator of one viewer; each step waits for a picture and returns the newest. Skipped pictures are counted.
 
     async with hub.subscribe("shown") as viewer:
         async for picture in viewer: ...
@@ -105,7 +105,7 @@ class Viewer(AsyncIterator[EncodedPicture]):
         self._closed = False
         self._taken_s = asyncio.get_running_loop().time()
         self.given = 0
-        """PictureKind taken by the viewer."""
+        """Number of pictures that the viewer has taken."""
 
     def offer(self, picture: EncodedPicture) -> None:
         """Replace the pending picture by the newest one."""
@@ -154,15 +154,15 @@ KINDS: tuple[PictureKind, ...] = ("raw", "shown", *LAYERS)
 """Picture kinds; each has a socket of the same name."""
 QUALITY = 80
 STALE_S, FROZEN_S = 0.5, 1.0
-"""Seconds without pictures after which the process counts as dead. The last picture is repeated
-dimmed, first once and then periodically with its age."""
+"""Seconds without a picture from the stream process. After `STALE_S` the hub repeats the last picture dimmed; after
+`FROZEN_S` it repeats it periodically with its current age."""
 LAYER_STALE_S, LAYER_FROZEN_S = 1.5, 3.0
-"""Like STALE_S and FROZEN_S, for layers that are drawn at low priority."""
+"""`STALE_S` and `FROZEN_S` of layer pictures, which the engine draws at low priority."""
 REPEAT_S = 1.0
 
 
 class DisplayHub:
-    """Viewers of one stream, in an event loop. `counts` has encoded and dropped pictures by reason."""
+    """Distributor of one stream's pictures to its viewers. For use in one event loop."""
 
     def __init__(self, folder: StreamFolder) -> None:
         self._folder = folder
@@ -187,12 +187,12 @@ class DisplayHub:
         return 0 if channel is None else len(channel.viewers)
 
     def counts(self, kind: PictureKind) -> dict[str, int]:
-        """Return the number of `encoded` pictures, and of pictures that viewers missed, by reason."""
+        """Return the number of pictures `encoded`, and of pictures dropped for viewers, by reason."""
         channel = self._channels.get(kind)
         return {} if channel is None else dict(channel.counts)
 
     def ages(self, kind: PictureKind) -> Mapping[str, Any]:
-        """Return the distribution of picture ages at encoding, since frame arrival."""
+        """Return the histogram of picture ages (time from frame arrival to encoding) as JSON values."""
         channel = self._channels.get(kind)
         return {} if channel is None else channel.ages.as_json()
 

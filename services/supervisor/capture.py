@@ -40,15 +40,15 @@ from services.supervisor.worker import ProcessSpec, SourceSpec, Worker
 LOOK_MS = 50
 ASK_AGAIN_S = 0.1
 SILENT_S = 1.0
-"""Seconds without a heartbeat after which the capture process counts as gone or hung."""
+"""Seconds without a heartbeat after which the engine treats the capture process as ended or hung."""
 WAITING = 4
 
 
 class CapturedSource(LiveSource):
     """Live source that receives frames from a capture process, with their arrival times there.
 
-    The source never ends. While the capture process or its source gives no frames, `state` and
-    `state_sentence` report that. Numbering and timestamps continue after a reconnect.
+    The source never ends. While no frames arrive, `state` and `state_sentence` report the cause in the capture process
+    or its source. Sequence numbers and timestamps continue after a reconnect.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class CapturedSource(LiveSource):
                 socket.close(0)
 
     def _begin_anew(self) -> None:
-        """Restart frame numbering, because the next frame is from another capture process or source connection."""
+        """Prepare for a frame with new numbering, from another capture process or source connection."""
         if self._order is not None:
             self._order.restart()
 
@@ -141,7 +141,7 @@ class CapturedSource(LiveSource):
             return None
 
     def _note(self, data: bytes) -> None:
-        """Evaluate a heartbeat of the capture process."""
+        """Update the reported source state from a heartbeat of the capture process."""
         try:
             said = parsed_json(data)
         except BadMessage:
@@ -152,7 +152,7 @@ class CapturedSource(LiveSource):
         if state == "live":
             self._reported = None
         elif state == SourceState.ENDED.value:
-            # reported as stalled, because a played recording may start again
+            # An ended source is reported as stalled, because a played recording may start again.
             self._reported = SourceState.STALLED, reason
         elif state == SourceState.STALLED.value:
             self._reported = SourceState.STALLED, reason
@@ -176,14 +176,14 @@ LOOK_S = 0.1
 
 
 class Capture:
-    """Reader of the source that publishes its frames and reopens the source after errors."""
+    """Reads the source, publishes its frames, and reopens the source after errors."""
 
     def __init__(self, spec: SourceSpec) -> None:
         self.spec = spec
         self._lock = threading.Lock()
         self._source: FrameSource | None = None
         self._run = time.time_ns()
-        """Run id in the frame headers; a change tells readers that sequence numbers and timestamps restart."""
+        """Run id in the frame headers. Readers detect by a new id that sequence numbers and timestamps restart."""
         self.frames = 0
         self._last_ns: int | None = None
 
@@ -206,10 +206,10 @@ class Capture:
         return {"frames": self.frames, "last_frame_ns": self._last_ns, "counts": counts}
 
     def publish(self, worker: Worker, publisher: PicturePublisher) -> None:
-        """Publish frames until the process is asked to stop.
+        """Publish frames until a stop of the process is requested.
 
         Raises:
-            UserError: if the address can never work.
+            UserError: if the address is invalid, so that reopening cannot succeed.
         """
         backoff = Backoff()
         while not worker.stop_requested():
@@ -272,7 +272,7 @@ def _sentence(source: FrameSource) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until asked to stop.
+    """Run the capture process until a stop is requested.
 
     Returns:
         The exit code.

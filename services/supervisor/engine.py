@@ -1,6 +1,7 @@
 """Engine process of a stream, `python -m services.supervisor.engine --spec FILE [--again]`.
 
-It works at a size relative to the stream's pictures, reports the figures of its graph, and writes snapshots of its model on command.
+The engine reconstructs the stream at full or reduced size, reports counters and latencies in its heartbeats, and writes
+snapshots of its model on command.
 """
 
 from __future__ import annotations
@@ -60,13 +61,13 @@ def engine_scale(
 ) -> float:
     """Return the scale of a stream's pictures for reconstruction.
 
-    An engine on a CPU without `engine_scale` measures once which size keeps up with the stream. A
-    restarted engine reuses the stored result, to show its first picture sooner.
+    Without the option `engine_scale`, an engine on a CPU measures once the largest size that keeps up with the stream.
+    A restarted engine reads the stored result, to show its first picture sooner.
 
     Args:
         spec: engine part of the stream specification.
         about: description of the stream's pictures.
-        kept: file for the measured size. An invalid file is overwritten.
+        kept: file that stores the measured size. An invalid file is overwritten.
         measure: returns the largest size that needs at most the given share of the frame interval.
     """
     if spec.engine_scale is not None:
@@ -81,15 +82,15 @@ def engine_scale(
         if found["size"] == size and scale <= 1:
             return scale
     except (OSError, BadMessage, UserError, KeyError, TypeError, ValueError):
-        pass  # nothing measured yet, or damaged file: measure again
+        pass  # no stored size, or a damaged file: measure
     chosen = measure(about, SHARE_OF_INTERVAL)
     write_json(kept, {"size": size, "scale": chosen.scale, "frame_ms": round(1e3 * chosen.frame_s, 1)})
     return chosen.scale
 
 
 def scene_of(shown: ShownPicture, newest: Model | Snapshot | None) -> LayerScene | None:
-    """Return the scene of a live picture with the newest model. None if the sizes differ, because
-    another scene has begun."""
+    """Return the scene for drawing layers: the newest model at the live picture's time and camera. None
+    without a model, or if model and picture differ in size because a new scene has begun."""
     rendered = shown.rendered
     frame = rendered.frame
     if newest is None or (newest.camera.width_px, newest.camera.height_px) != (frame.width_px, frame.height_px):
@@ -119,11 +120,11 @@ def _serialised(histogram: Histogram) -> dict[str, Any]:
 
 
 WAIT_S = 5.0
-"""Seconds to wait for the end of a frame."""
+"""Seconds that a snapshot waits for training on the next frame."""
 
 
 class LiveSnapshots:
-    """Writer for the model of the running reconstruction.
+    """Handler of the command `snapshot`: writes the model of the running reconstruction.
 
     Snapshots do not delay pictures. The model is copied after a frame's picture is published, and
     written in the command thread in pieces, so that other threads can run.
@@ -135,7 +136,7 @@ class LiveSnapshots:
 
     @contextmanager
     def of(self, graph: Pipeline) -> Iterator[None]:
-        """Register the running reconstruction while the block runs."""
+        """Use `graph` as the running reconstruction while the block runs."""
         self._graph = graph
         try:
             yield
@@ -173,7 +174,7 @@ class LiveSnapshots:
         }
 
     def _asked(self, running: ReconstructOp) -> tuple[Model, int, int]:
-        """Request the model after the next frame.
+        """Request the model that the next frame is trained into, and copy it.
 
         The GPU snapshot is released here, because training needs another slot while one is held.
 
@@ -208,7 +209,7 @@ class LiveSnapshots:
 
 
 LOOK_S = 0.05
-"""Seconds between checks for a switch back to the live reconstruction."""
+"""Seconds between two checks for a switch back to the live reconstruction, while a finished model is displayed."""
 
 
 def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
@@ -242,7 +243,7 @@ def started(settings: LiveSettings, source: CapturedSource, again: bool) -> Live
 def reconstruct(
     worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, snapshots: LiveSnapshots, *, again: bool
 ) -> None:
-    """Reconstruct live until the process is asked to stop or to show a finished model.
+    """Reconstruct live until a stop or the display of a finished model is requested.
 
     Raises:
         UserError: if the configuration cannot work.
@@ -286,7 +287,7 @@ def reconstruct(
 
 
 def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again: bool) -> None:
-    """Alternate between the live reconstruction and finished models until the process is asked to stop."""
+    """Run the live reconstruction, or wait while a finished model is displayed, until a stop is requested."""
     check_device(spec.device)
     check_renderer(spec.renderer, spec.device)
     models = ModelShow(worker, spec, screen, layers)
@@ -313,7 +314,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
 
 
 def graph_figures(graph: Pipeline) -> dict[str, object]:
-    """Return the counters of a graph by name; empty before the graph runs."""
+    """Return frame, picture and drop counters of a graph by name; empty before the graph runs."""
     if getattr(graph, "metrics", None) is None:
         return {}
     counts = graph.reconstruct.counts
@@ -331,7 +332,7 @@ def graph_figures(graph: Pipeline) -> dict[str, object]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until asked to stop.
+    """Run the engine process until a stop is requested.
 
     Returns:
         The exit code.

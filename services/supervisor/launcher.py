@@ -37,7 +37,7 @@ from services.supervisor.worker import ORPHAN_DRAIN_S, Parent, identity_of
 FINISHED = 0
 FAILED = 1
 NO_USE = 2
-"""The request cannot be fulfilled; a restart would fail in the same way."""
+"""Exit code of a process with an invalid specification or configuration; a restart would fail in the same way."""
 _TAIL_BYTES = 4096
 _LOGGED = re.compile(r"[\d-]+ [\d:,]+ (?P<level>[A-Z]+) [\w.]+: ")
 """Log line prefix of the stream processes."""
@@ -61,12 +61,12 @@ def status_of_child(pid: int) -> str | None:
 
 
 def is_of_no_use(how: str | None) -> bool:
-    """Return True if a restart would end in the same way."""
+    """Return True if a process ended with `NO_USE`, so that a restart would fail in the same way."""
     return how == f"exit code {NO_USE}"
 
 
 def cause_of(how: str) -> str:
-    """Map the description of an end to one of few causes, for metric labels."""
+    """Reduce the description of a process's end to one of a few causes, for metric labels."""
     if how.endswith("it was killed"):
         return "hung"
     if how.startswith("killed by "):
@@ -77,7 +77,7 @@ def cause_of(how: str) -> str:
 
 
 def last_words(log: Path) -> str:
-    """Return the last logged error of a process, otherwise its last log line; empty without a log."""
+    """Return the last error in a process's log, or its last line if it has no error; empty without a log."""
     try:
         with open(log, "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
@@ -97,8 +97,8 @@ SOCKET, RECORD = "launcher", "launcher.json"
 FORKED = ("services.supervisor.capture", "services.supervisor.engine")
 """Modules that the launcher can fork."""
 LOADS_LONG = ("services.supervisor.engine",)
-"""Modules that take as long to import as the launcher itself. Waiting for a starting launcher is no
-slower than importing twice at once."""
+"""Modules that import as long as the launcher itself. Their start waits for a launcher that is still loading, which
+is no slower than a second import at the same time."""
 LOADING_S = 60.0
 ANSWER_S = 5.0
 LOOK_S = 0.05
@@ -185,7 +185,7 @@ class ByLauncher:
         self._own_pid: int | None = None
         self._keeping: asyncio.Task[None] | None = None
         self.ready = asyncio.Event()
-        """Set while the launcher accepts requests."""
+        """Event that is set while the launcher accepts requests."""
 
     def open(self) -> None:
         """Adopt the launcher of the runtime folder or start one. No effect if already open."""
@@ -252,7 +252,8 @@ class ByLauncher:
         return how
 
     async def _is_there(self, module: str) -> bool:
-        """Return True if the launcher is ready; for slow modules wait until it has loaded."""
+        """Return True if the launcher accepts requests. For a module in `LOADS_LONG`, wait up to `LOADING_S` for it
+        first."""
         if not self.ready.is_set() and self._keeping is not None and module in LOADS_LONG:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self.ready.wait(), LOADING_S)
@@ -332,14 +333,14 @@ LOADED = (
 """Source modules that capture processes are likely to import."""
 LAUNCHER_LOOK_S = 0.2
 REQUEST_S = 1.0
-"""Timeout for reading a request, in seconds."""
+"""Timeout in seconds for reading a request and sending its answer."""
 MOST_REMEMBERED = 256
 """Exit statuses kept for processes whose status was not queried yet."""
 
 
 class Launcher:
-    """Server on the launcher's socket. Ends on `stop`, when its supervisor has died, or when the
-    socket file is removed. An orphan ends its children, too."""
+    """Server on the launcher's socket. It ends on `stop`, when its supervisor has died, or when its socket file is
+    removed. After the supervisor's death it also ends its children."""
 
     def __init__(self, path: Path, parent: Parent) -> None:
         self._path, self._parent = path, parent
@@ -356,7 +357,7 @@ class Launcher:
         self._stopped = True
 
     def serve(self) -> None:
-        """Answer requests until the end."""
+        """Answer requests until `stop`, the supervisor's death or the removal of the socket file."""
         while not self._stopped:
             self._reap()
             if self._parent.lost(time.monotonic()):
@@ -410,7 +411,7 @@ class Launcher:
             os.close(output)
 
     def _end_children(self) -> None:
-        """Wait for the children, which end themselves as orphans, and kill those that hang."""
+        """Wait for the child processes, which end after the supervisor's death, and kill those that hang."""
         until_s = time.monotonic() + ORPHAN_DRAIN_S + LAUNCHER_LOOK_S
         while self._children and time.monotonic() < until_s:
             time.sleep(LOOK_S)
@@ -453,7 +454,7 @@ def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until asked to stop.
+    """Run the launcher until a stop is requested.
 
     Returns:
         The exit code.

@@ -106,11 +106,11 @@ LATE_IN_A_ROW = 5
 
 @dataclass(frozen=True)
 class Showing:
-    """Displayed model and the command that requested it."""
+    """Displayed model, with the arguments of the command `show_model` that requested it."""
 
     model: FinishedModel
     asked: Mapping[str, Any]
-    """Arguments of the command."""
+    """Arguments of the command, stored so that the next engine process can repeat it."""
     most_ms: float | None
 
     def __str__(self) -> str:
@@ -134,7 +134,7 @@ class ModelShow:
         self._previous: Showing | None = None
         self._late = 0
         self._gave_way: list[dict[str, Any]] = []
-        """Recent models that were rolled back, each with the reason."""
+        """Name, version and reason of the last eight models that were rolled back."""
         self._thread: threading.Thread | None = None
 
     def begin(self) -> None:
@@ -285,10 +285,10 @@ class ModelShow:
             self._give_way(showing, f"{showing} took {took_ms:.1f} ms for a picture, {LATE_IN_A_ROW} times in a row")
 
     def _give_way(self, showing: Showing, why: str) -> bool:
-        """Return to the previous model or to the live reconstruction.
+        """Roll back to the previous model, or to the live reconstruction if there is none.
 
         Returns:
-            False if the live reconstruction is next.
+            False if the live reconstruction is displayed next.
         """
         log.error("%s; what was shown before is shown again", why)
         with self._lock:
@@ -304,13 +304,14 @@ class ModelShow:
             return False
 
     def _put(self, showing: Showing) -> None:
-        """Select the model for the next picture. The caller holds the lock."""
+        """Display a model from the next picture on, and store its command for the next engine process. Requires the
+        lock."""
         self._current, self._late = showing, 0
         write_json(self._file, showing.asked)
 
     def _to_live(self) -> None:
-        # The model stays on screen until the first live picture. Then publishing is refused and the
-        # thread ends.
+        # The model stays on screen until the first live picture. `Screen.publish` then refuses the model's pictures,
+        # and the display thread ends.
         self._screen.want("live")
         self._previous = None
         self._file.unlink(missing_ok=True)

@@ -28,11 +28,11 @@ SETTLED_S = 2.0
 
 
 class Restarts:
-    """Restart back-off. The first restart is immediate; further ones wait longer, up to a cap. Restarts never stop,
-    because a missing camera or GPU may return.
+    """Restart back-off of one process. The first restart is immediate. Later delays double up to a cap. Restarts never
+    stop, because a missing camera or GPU may return.
 
-    The cap is low for a process that has worked, even briefly: the cause is external or occasional, and viewers wait
-    for pictures. A process that never worked would only take resources from the others, so its cap is higher.
+    The cap is low for a process that reached a good state, because viewers wait for its pictures. The cap is higher for
+    a process that never did, because its restarts only take resources from other processes.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class Restarts:
         self._most_worked_s = most_worked_s
         self.in_a_row = 0
         self.never_well = 0
-        """Consecutive ends without reaching a good state."""
+        """Number of consecutive ends without a good state (`WELL`) in between."""
         self.total = 0
 
     def ended(self, well_s: float) -> float:
-        """Count an end.
+        """Count the end of the process.
 
         Args:
             well_s: seconds for which the process was in a good state.
@@ -79,7 +79,7 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.25
 PING_S = 1.0
 PAUSED_S = 1.0
-"""Extra seconds between two checks that show that the supervisor itself was suspended."""
+"""Delay of a periodic check, in seconds, beyond which the supervisor itself was suspended."""
 MOST_LOG_BYTES = 1 << 20
 FRESH_AFTER = 3
 """Consecutive failed starts after which a new interpreter is used, because the launcher's forked
@@ -88,11 +88,11 @@ WELL = ("live", "running")
 RATE_S = 3.0
 """Window of the rate measurement, in seconds."""
 COUNTED: dict[Role, str] = {"capture": "frames", "engine": "pictures"}
-"""Heartbeat figure whose rate is measured, by role."""
+"""Counter in the heartbeats whose rate is measured, by role of the process."""
 SOURCE_GONE = ("opening", "stalled", "reconnecting", "lost", "ended")
-"""Capture process states without frames."""
+"""States of a capture process in which its source delivers no frames."""
 LOST_AFTER_S = 2.0
-"""Seconds without frames after which the source counts as lost. Shorter gaps appear in the metrics only."""
+"""Seconds without frames after which loss of the source is reported. Shorter gaps appear in the metrics only."""
 Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "lost", "recovered"]
 
 
@@ -109,7 +109,7 @@ class StreamEvent:
 
 @dataclass(frozen=True)
 class ProcessState:
-    """Current state of a stream process as known to the supervisor."""
+    """State of a stream process, from its newest heartbeat and the supervisor's own checks."""
 
     state: str
     """State from the heartbeat (`starting`, `live`, `running`, ...), or `down`, `failed`, `stopped`."""
@@ -172,10 +172,10 @@ class ManagedProcess:
         self._heartbeat: dict[str, Any] | None = None
         self._heard_s = self._well_s = 0.0
         self._shown: tuple[int, float] = 0, 0.0
-        """Number of published pictures, and the time since which it is unchanged."""
+        """Number of published pictures, and the time of its last change."""
         self._rate = Rate()
         self._gone_s: float | None = None
-        """Time since which the source has given no frames."""
+        """Time of the first heartbeat without frames from the source; None while frames arrive."""
         self._lost = False
         """True after a reported loss of the source, until its recovery is reported."""
         self._tasks: list[asyncio.Task[None]] = []
@@ -357,7 +357,7 @@ class ManagedProcess:
         return str(heartbeat.get("reason")) if heartbeat is not None and ended else None
 
     async def _listen(self) -> None:
-        """Receive heartbeats and keep those of the current process."""
+        """Receive heartbeats, and evaluate those whose process id is that of the supervised process."""
         socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), self._folder.status(self._role), waiting=16)
         try:
             while True:
@@ -387,7 +387,7 @@ class ManagedProcess:
             self._look_at_source(str(said.get("state")), str(said.get("reason")), now_s)
 
     def _look_at_source(self, state: str, reason: str, now_s: float) -> None:
-        """Report loss and recovery of the source once each."""
+        """Report a loss of the source once it lasts `LOST_AFTER_S`, and then its recovery."""
         if state == "live":
             self._gone_s = None
             if self._lost:
@@ -401,7 +401,7 @@ class ManagedProcess:
                 self._say("lost", reason, self._identity)
 
     async def _ping(self) -> None:
-        """Tell the process periodically that this process is its supervisor, so that an adopted process does not end
+        """Send the stream process this supervisor's identity periodically, so that an adopted process does not end
         itself as an orphan."""
         own = asdict(ProcessIdentity.own())
         while True:
@@ -410,7 +410,7 @@ class ManagedProcess:
                 try:
                     await ask_async(self._folder.commands(self._role), "ping", supervisor=own)
                 except BusError as error:
-                    # hang detection relies on the heartbeats, not on this ping
+                    # An unanswered ping has no consequence: hangs are detected by missing heartbeats.
                     log.info("%s %s: %s", self._spec.stream, self._role, error)
 
     async def _end(self, identity: ProcessIdentity) -> None:

@@ -48,10 +48,10 @@ of the previous raw frame as a baseline, and of the newest predicted frame befor
 
 
 class Screen:
-    """Single publisher of an engine's pictures, so each picture is rendered from one model.
+    """Publisher of an engine's main picture, shared by the live reconstruction and the display of finished models.
 
-    The screen shows the live reconstruction or a finished model. On a switch, the old pictures
-    continue until the first picture of the new kind.
+    After a switch between these two kinds, pictures of the old kind are published until the first picture of the new
+    kind.
     """
 
     def __init__(self, publisher: PicturePublisher) -> None:
@@ -70,11 +70,11 @@ class Screen:
 
     @property
     def wanted(self) -> Shows:
-        """Return the requested kind of picture."""
+        """Return the requested kind of picture: live reconstruction or finished model."""
         return self._wanted
 
     def want(self, shows: Shows) -> None:
-        """Switch to a kind of picture; takes effect with its next picture."""
+        """Request a kind of picture. The switch happens at the first picture of this kind."""
         with self._lock:
             self._wanted = shows
 
@@ -82,7 +82,7 @@ class Screen:
         """Publish a picture of the live reconstruction.
 
         Returns:
-            False if it was not published.
+            False if the screen shows a finished model, so that the picture was not published.
         """
         return self.publish("live", {**header_of(shown), **self._scores}, shown.image)
 
@@ -108,7 +108,7 @@ class Screen:
             image: RGB uint8 [H, W, 3].
 
         Returns:
-            False if the other kind is already displayed; nothing is published then.
+            False, without publishing, if the other kind was requested and is already on screen.
         """
         with self._lock:
             if shows != self._wanted and self._shown != shows:
@@ -253,7 +253,8 @@ def _rendered(scene: LayerScene) -> RenderOutput:
 
 
 def _weighted(gaussians: Gaussians, unseen_s: torch.Tensor | None) -> Gaussians:
-    """Return the Gaussians with confidence as colour: 1 if visible or unknown, decreasing with the unseen time."""
+    """Return the Gaussians with their confidence as grey value: 1 if visible or unknown, decreasing with the unseen
+    time."""
     weight = gaussians.means.new_ones(gaussians.count)
     if unseen_s is not None:
         weight = certainty(unseen_s).to(gaussians.dtype)
@@ -272,13 +273,13 @@ MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
 """Largest share of time spent on drawing, by device. A slow picture is followed by a longer pause."""
 LOOK_S = 0.2
 Scene = Callable[[], LayerScene | None]
-"""Callable that creates the scene when it is drawn; None if it cannot be drawn."""
+"""Factory of a scene, called by the drawing thread. It returns None if the scene cannot be drawn."""
 
 
 class Layers:
-    """Drawing thread for the watched layers. `offer` and `camera` are thread-safe.
+    """Low-priority thread that draws the layers with viewers. `offer` and `camera` are thread-safe.
 
-    The publishers' sockets report subscribers. Without subscribers nothing is drawn and no scene is held.
+    The publisher sockets detect subscribers. Without a subscriber no layer is drawn, and no scene is kept in memory.
     """
 
     def __init__(
@@ -290,7 +291,7 @@ class Layers:
         self._number = 0
         """Number of offered scenes."""
         self._drawn_of: dict[Layer, tuple[int, float]] = dict.fromkeys(LAYERS, (0, 0.0))
-        """Last drawn scene number and its time, per layer."""
+        """Number of the scene that each layer drew last, and the start time of that drawing."""
         self._watched: frozenset[Layer] = frozenset()
         self._drawn: Counter[Layer] = Counter()
         self._failed = ""
@@ -319,7 +320,8 @@ class Layers:
                 self._changed.notify()
 
     def camera(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Handle `camera {azimuth_deg?, elevation_deg?, zoom?}`: move the virtual camera. Defaults are 0, 0 and 1.
+        """Handle `camera {azimuth_deg?, elevation_deg?, zoom?}`: set the virtual camera's position. Defaults are 0, 0
+        and 1.
 
         Args:
             arguments: arguments of the command.
@@ -339,7 +341,7 @@ class Layers:
         return dict(vars(self._orbit))
 
     def figures(self) -> dict[str, Any]:
-        """Return viewer and picture counts for the heartbeats."""
+        """Return for the heartbeats whether each layer is watched, its picture count, and the last failure."""
         watched = self._watched
         layers = {layer: {"watched": layer in watched, "drawn": self._drawn[layer]} for layer in LAYERS}
         return {"layers": {**layers, **({"failed": self._failed} if self._failed else {})}}
@@ -367,7 +369,8 @@ class Layers:
                 publisher.close()
 
     def _next(self) -> tuple[Layer, Scene] | None:
-        """Return the watched layer that waited longest for an undrawn scene, and that scene. None if no layer waits."""
+        """Return the newest scene and the watched layer whose last drawing is oldest. None if every watched layer
+        has drawn this scene."""
         with self._changed:
             waiting = [each for each in LAYERS if each in self._watched and self._drawn_of[each][0] < self._number]
             if not waiting or self._scene is None:
@@ -384,7 +387,7 @@ class Layers:
             if scene is None:
                 return
             image, said = drawing.draw(layer, scene)
-        # the main picture continues without the layer; the heartbeat figures report the failure
+        # A failed layer must not end the main picture. The heartbeats report the failure.
         except Exception as error:
             self._failed = f"{layer}: {type(error).__name__}: {error}"[:500]
             log.exception("the picture of %s was not drawn", layer)
@@ -404,7 +407,7 @@ class Layers:
         return max(screen, own, key=order.index)
 
     def _rest(self, took_s: float) -> None:
-        """Wait until the next picture, leaving most of the time to the reconstruction."""
+        """Pause after a drawing of `took_s` seconds, so that drawing takes at most `MOST_SHARE` of the time."""
         period_s = PERIOD_S[self._device] / max(1, len(self._watched))
         rest_s = max(period_s - took_s, took_s * (1 / MOST_SHARE[self._device] - 1))
         with self._changed:

@@ -1,7 +1,7 @@
 """Streams of a server: capture and engine process of each, state, viewers, and the registry model that it shows.
 
-`Stream` runs the two processes of one stream. `SupervisedStreams` holds all streams. `ShownModels` keeps streams in step with the active versions of the
-registry.
+`Stream` runs the two processes of one stream. `SupervisedStreams` holds all streams. `ShownModels` displays the active
+registry versions on the streams.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ OUT_OF_BODY = "out of body"
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:
-    """Derive the state of a stream and the reason from its processes."""
+    """Derive the state of a stream, and its reason, from the states of its two processes."""
     for process in (capture, engine):
         if process.state == "failed":
             return "failed", process.reason
@@ -166,7 +166,7 @@ def _withheld(engine: ProcessState) -> str | None:
 
 
 class SupervisedStreams:
-    """Streams of a server by name. `running` is entered with the server."""
+    """Streams of a server by name. The server enters the context manager `running` at its start."""
 
     def __init__(
         self,
@@ -190,8 +190,8 @@ class SupervisedStreams:
 
     @asynccontextmanager
     async def running(self, at_start: Mapping[str, StreamSettings]) -> AsyncIterator[None]:
-        """Create the streams `at_start`, and start those that are to start. All streams are stopped
-        at the end of the block."""
+        """Create the streams `at_start` and start those whose settings have `start`. Stop all streams at the end of
+        the block."""
         await asyncio.to_thread(remove_dead)
         for name, settings in at_start.items():
             self.create(name, settings)
@@ -206,7 +206,7 @@ class SupervisedStreams:
             await asyncio.to_thread(remove_dead)
 
     def streams(self) -> Sequence[Stream]:
-        """Return the streams themselves, for components that work with their processes."""
+        """Return the `Stream` objects, for components that send commands to their processes."""
         return list(self._streams.values())
 
     def all(self) -> Sequence[StreamView]:
@@ -356,17 +356,17 @@ class SupervisedStreams:
 
 LOOK_S = 0.25
 MOST_MS = 200.0
-"""Time limit per picture in milliseconds. A model that repeatedly exceeds it is replaced by the previous one."""
+"""Time limit per picture in milliseconds. A model that repeatedly exceeds it is replaced by the previous model."""
 PREPARE_S = 60.0
 """Seconds allowed for loading a model and rendering its first picture."""
 AGAIN_S = 5.0
-"""Seconds before a refused request to an engine is repeated."""
+"""Seconds after which `show_model` is sent again to an engine that refused it."""
 GivenUp = tuple[tuple[str, int, str], ...]
 
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """Last request to an engine, and the models it had rolled back by then."""
+    """Last `show_model` command to an engine, with the rollbacks that the engine had reported before it."""
 
     name: str
     version: int
@@ -374,20 +374,20 @@ class ModelRequest:
 
 
 class ShownModels:
-    """Polls four times a second that each stream displays its configured model. A restarted engine
-    gets the request again."""
+    """Keeps each stream on the active version of its configured registry model, by polling four times per second. A
+    restarted engine receives `show_model` again."""
 
     def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, events: SystemEvents | None = None) -> None:
         self._streams, self._registry = streams, registry
         self._events = events or SystemEvents()
         self._refused: dict[tuple[str, str, int], float] = {}
-        """Time of an engine's refusal, by stream, model and version."""
+        """Time at which an engine refused `show_model`, by stream, model and version."""
         self._requests: dict[str, ModelRequest] = {}
-        """Last request to each stream's engine."""
+        """Last `show_model` command by stream, until its model is rolled back."""
 
     @asynccontextmanager
     async def following(self) -> AsyncIterator[None]:
-        """Synchronise while the block runs."""
+        """Poll all streams while the block runs."""
         task = asyncio.create_task(self._follow(), name="shown models")
         try:
             yield
@@ -405,7 +405,7 @@ class ShownModels:
             await asyncio.sleep(LOOK_S)
 
     async def look_at(self, stream: Stream) -> None:
-        """Make a stream display the active version of its model.
+        """Send `show_model` to a stream's engine if it does not display the active version of the configured model.
 
         Raises:
             BusError: if the engine does not answer.
@@ -437,7 +437,8 @@ class ShownModels:
         log.info("%s shows %s/%d", stream.name, name, active.version)
 
     async def _roll_back_if_given_up(self, stream: str, figures: Mapping[str, Any]) -> None:
-        """Roll back the active version if the engine reports that it cannot be displayed."""
+        """Roll back the active version in the registry if the engine reports that it stopped displaying this
+        version."""
         request, given_up = self._requests.get(stream), _given_up(figures)
         if request is None or given_up == request.given_up_before:
             return

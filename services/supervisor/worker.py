@@ -204,13 +204,13 @@ def step_back(nice: int) -> None:
 
 PREFIX = "intrasplat-engine-"
 NEW_S = 2.0
-"""Age in seconds below which a folder may belong to a process that has not locked it yet."""
+"""Age in seconds below which a scratch folder may belong to a process that has not locked it yet."""
 
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Create a temporary folder and make it the default for this process. Folders of killed engines
-    are removed first."""
+    """Create a scratch folder and make it the default of `tempfile` in this process. Scratch folders of killed
+    engines are removed first."""
     remove_dead()
     before = tempfile.tempdir
     folder = Path(tempfile.mkdtemp(prefix=PREFIX))
@@ -226,7 +226,7 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def remove_dead() -> list[Path]:
-    """Delete this user's folders that no process holds.
+    """Delete this user's scratch folders whose process has ended.
 
     Returns:
         The deleted folders.
@@ -259,10 +259,10 @@ ORPHAN_DRAIN_S = 1.25
 
 
 class Parent:
-    """Supervising process of this process, which may be replaced by the next one.
+    """Liveness check of this process's supervisor. A `ping` of another supervisor replaces the identity.
 
-    The supervisor need not be the parent of the process, because the launcher forks it. Its identity is therefore checked
-    in place of a signal at the parent's death.
+    The supervisor need not be the parent process, because the launcher forks stream processes. The death of the
+    supervisor is therefore detected by its process identity, not by a parent-death signal.
     """
 
     def __init__(self, identity: ProcessIdentity | None, patience_s: float) -> None:
@@ -270,7 +270,7 @@ class Parent:
 
         Args:
             identity: the supervisor; None for a process that is run by hand.
-            patience_s: time after the supervisor's death in which another one may take its place.
+            patience_s: seconds after the supervisor's death in which a new supervisor may adopt this process.
         """
         self.identity = identity
         self._patience_s = patience_s
@@ -299,7 +299,7 @@ def identity_of(content: Any) -> ProcessIdentity:
 
 
 class Worker:
-    """Context manager that runs this process in its role.
+    """Context manager for the runtime of a stream process: lock of its role, heartbeats, commands, signals.
 
     `say` sets the state in the heartbeats. `stop_requested` returns True after a stop command, a
     signal, or the death of the supervisor. A process that does not finish within `drain_s` is
@@ -360,11 +360,11 @@ class Worker:
         os.close(self._lock)
 
     def take(self, handlers: Mapping[str, Handler]) -> None:
-        """Add command handlers."""
+        """Add handlers of further commands."""
         self._handlers.update(handlers)
 
     def say(self, state: str, reason: str) -> None:
-        """Set the state and its reason for the heartbeats; a changed state is logged and sent at once."""
+        """Set the state and reason that the heartbeats report. A changed state is logged and published at once."""
         with self._saying:
             changed = self._said["state"] != state or (state == "starting" and self._said["reason"] != reason)
             self._said = {"state": state, "reason": reason[:2000]}
@@ -373,11 +373,12 @@ class Worker:
             self._heartbeats.say_now()
 
     def tell_figures(self, part: str, figures: Callable[[], Mapping[str, Any]]) -> None:
-        """Add figures to each heartbeat. `figures` is called in the heartbeat thread."""
+        """Register a callable whose counters are part of each heartbeat. The heartbeat thread calls it."""
         self._figures[part] = figures
 
     def tell_measures(self, part: str, measures: Callable[[], Mapping[str, Any]]) -> None:
-        """Add Prometheus measures to the heartbeats. `measures` is called once per second."""
+        """Register a callable whose Prometheus measures are part of the heartbeats. The heartbeat thread calls it
+        once per second."""
         self._measures[part] = measures
 
     def stop_requested(self) -> bool:
@@ -389,7 +390,7 @@ class Worker:
         return self._stop.wait(seconds)
 
     def request_stop(self, reason: str) -> None:
-        """Ask this process to finish."""
+        """Request an orderly stop of this process. The reason of the first request is kept."""
         if not self._stop.is_set():
             self.stop_reason = reason
             self._stop.set()
@@ -398,7 +399,7 @@ class Worker:
         self.request_stop(f"it got {signal.Signals(number).name}")
 
     def _pinged(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer with the process id. The caller is the supervisor from now on."""
+        """Handle `ping`: adopt the supervisor identity in the arguments, and return the process id."""
         if "supervisor" in arguments:
             self._parent.identity = identity_of(arguments["supervisor"])
         return {"pid": os.getpid()}
