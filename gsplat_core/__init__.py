@@ -97,7 +97,7 @@ _HOME = {
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
 }
-"""Module that defines each public name."""
+"""Import path of the module that defines each public name."""
 
 
 def __getattr__(name: str) -> Any:

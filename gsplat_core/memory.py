@@ -33,7 +33,7 @@ def _of_control_group(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
     limit, current = _text(folder / "memory.max").strip(), _text(folder / "memory.current").strip()
     if not limit.isdecimal() or not current.isdecimal():
         return None
-    # The page cache counts as used but can be reclaimed.
+    # The page cache counts as used, but the kernel can reclaim it.
     stated = dict(line.split()[:2] for line in _text(folder / "memory.stat").splitlines() if " " in line)
     return max(0, int(limit) - int(current) + int(stated.get("inactive_file", "0")))
 
@@ -50,7 +50,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text()
     except OSError:
-        return ""  # another system, or no such limit
+        return ""  # the file does not exist on other systems, or if no such limit is set
 
 
 def return_freed_memory() -> None:

@@ -152,13 +152,13 @@ def measure_baselines(
     """Score the trivial baselines on a recording; reads it twice.
 
     Args:
-        recording: anything that gives the frames in order each time it is iterated. Frames need not have a mask.
-        ages: of the copies, in frames; 1 is always among them.
-        flow: whether the two baselines that need optical flow are measured too; they take some 50 ms a frame of 640x512.
-        record: given each frame's figures but those of the mean, in order.
+        recording: re-iterable recording that yields its frames in order. Frames need not have a mask.
+        ages: ages of the copies in frames; 1 is always added.
+        flow: also score the two baselines that need optical flow, which take about 50 ms per frame of 640x512 pixels.
+        record: callback that receives each frame's figures in order, without those of the train mean.
 
     Raises:
-        InvalidInput: the recording can be iterated only once, its frames differ in size, or an age is below 1.
+        InvalidInput: if the recording can be iterated only once, its frames differ in size, or an age is below 1.
     """
     if isinstance(recording, Iterator):
         raise InvalidInput(

@@ -1,6 +1,8 @@
-"""Errors of rendered depth and normals against true depth, next to the best-fit plane and the level plane of each frame.
+"""Errors of rendered depth and normals against true depth, next to the best-fit plane and the level plane of each
+frame.
 
-`DepthSums` gives absolute errors for the held-out protocol. `DepthShareSums` and `NormalSums` compare whole sequences with flat planes.
+`DepthSums` gives absolute errors for the held-out protocol. `DepthShareSums` and `NormalSums` compare whole sequences
+with flat planes.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from gsplat_core.training.metrics import ScoredMean
 
 Array = NDArray[np.float64]
 MOST_STEPS = 100
-"""Steps of Levenberg and Marquardt's method from each start; it converges in about ten."""
+"""Largest number of Levenberg-Marquardt steps from each start; the fit converges in about ten."""
 CONVERGED = 1e-10
 """Relative decrease of the squared error that ends the iteration."""
 STEEPEST_RATIO = 1e-6
@@ -68,7 +70,7 @@ def best_plane(rays: Array, z: Array) -> Array | None:
     unit = float(z.mean())
     heights = z / unit
     starts = [np.array([0.0, 0.0, 1.0])]
-    for power in (1, 2):  # squared differences of 1/z, and of z to first order
+    for power in (1, 2):  # weights of the fit: squared differences of 1/z, then of z to first order
         weight = heights**power
         found, *_ = np.linalg.lstsq(rays * weight[:, None], weight / heights, rcond=None)
         if (rays @ found).min() > STEEPEST_RATIO:
@@ -125,7 +127,7 @@ class DepthErrors:
     scaled_rmse_mm: float
     """RMSE after scaling each frame by its median of true over rendered depth; measures shape alone."""
     covered: float
-    """Share of tissue pixels with known depth at which the model has depth. Others add no error."""
+    """Share of tissue pixels with known depth at which the model has depth. Other pixels add no error."""
     frames: int
 
 

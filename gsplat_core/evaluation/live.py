@@ -1,7 +1,8 @@
 """Scores of a live run: the picture on the screen when frame i+1 arrives, against frame i.
 
-The picture on the screen is the last one displayed before that moment. It shows frame i if it was in time, and an older
-frame otherwise. Pictures replaced earlier are not scored. Nothing is scored while a stopped source sends no frames.
+The picture on the screen is the last one displayed before that moment. It shows frame i if frame i was processed in
+time, otherwise an older frame. Pictures that were replaced before that moment are not scored. Nothing is scored while a
+stopped source sends no frames.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class AgeHistogram:
 
 
 MOST_BEHIND = 8
-"""Largest lateness in frames with its own counter; later pictures are counted here too."""
+"""Largest lateness in frames with its own counter. The counter also includes pictures that are later."""
 SETTLING_S = 1.0
 """Start-up time in seconds, excluded from `settled` but included in `score`."""
 NOTHING_SHOWN = "nothing shown yet"

@@ -1,12 +1,12 @@
 """Errors of a model's motion: tracked points, and frame-to-frame optical and scene flow.
 
-A point is defined by its pixel in the first frame that sees it. The model lifts it by its own depth
-and moves it with the nearest Gaussians. Errors are Euclidean, over every later frame that sees the
-point, in pixels and in the recording's unit in left-camera coordinates. Metrics: Schmidt et al.,
-"STIR: Surgical Tattoos in Infrared" (2023), and the STIR challenge of 2024.
+A point is defined by its pixel in the first frame that shows it. The model unprojects the pixel by its own depth and
+moves the point with the nearest Gaussians. Errors are Euclidean, over every later frame that shows the point, in pixels
+and in the recording's unit in left-camera coordinates. Metrics: Schmidt et al., "STIR: Surgical Tattoos in Infrared"
+(2023), and the STIR challenge of 2024.
 
-Flow compares each pixel with its position in the next frame. A pixel moves by the mean motion of
-the Gaussians on its ray, weighted by their blending weights.
+Flow compares each pixel with its position in the next frame. A pixel moves by the mean motion of the Gaussians on its
+ray, weighted by their blending weights.
 """
 
 from __future__ import annotations
@@ -302,7 +302,7 @@ class FlowSums:
         """Complete the comparison started by `begin` when the next frame arrives.
 
         Args:
-            frame: next frame, whether or not it is sampled itself.
+            frame: next frame; it need not have been sampled by `begin`.
             own: camera of the next frame in model space.
         """
         started, self._started = self._started, None
@@ -312,7 +312,7 @@ class FlowSums:
         there = pixels_of(own, moved(own.world_to_camera, started.points + motion))
         true = started.true.flow[started.here]
         off = np.linalg.norm(there - started.pixels - true, axis=1)
-        seen = np.isfinite(off)  # Points that the model moves behind the camera have no pixel.
+        seen = np.isfinite(off)  # NaN for points that the model moves behind the camera
         self._px.append(np.stack([off[seen], np.linalg.norm(true, axis=1)[seen]]))
         if started.true.scene_flow is not None:
             found = motion @ started.own.world_to_camera[:3, :3].T

@@ -1,8 +1,8 @@
 """Offline protocols that render a model for the frames of a recording and score the pictures.
 
 * `evaluate_heldout`: frames excluded from training, rendered from a finished model
-* `evaluate_causal`: each frame is predicted before it is trained on, from its time and pose and
-  the previous frame's exposure
+* `evaluate_causal`: each frame is predicted before it is trained on, from its time and pose and the previous frame's
+  exposure
 * `evaluate_retention`: earlier frames and revisited places, rendered from the final model
 """
 
@@ -66,7 +66,7 @@ class PictureMaker:
         with torch.inference_mode():
             if model is not self._prepared:
                 self._renderer.prepare(model if self._reads_snapshots else model.as_model())
-                # Keeping a snapshot would block its slot for training.
+                # Do not keep a snapshot, because it would block its slot for training.
                 self._prepared = model if isinstance(model, Model) else None
             output = self._renderer.render(camera, frame.time_s).result()
             picture = output.image
@@ -225,10 +225,10 @@ def _score(frame: Frame, picture: Picture, sums: ScoreSums, record: Record | Non
 
 
 NEAR_SHARE = 0.05
-"""Distance below which two positions are one place, relative to the largest pairwise distance."""
+"""Distance below which two positions count as the same place, as a share of the largest pairwise distance."""
 NEAR_DEGREES = 10.0
 AWAY = 3.0
-"""Least distance of the scope from a place between two stays, in units of "same place".
+"""Least distance of the scope from a place between two stays, in multiples of the limit of the same place.
 
 The distance is the larger of the position and the angle measure of `_distances`.
 """
@@ -292,7 +292,10 @@ class PlaceFinder:
 
 
 def _last_stay(apart: NDArray[np.float64]) -> int | None:
-    """Return the index of the newest earlier stay at the same place with an absence since, or None."""
+    """Return the index of the newest earlier stay at a place, from the distances [K] of earlier poses to it.
+
+    None if the scope has not been away since, or was never there before.
+    """
     away = np.flatnonzero(apart >= AWAY)
     if not len(away):
         return None
@@ -441,7 +444,7 @@ def returns(entries: Iterable[Entry], places: Sequence[Visits]) -> list[Return]:
 
 
 def _within(frame: Frame, times: Range) -> bool:
-    # Seconds are made of nanoseconds by a product that rounds.
+    # Tolerate the rounding of times that were converted from nanoseconds.
     return times[0] - 1e-6 <= frame.time_s <= times[1] + 1e-6
 
 

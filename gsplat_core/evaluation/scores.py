@@ -11,7 +11,7 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import MEASURES, FrameQuality, ImageLike, QualityTracker, frame_quality
 
 Entry = dict[str, float | int | bool | str | None]
-"""The figures of one frame by name; None where a measure does not exist."""
+"""Figures of one frame by name; None for a measure that the frame does not have."""
 Record = Callable[[Entry], None]
 """Callback that receives each frame's figures in order."""
 
@@ -29,9 +29,9 @@ class Score:
     frames: int
     """Number of scored frames."""
     worst_db: float | None
-    """The lowest tissue PSNR of a frame."""
+    """Lowest tissue PSNR of any frame, in dB."""
     worst_seq: int | None
-    """Sequence number of the frame with the lowest score."""
+    """Sequence number of the frame with the lowest tissue PSNR."""
     left_out: Mapping[str, int]
     """Numbers of excluded frames by reason."""
 
@@ -99,7 +99,7 @@ class ScoreSums:
 
 
 def measures(quality: FrameQuality) -> Entry:
-    """The measures of a frame by name, for a log."""
+    """Return the measures of a frame by name, for a log."""
     return {name: finite(getattr(quality, name)) for name in MEASURES}
 
 

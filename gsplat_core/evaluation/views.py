@@ -123,7 +123,7 @@ def seen_by_both(
     column, row = (np.floor(np.nan_to_num(pixels[:, k], nan=-1)).astype(np.int64) for k in (0, 1))
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     reached[row[inside], column[inside]] = 1
-    # Pixels are projected one by one, which leaves gaps where the view is nearer.
+    # Pixels are projected one by one, which leaves gaps where the view's camera is nearer to the tissue.
     closed = cv2.morphologyEx(reached, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     return np.asarray(tissue & (closed != 0))
 
@@ -331,7 +331,7 @@ def matched_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDAr
     reach = 8 * math.ceil(2 * SEARCHED * width / 16)
     least = round(typical_shift(left, right) * width) - reach
     matcher = cv2.StereoSGBM.create(least, 2 * reach, 5, 8 * 3 * 25, 32 * 3 * 25, mode=cv2.STEREO_SGBM_MODE_HH)
-    # In mirrored pictures the right eye is the left one, so disparities belong to its pixels.
+    # In mirrored pictures the right eye takes the role of the left one, so disparities belong to its pixels.
     mirrored = [np.ascontiguousarray(eye[:, ::-1]) for eye in (right, left)]
     found = matcher.compute(*mirrored)[:, ::-1].astype(np.float32) / 16
     known = found >= least

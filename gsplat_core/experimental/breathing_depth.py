@@ -93,12 +93,12 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
     rows, unturned, where = [], [], []
     for ray, each, chosen, turn in zip(rays, off, moved, turns, strict=True):
         r, d = ray[chosen], each[chosen] * focal_px
-        # d x (p - r p_z) = 0
+        # Each point gives the constraint d x (p - r p_z) = 0 on the direction p.
         rows.append(np.stack([-d[:, 1], d[:, 0], d[:, 1] * r[:, 0] - d[:, 0] * r[:, 1]], 1) @ turn.T)
         unturned.append(np.repeat(turn[None], len(r), 0))
         where.append(r)
     c, turn, ray = np.concatenate(rows), np.concatenate(unturned), np.concatenate(where)
-    # Derivative of each constraint by image noise.
+    # Derivative of each constraint by the noise of the observed ray.
     reach = np.stack([np.tile([1.0, 0.0], (len(ray), 1)), np.tile([0.0, 1.0], (len(ray), 1)), -ray], 2) @ turn.swapaxes(
         1, 2
     )
@@ -156,7 +156,7 @@ class _Window:
 
 
 class MovingTissue:
-    """Depth of a recording's frames, computed on request. The same frames give the same bytes."""
+    """Depth of a recording's frames, computed on request. Equal frames give bit-identical results."""
 
     def __init__(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> None:
         """Fit all windows of a recording.
@@ -292,7 +292,7 @@ def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -
 
 
 MOST_PIXELS = 64_000_000
-"""Largest total number of pixels of frames with depth. Each takes 12 bytes here and again in the observations."""
+"""Largest total number of pixels of frames with depth. Each pixel takes 12 bytes here and again in the observations."""
 NEEDS_ALL_FRAMES = "depth of breathing tissue is estimated from a complete recording, by `intrasplat reconstruct`"
 
 

@@ -1,18 +1,12 @@
 """Motion prior that learns periodic motion and temporal colour changes from the stream.
 
-The next picture is predicted from the newest, mean and blurred pictures and several motions, in locally learned shares. Earlier similar moments give
-forecasts of heartbeat and breathing.
-
-Motion forecast from earlier similar moments, for periodic motion such as heartbeat and breathing.
-
-Forecasting by analogues (Lorenz, "Atmospheric predictability as revealed by naturally occurring analogues", 1969). No
+Motion is forecast from earlier similar moments, for periodic motion such as heartbeat and breathing. This is
+forecasting by analogues (Lorenz, "Atmospheric predictability as revealed by naturally occurring analogues", 1969). No
 period is estimated, so several or changing periods need no model.
 
-Prediction of the next picture from the newest, mean and blurred pictures and several motions.
-
 Highlights flicker, noise is random and motion is uncertain. The best prediction of a colour is therefore a mixture of
-the moved newest picture, the mean of earlier ones, a blurred picture and other plausible motions. The mixture is
-learned locally from earlier predictions (`LocalShares`).
+the moved newest picture, the mean of earlier ones, a blurred picture and other plausible motions. The shares of the
+mixture are learned locally from earlier predictions (`LocalShares`).
 """
 
 from __future__ import annotations
@@ -47,7 +41,7 @@ class SharesSettings:
     """Settings of the learning; units are squares of the fields' units."""
 
     at_first: tuple[float, ...]
-    """Shares before anything was learned."""
+    """Shares used before any observation."""
     decay: float
     """Weight of accumulated sums at each new frame; about 1 / (1 - decay) frames are remembered."""
     around_cells: float
@@ -149,8 +143,8 @@ class SimilarMoments:
         self._taken = 0
 
     def take(self, motion: Flow) -> None:
-        """Add the newest motion [h, w, 2]. Another size restarts the history. Moments next to a gap
-        in the motions count as neighbours, which affects few of many.
+        """Add the newest motion [h, w, 2]. Another size restarts the history. Moments before and after a gap in the
+        motions are treated as neighbours, which affects only the few moments next to the gap.
         """
         if self._motions.shape[1:] != motion.shape:
             self._begin(motion.shape)

@@ -1,8 +1,8 @@
 """Relative depth for a static scope from the shading of its own light.
 
 Brightness falls with the square of the distance and the cosine of the incidence angle, and highlights mark surfaces
-that face the lamp (`relief`). Brightness changes of tracked tissue depend on distance and slope alone
-(`light_change`). The depth is never metric, since neither the lamp's power nor the tissue's albedo is known.
+that face the lamp (`relief`). Brightness changes of tracked tissue depend on distance and slope alone (`shading`). The
+depth is never metric, since neither the lamp's power nor the tissue's albedo is known.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from gsplat_core.scene.depth_origin import BELIEVED, LIGHT, RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
 
 SOLVED_AT = (1, 2, 4, 8, 12)
-"""Numbers of looks at which all reliefs are re-estimated jointly; in between only the newest look's
+"""Numbers of looks in a window at which all reliefs are re-estimated jointly. At other numbers only the newest look's
 change is estimated.
 """
 
 
 class LightWindow:
-    """Looks at tissue that can be tracked from one of them, the key, to all others."""
+    """Looks (shading and texture of one picture each) whose tissue can be tracked from one of them, the key."""
 
     def __init__(self, grid: Grid, key: Look, before: Sequence[Look] = ()) -> None:
         """Create a window around a key.
@@ -83,7 +83,7 @@ class LightWindow:
 
 
 EVERY_S = 0.3
-"""Time from one estimate to the next in seconds; frames between reuse the last answer."""
+"""Time from one estimate to the next in seconds. Frames between reuse the previous result."""
 MOST_LOOKS = 12
 """Largest number of looks fitted together."""
 NEWEST = 0.2

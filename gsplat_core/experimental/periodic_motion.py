@@ -1,20 +1,16 @@
 """Fit of periodic tissue motion and depth to point tracks of a moving scope with known poses.
 
-The breathing and heart frequencies are searched for first. Tissue disturbed by tools is excluded by a robust fit.
-
 The position of a point at time t is its rest position plus a cos(2 pi f t) + b sin(2 pi f t) for each of a few
 frequencies f common to all tissue. The vectors a and b vary smoothly over the surface. Breathing and heart beat are
-periodic and the scope's trajectory is not, which separates the two.
+periodic and the scope's trajectory is not, which separates the two. The frequencies are searched for first.
 
 The fit is Gauss-Newton on reprojection errors with Cauchy weights. Rest positions are eliminated (Schur complement),
 so only the vectors at the nodes of a coarse grid remain as unknowns.
 
-Robust fit of periodic motion that excludes tissue disturbed by tools.
-
-Tissue pulled by a tool biases a periodic fit even with robust weights, because small deviations keep nearly full
-weight. A pull towards the camera then corrupts the motion along the line of sight. Disturbed points deviate together,
-unlike points with independent errors. Observations whose neighbours deviate on average are therefore excluded and the
-motion is fitted again.
+Tissue pulled by a tool biases the fit even with robust weights, because small deviations keep nearly full weight. A
+pull towards the camera then corrupts the motion along the line of sight. Disturbed points deviate together, unlike
+points with independent errors. Observations whose neighbours deviate on average are therefore excluded and the motion
+is fitted again.
 """
 
 from __future__ import annotations

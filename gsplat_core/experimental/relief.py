@@ -48,7 +48,8 @@ SOFTNESS = 0.25
 """Fill light by subsurface scattering and surrounding walls: cos θ is replaced by (cos θ + SOFTNESS) / (1 + SOFTNESS).
 """
 ROUND = 0.1
-"""Angle in radians below which differences hardly affect highlights, since fine bumps are never all level."""
+"""Angle in radians below which angle differences hardly affect highlights, since fine bumps are never level throughout.
+"""
 
 
 @dataclass(frozen=True)

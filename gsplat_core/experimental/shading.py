@@ -1,4 +1,4 @@
-"""Separation of illumination and pigment in a picture, and the brightness change of each piece of tissue between two pictures.
+"""Separation of illumination and pigment in a picture, and the brightness change of tissue between two pictures.
 
 Light that weakens with distance reduces red, green and blue alike, while pigment absorbs them unequally. Fine detail
 is mostly pigment, since distance and slope change slowly. Log brightness is therefore the weighted sum of the
@@ -8,11 +8,9 @@ channels' logarithms, with weights summing to 1, that has the least fine detail 
 Wet tissue also reflects the lamp, which adds white. The excess of red over green and blue is free of reflections. The
 excess of a pixel's white over its surroundings reveals highlights.
 
-Brightness change of each piece of tissue between two pictures. Pigment is constant, so the change depends on light
-and slope alone.
-
-Tissue is tracked from a key picture by optical flow with a forward-backward check. Specular reflections are removed
-beforehand (`log_diffuse`).
+The pigment of a piece of tissue is constant, so its brightness change between two pictures depends on light and slope
+alone. Tissue is tracked from a key picture by optical flow with a forward-backward check. Specular reflections are
+removed beforehand (`log_diffuse`).
 """
 
 from __future__ import annotations
@@ -247,7 +245,7 @@ class Change:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Cells of which enough pixels were found again, bool [h, w]."""
+        """Marks of cells with enough pixels found again, bool [h, w]."""
         return self.share >= LEAST_KNOWN
 
     @property

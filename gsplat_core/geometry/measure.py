@@ -93,7 +93,8 @@ class Measurement:
             )
         start, step = rays_of(camera, np.array([column + 0.5, row + 0.5]))
         spread = float(surface["spread"][row, column])
-        # In half-transparent pixels the point may as well be at the median depth.
+        # In half-transparent pixels the median depth is as plausible as the mean, so their difference adds to the
+        # error.
         median = float(surface["median_depth"][row, column])
         split = abs(depth - median) if median > 0 else spread
         relative_error = UNKNOWN_ERROR if self.origin is None else self.origin.relative_error

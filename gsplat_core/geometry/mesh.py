@@ -100,14 +100,16 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer
 
 
 def _triangles(across: NDArray[np.bool_], down: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return pixel indices [T, 3]: two triangles for each square with four connected sides, one if a corner is cut off."""
+    """Return pixel indices [T, 3]: two triangles for each square of pixels with four connected sides, one triangle if a
+    corner is disconnected.
+    """
     height, width = across.shape[0], down.shape[1]
     pixel = np.arange(height * width).reshape(height, width)
     upper_left, upper_right = pixel[:-1, :-1], pixel[:-1, 1:]
     lower_left, lower_right = pixel[1:, :-1], pixel[1:, 1:]
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     whole = top & bottom & left & right
-    # Pixel rows increase downwards, so this order is counter-clockwise for a viewer along +z.
+    # Pixel rows increase downwards, so this corner order is counter-clockwise for a viewer along +z.
     corners = (
         (whole | (top & left), upper_left, lower_left, upper_right),
         (whole | (bottom & right), lower_right, upper_right, lower_left),

@@ -1,9 +1,7 @@
-"""Rigid registration of a reconstruction to a reference surface such as a CT, and signed distances to the closest points of a triangle mesh.
+"""Rigid registration of a reconstruction to a reference surface such as a CT, and signed distances between them.
 
-Rigid registration of a reconstruction to a reference surface such as a CT, and signed distances between them.
-
-Point-to-plane ICP (Chen and Medioni 1991) with trimming (Chetverikov et al. 2002). Only the closest pairs are used,
-because a reconstruction covers part of the reference and contains structures that it lacks. The start is an initial
+Point-to-plane ICP (Chen and Medioni 1991) with trimming (Chetverikov et al. 2002) uses only the closest pairs, because
+a reconstruction covers part of the reference and contains structures that the reference lacks. The start is an initial
 guess or three or more corresponding point pairs.
 """
 
@@ -22,8 +20,8 @@ Array = NDArray[np.float64]
 SAMPLES = 100_000
 """Approximate number of samples spread over the mesh for the nearest-neighbour search."""
 CANDIDATES = 6
-"""Nearest samples whose triangles are tested exactly. The closest point may be on another triangle where triangles of
-very different sizes meet. The error is then less than the distance between samples.
+"""Number of nearest samples whose triangles are tested exactly. Where triangles of very different sizes meet, the
+closest point may be on a triangle without such a sample. The error is then less than the distance between samples.
 """
 MOST_TRIANGLES = 5_000_000
 LEAST_EXTENT, MOST_EXTENT = 1e-6, 1e9
@@ -69,7 +67,7 @@ class ClosestPoints:
             )
         samples, self._triangle = _sampled(self._corners, areas)
         self._centre = samples.mean(0)
-        # float32 is precise enough for candidates once the mesh is centred and scaled to unit size.
+        # float32 is precise enough to select candidates once the mesh is centred and scaled to unit size.
         import cv2
 
         self._samples = np.ascontiguousarray(((samples - self._centre) / self.extent).astype(np.float32))

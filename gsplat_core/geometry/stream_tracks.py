@@ -142,7 +142,7 @@ class StreamTracks:
         return self.numbers[trusted], moved[trusted]
 
     def go_on(self, picture: SmallPicture, numbers: Numbers, pixels: Points) -> None:
-        """Accept a tracked picture with the given points."""
+        """Replace the tracker's state by a picture and the points found in it."""
         self.first = self.first[np.searchsorted(self.numbers, numbers)]
         self.picture, self.numbers, self.pixels = picture, numbers, pixels
 
@@ -151,7 +151,9 @@ class StreamTracks:
         self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
 
     def take_up(self) -> Numbers:
-        """Detect new corners if points are missing. Returns their numbers, which are larger than all earlier ones."""
+        """Detect new corners if at least a tenth of `MOST_POINTS` is missing. Returns their numbers, which are larger
+        than all earlier ones.
+        """
         picture, missing = self.picture, MOST_POINTS - len(self.numbers)
         if picture is None or missing < MOST_POINTS // 10:
             return np.zeros(0, np.int64)

@@ -87,7 +87,7 @@ def normals_of(depth: Array, camera: Camera) -> NDArray[np.float32]:
     """
     points = points_of(depth, camera)
     (across, has_across), (down, has_down) = (_tangent(points, joined(depth, camera, axis), axis) for axis in (1, 0))
-    normals = np.cross(down, across)  # x right, y down: towards the camera, where z is negative
+    normals = np.cross(down, across)  # with x right and y down, this points towards the camera
     length = np.linalg.norm(normals, axis=-1)
     good = has_across & has_down & (length > 0)
     normals = np.where(good[..., None], normals / np.where(length > 0, length, 1)[..., None], 0)

@@ -1,6 +1,6 @@
 """Tracking of points by sparse optical flow with forward-backward error (Kalal et al. 2010).
 
-Recordings are tracked from corners that are dropped when they become unreliable.
+`FeatureTracks` tracks corners through a recording and drops those that become unreliable.
 """
 
 from __future__ import annotations

@@ -205,7 +205,7 @@ def short(text: str | None) -> str | None:
 
 
 def frame_from(seq: int, pts_ns: int, fields: FrameFields, arrays: Mapping[str, NDArray[Any]], **changes: Any) -> Frame:
-    """Return the frame of its parts.
+    """Create a frame from its parts.
 
     Args:
         seq: sequence number.

@@ -77,7 +77,7 @@ def _read_obj(data: bytes) -> TriangleMesh:
         if parts and parts[0] == "v":
             vertices.append([float(value) for value in parts[1:4]])
         elif parts and parts[0] == "f":
-            # Counted from 1, or from the newest one backwards.
+            # OBJ indices count from 1, or if negative backwards from the newest vertex.
             numbers = [int(corner.split("/")[0]) for corner in parts[1:]]
             polygons.append([number - 1 if number > 0 else len(vertices) + number for number in numbers])
     return TriangleMesh(np.array(vertices, np.float64).reshape(-1, 3), _fans(polygons))

@@ -32,7 +32,7 @@ TIMES_FILE = "times.json"
 NODE_NAME = "reconstruction"
 """Object name in a `.glb`. Independent of the file name, so equal models give equal bytes."""
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
-"""Earliest timestamp of a zip archive, used so that equal models give equal bytes."""
+"""Earliest timestamp that a zip archive can store, used so that equal models give equal bytes."""
 
 
 def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool = False) -> int:

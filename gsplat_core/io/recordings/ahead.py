@@ -30,7 +30,7 @@ def read_ahead(items: Generator[T, None, None], name: str, ahead: int = ITEMS_AH
         yield from made.taken()
     finally:
         made.stop()
-        # the garbage collector may close the generator in any thread
+        # The garbage collector may close the generator in any thread, also in the producing one.
         if thread is not threading.current_thread():
             thread.join()
 

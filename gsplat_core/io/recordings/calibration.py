@@ -62,7 +62,7 @@ def default_calibration(
     """Return a default calibration with a warning: pinhole, f = 0.9 of the longer side, centred.
 
     Args:
-        poses_known: poses come from elsewhere, so nothing is assumed about them.
+        poses_known: True if the poses are read from another file, so that the warning does not mention them.
     """
     camera = default_camera(width_px, height_px)
     still = "" if poses_known else " and no camera motion"
@@ -389,8 +389,8 @@ def _matlab(paths: Sequence[Path], findings: Findings) -> StereoCalibration:
         )
 
     left, right = eye("Left"), eye("Right")
-    # All matrices are OpenCV's. The function transposes the intrinsics for MATLAB and not the rotation; the pictures agree with the rotation as it
-    # is written: rows of `scared_raw` are off by 0.40 px with it, by 0.69 px with its transpose.
+    # All matrices are OpenCV's. The MATLAB function transposes the intrinsics but not the rotation. The pictures agree
+    # with the rotation as stored: rows of `scared_raw` are off by 0.40 px with it, and by 0.69 px with its transpose.
     rotation = _shaped(value("rotationOfCameraMatrix"), (3, 3), "rotationOfCameraMatrix")
     translation = _shaped(value("translationOfCameraMatrix"), (3,), "translationOfCameraMatrix")
     return StereoCalibration(*left, *right, rotation, translation, paths[0].name)

@@ -119,7 +119,7 @@ class Contents:
         return read_ahead(self._read_beside(), f"read what lies beside the images of {printable(self.root.name)}")
 
     def _read_beside(self) -> Generator[_Beside, None, None]:
-        # Separate findings, because those of a frame read ahead belong to that frame's turn.
+        # Collect the findings of each frame separately, because the thread reads frames before it is their turn.
         found = Findings()
         rights = self.right.frames(found) if self.right else None
         for index in range(self.images.frame_count):

@@ -226,7 +226,8 @@ class PictureConverter:
 
     def picture(self, frame: av.VideoFrame) -> NDArray[np.uint8]:
         """Return an upright RGB uint8 picture [H, W, 3], with the same bytes as OpenCV."""
-        # By way of BGR: FFmpeg's conversions to RGB round otherwise for some formats. One thread: more take longer to wake than to convert.
+        # Convert by way of BGR, because FFmpeg's conversions to RGB round differently for some formats. Use one thread,
+        # because further threads take longer to wake than to convert.
         bgr = self._reformatter.reformat(frame, format="bgr24", interpolation=Interpolation.BICUBIC, threads=1)
         image = np.asarray(cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2RGB), dtype=np.uint8)
         if self._turns:

@@ -144,7 +144,7 @@ class DepthFiles:
             return None if header.shape == self._shape else self._other_shape(header.shape)
 
         try:
-            # values that overflow become infinite and are rejected as such
+            # Values that overflow become infinite. The check below rejects them.
             with np.errstate(over="ignore"):
                 return read_array(path, wrong).astype(np.float32)
         except UnreadableFile as error:

@@ -104,7 +104,7 @@ def frame_times(files: Sequence[Path], findings: Findings) -> tuple[float, ...] 
     """
     numbers = [number for path in files if (number := frame_number(path)) is not None]
     if len(numbers) < len(files) or len(set(numbers)) < 2:
-        return None  # names without numbers, or one number that is part of every name
+        return None  # The names have no number, or one constant number.
     for earlier, later, first, second in zip(numbers, numbers[1:], files, files[1:], strict=False):
         if later <= earlier:
             findings.problem(

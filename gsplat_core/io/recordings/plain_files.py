@@ -1,7 +1,7 @@
 """Bounded reading of a recording's files: regular files inside its folder, `.npy` arrays and still images.
 
-The header is checked first, then the size of the file, then the content. libjpeg repairs damage as it decodes and only warns, so its warnings are reported
-as damage.
+The header is checked first, then the size of the file, then the content. libjpeg repairs damage while decoding and only
+warns. Its warnings are therefore reported as damage.
 """
 
 from __future__ import annotations
@@ -182,7 +182,8 @@ class Picture:
     image: NDArray[np.uint8]
     """RGB uint8 [H, W, 3]."""
     damage: str | None = None
-    """Reason why parts may be the decoder's guess; None without any sign of damage."""
+    """Description of damage, after which parts may be the decoder's error concealment; None without any sign of damage.
+    """
 
 
 class DamagedFrames:
@@ -213,7 +214,7 @@ class DamagedFrames:
         return ", ".join(runs + ["…"] * self._more)
 
     def sentence(self, frames: int) -> str:
-        """Return the sentence that reports damaged frames to a reader of the results."""
+        """Return the sentence that reports damaged frames, for the notes of a result."""
         are = "frame is" if self.count == 1 else "frames are"
         return (
             f"{self.count} of {frames} {are} damaged ({self.numbers()}): shown, but neither trained on nor scored; "

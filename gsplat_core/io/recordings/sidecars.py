@@ -42,7 +42,7 @@ _FILES = (DESCRIPTION_FILE, POSES_FILE, "poses_bounds.npy", "cameras.json", "val
 
 
 class Beside:
-    """Reader of the sidecars in a recording's folder; `folder=None` means that it has none."""
+    """Reader of the sidecar files in a recording's folder. With `folder=None` it finds none."""
 
     def __init__(self, folder: Path | None, images: FrameImages, findings: Findings) -> None:
         self._folder = folder
@@ -61,7 +61,7 @@ class Beside:
         return (_read_description(path, self._size, self._findings) if path else None) or {}
 
     def poses(self) -> Calibration | None:
-        """Read the cameras of `poses_bounds.npy`."""
+        """Return the calibration stored in `poses_bounds.npy`, or None."""
         path = self._file("poses_bounds.npy")
         return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
 
@@ -71,17 +71,17 @@ class Beside:
         return read_poses(path, self._images.frame_count, self._findings) if path else None
 
     def right(self) -> ImageFiles | None:
-        """Return the images of the right eye."""
+        """Return the reader of the right eye's images, or None."""
         files = self._sequence("images_right", "right image")
         return ImageFiles(files, *self._size) if files else None
 
     def masks(self) -> MaskFiles | None:
-        """Return the tool masks."""
+        """Return the reader of the tool masks, or None."""
         files = self._sequence("masks", "mask")
         return MaskFiles(files) if files else None
 
     def depth(self, unit_mm: float | None) -> DepthFiles | None:
-        """Return the depth maps; `unit_mm` is the length of one grey value, None if not stated."""
+        """Return the reader of the depth maps, or None. `unit_mm` is the length of one grey value, None if not stated."""
         files = self._sequence("depth", "depth map")
         if not files:
             return None

@@ -1,4 +1,4 @@
-"""Held-out split of the field: frames with (i - 1) % 8 == 0 (1, 9, 17, …) for testing.
+"""Held-out split customary for endoscopic reconstruction: frames with (i - 1) % 8 == 0 (1, 9, 17, …) are test frames.
 
 EndoGaussian, Deform3DGS and SurgicalGaussian use it on EndoNeRF's clips, which have no official split.
 """

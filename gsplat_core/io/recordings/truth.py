@@ -222,7 +222,7 @@ def _read_motion(path: Path, channels: int, frame: Frame) -> NDArray[np.float32]
         shape = header.shape
         if len(shape) != 3 or shape[2] != channels or not 0 < shape[0] * shape[1] <= MAX_PIXELS:
             return f"it is {list(shape)!s:.80} in place of [rows, columns, {channels}]"
-        # Pictures that were read at another size are as wide for their height, up to rounding.
+        # Pictures read at another size have the same aspect ratio, up to rounding.
         unlike = abs(shape[0] * frame.width_px - shape[1] * frame.height_px) > max(shape[:2])
         return f"it is {list(shape)}, and the frame {frame.width_px}x{frame.height_px}" if unlike else None
 

@@ -224,7 +224,7 @@ class LogWriter:
         data = line.as_json() + b"\n"
         written = self._file.write(data)
         self.bytes += written
-        # a disk that fills up accepts a part; the next write raises the error
+        # A disk that fills up may accept a part of the line. The next write then raises the error.
         if written != len(data):
             self.bytes += self._file.write(data[written:])
 

@@ -166,7 +166,7 @@ class TrackWriter:
         self._stream.pix_fmt = PIXEL_FORMATS[coding]
         context = self._stream.codec_context
         context.time_base = _MS
-        # One thread, so that encoding does not take processor time from the graph.
+        # Use one thread, so that encoding does not take processor time from the pipeline's other operators.
         context.thread_count = 1
         if coding == "vp9":
             context.gop_size = max(1, round(2 * fps))
@@ -202,7 +202,7 @@ class TrackWriter:
 
     def abandon(self) -> None:
         """Release the file without finishing it."""
-        with suppress(OSError, av.FFmpegError):  # it could not be written before either
+        with suppress(OSError, av.FFmpegError):  # closing a file that failed before may fail again
             self._container.close()
         self._file.close()
 
@@ -245,7 +245,7 @@ class TrackIndex:
             size = file.seek(0, io.SEEK_END)
             for cluster in islice(whole_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
                 rising = cluster.time < _MOST_MS and (not self._times or cluster.time > self._times[-1])
-                if not cluster.intact or not rising:  # our writer's times rise
+                if not cluster.intact or not rising:  # `TrackWriter` writes increasing timestamps
                     break
                 self._times.append(cluster.time)
                 self.end = cluster.end

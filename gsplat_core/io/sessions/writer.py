@@ -316,7 +316,7 @@ class SessionWriter:
         }
 
     def _go_on(self) -> None:
-        """Sync, start the next segment and delete old ones when due; called before each line."""
+        """Sync, start the next segment and delete old segments, each when due. Called before each line."""
         now = self.options.clock()
         if now - self._synced_ns >= SYNC_S * 1e9:
             self._segment.sync()
@@ -365,7 +365,7 @@ class SessionWriter:
 
 
 def _said(frame: Frame) -> dict[str, Any]:
-    """Return the fields of a frame's log line except its tracks."""
+    """Return the fields of a frame for its log line, without the tracks."""
     return {
         **fields_of(frame),
         "seq": frame.seq,

@@ -56,7 +56,7 @@ def adam_step_queued(
         learning_rate: learning rate.
         betas: decay rates of the moments.
         epsilon: term added to the denominator.
-        row_size: number of values that are updated together or not at all; divides the number of values.
+        row_size: number of consecutive values that form a row; divides the number of values.
 
     Returns:
         Number of skipped rows, int64 [] on the device.

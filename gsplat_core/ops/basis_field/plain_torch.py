@@ -43,7 +43,7 @@ def basis_field(
     u = (tau - centers) * torch.exp(-log_widths)
     inactive = u.abs() > BUMP_REACH
     bumps = torch.exp(-(u.masked_fill(inactive, 0.0) ** 2)).masked_fill(inactive, 0.0)
-    # Masked, so that values in inactive rows, even NaN, have no effect.
+    # Mask the weights, so that those of inactive bumps have no effect, even if NaN.
     deltas = (bumps[..., None] * weights.masked_fill(inactive[..., None], 0.0)).sum(dim=1)
     return torch.nn.functional.pad(deltas, (0, RAW_COLUMNS - deltas.shape[1])) if padded else deltas
 

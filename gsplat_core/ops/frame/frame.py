@@ -39,9 +39,8 @@ TILE_SIZE = 16
 MAX_SEGMENT = 1024
 """Largest capacity of a tile's own segment, in instances."""
 STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)
-"""Entries of `Frame.status`.
-
-They are the frame's instances, the largest number in a tile, and 1 if instances were dropped.
+"""Indices into `Frame.status`: number of instances of the frame, largest number in a tile, and 1 if instances were
+dropped.
 """
 
 
@@ -68,7 +67,7 @@ class Frame(NamedTuple):
     Depth is the weighted mean of z, or the weighted sum when training.
     """
     alphas: Tensor
-    """[H, W]."""
+    """Accumulated opacity [H, W]."""
     last: Tensor
     """Index in `sorted` of the last blended instance, int32 [H, W]; -1 for none. Empty unless training."""
     records: Tensor

@@ -28,12 +28,12 @@ class View(NamedTuple):
     width: int
     height: int
     background: Tensor | None = None
-    """[3]; black where None."""
+    """Background colour [3]; None for black."""
     camera_model: str = "pinhole"
     eps2d: float = EPS2D
     near_plane: float = NEAR_PLANE
     far_plane: float = FAR_PLANE
-    """The last four as in `gsplat_core.rasterization`."""
+    """Camera model, blur and clipping planes have the meaning and defaults of `gsplat_core.rasterization`."""
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -53,7 +53,7 @@ def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: Any
     raw, sh = torch.ops.gsplat_core.render_frame_backward(
         list(gaussians), deltas, *view, list(forward), v_image, v_alphas, ctx.eps2d, ctx.camera_model, True
     )
-    # Return copies: autograd may accumulate in place, and these views share memory.
+    # Return copies, because autograd may accumulate in place and these views share memory.
     sh_gradient = raw[:, None, COLOUR] if gaussians[4].shape[1] == 1 else sh
     columns = raw[:, POSITION], raw[:, ROTATION], raw[:, LOG_SCALE], raw[:, OPACITY.start], sh_gradient
     own = [column.clone() if needed else None for column, needed in zip(columns, of_gaussians, strict=True)]

@@ -40,8 +40,11 @@ class TrainingState(NamedTuple):
     hidden: Tensor
     """Outputs of the trunk's layers, zero-padded, [depth, N, padded width]."""
     order: Tensor
-    """int32 [3, 3 * levels * N]: items (plane after plane, Gaussian after Gaussian) sorted by the cell of the plane; the index of each
-    item among the sorted ones; and the cells of the sorted items, with their highest bit set if they have 8 items or more (dense)."""
+    """int32 [3, 3 * levels * N]. An item is a pair of plane and Gaussian, numbered plane after plane.
+
+    The rows are: the items sorted by the cell of the plane; the index of each item among the sorted ones; and the cells
+    of the sorted items. The highest bit of a cell is set if the cell has 8 items or more (dense).
+    """
     starts: Tensor
     """Start of each cell's items, int32 [cells + 1]."""
 
@@ -52,8 +55,11 @@ class FieldGradient(NamedTuple):
     network: Tensor
     """Weight and bias of every layer, concatenated."""
     rows: Tensor
-    """[2, 3 * levels * N, C]: gradients of the samples of the space planes (xy, xz, yz of every level) and of the lines of their major
-    axes (y, x, z), sorted by the cell of the plane."""
+    """Gradients of samples [2, 3 * levels * N, C], sorted by the cell of the plane.
+
+    The first part belongs to the space planes (xy, xz, yz of every level), the second to the lines of their major axes
+    (y, x, z).
+    """
     fractions: Tensor
     """Interpolation fractions along the major and minor axis, [3 * levels * N, 2], in the same order."""
     dense_sums: Tensor

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 
 PLAIN_COLORS = -1
-"""Value of the degree for plain colours, at most `MOST_PLAIN_COLORS` channels."""
+"""Value of `Options.degree` for plain colours without spherical harmonics, at most `MOST_PLAIN_COLORS` channels."""
 MOST_PLAIN_COLORS = 3
 NO_DEPTH, DEPTH_SUM, EXPECTED_DEPTH = range(3)
 TILE_SIZE = 16
@@ -41,7 +41,7 @@ class Options(NamedTuple):
     """Number of colour channels, 0 to 3."""
     depth_mode: int
     antialiased: int
-    """1 or 0, as the next two."""
+    """1 or 0, as the next two fields."""
     packed: int
     absgrad: int
 
@@ -72,7 +72,7 @@ class Inputs(NamedTuple):
 
     means: Tensor
     covars: Tensor | None
-    """Upper triangles [..., N, 6]; None if the next two are given."""
+    """Upper triangles of the covariances [..., N, 6]; None if quaternions and scales are given."""
     quats: Tensor | None
     scales: Tensor | None
     opacities: Tensor
@@ -185,7 +185,7 @@ class _Project(Function):
         v_means2d, v_depths, v_conics, v_opacities, v_records = v
         *inputs, radii, row_of = ctx.saved_tensors
         wanted = list(ctx.needs_input_grad[1:])
-        wanted[-1] = False  # the other node returns the background's gradient
+        wanted[-1] = False  # the other autograd node returns the background's gradient
         if v_opacities is not None and not v_opacities.numel():
             v_opacities = None
         gradients = [v_records, v_means2d, v_depths, v_conics, v_opacities]

@@ -77,6 +77,6 @@ class Lamp:
             if nearest_mm2:
                 distance2 = np.maximum(distance2, np.float32(nearest_mm2))
             along = np.clip(-(to_light @ self.axis), 0, 1)
-            # Fibres shine in a cone about the beam's middle.
+            # A fibre's light falls off with the angle from the beam axis.
             found.append((to_light, np.float32(0.5 * self.reference_mm**2) / distance2 * along**2))
         return found

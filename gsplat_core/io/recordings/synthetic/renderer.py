@@ -52,7 +52,7 @@ def shade_tissue(
         light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
     shade = _tool_shade(parts, camera, local, lamp)
     diffuse = (light_diffuse * shade)[..., None]
-    # Light scattered inside tissue emerges red. Raise red where little direct light arrives.
+    # Light scattered inside tissue emerges red. Add red where little direct light arrives.
     bleed = np.array([0.060, 0.014, 0.010], np.float32) * np.sqrt(np.maximum(diffuse, 0))
     wet = (light_wet * shade * reflectance[..., 3])[..., None] * np.array([1.0, 0.97, 0.93], np.float32)
     return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)

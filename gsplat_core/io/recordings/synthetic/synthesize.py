@@ -199,12 +199,12 @@ class FrameFiles:
 
 
 def save_image(path: Path, image: NDArray[np.uint8]) -> None:
-    """An RGB image as PNG."""
+    """Write an RGB image as PNG."""
     _save(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 
 
 def save_depth(path: Path, depth: NDArray[Any]) -> None:
-    """Depth in mm as 16 bit PNG in units of DEPTH_UNIT_MM."""
+    """Write depth in mm as 16-bit PNG in units of DEPTH_UNIT_MM."""
     _save(path, np.round(depth / np.float32(DEPTH_UNIT_MM)).astype(np.uint16))
 
 
@@ -395,6 +395,6 @@ def _write_frames(files: FrameFiles, frames: int, progress: Callable[[int, int],
             if progress is not None:
                 progress(done, frames)
     finally:
-        pool.shutdown(cancel_futures=True)  # after Ctrl-C or a full disk the frames not begun are not rendered
+        pool.shutdown(cancel_futures=True)  # after Ctrl-C or a write error, cancel frames that have not started
     files.finish(rows)
     describe(files, frames)

@@ -109,7 +109,7 @@ class TissueTexture:
         """[S, S, 2]: the relief's derivatives by u and v."""
 
     def sample(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Reflectance and wetness [H, W, 4] and relief slopes [H, W, 2] of material points [H, W]."""
+        """Return reflectance and wetness [H, W, 4] and relief slopes [H, W, 2] of material points [H, W]."""
         column = (u + np.float32(HALF_EXTENT_MM)) / np.float32(self.texel_mm) - np.float32(0.5)
         row = (v + np.float32(HALF_EXTENT_MM)) / np.float32(self.texel_mm) - np.float32(0.5)
         reflectance = cv2.remap(self.reflectance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)

@@ -63,7 +63,7 @@ class ToolMotion:
         radius = 15 * np.sqrt(rng.uniform(0.05, 1, cycles + 1))
         self._grasps = np.stack([radius * np.cos(angle) - 4, 0.75 * radius * np.sin(angle) - 3], axis=1)
         side = rng.uniform(-0.6, 0.6, cycles + 1)
-        # Towards the port and off the surface.
+        # Pull towards the port and away from the surface.
         self._pulls = np.stack([2.8 + side, 1.8 - side, np.full(cycles + 1, -6.0)], axis=1)
 
     def tug(self, time_s: float) -> Tug:
@@ -176,7 +176,7 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
     normal = np.zeros((count, 3), np.float32)
     material = np.zeros(count, np.int8)
     if touching.size:
-        # A ray that only grazes is shaded where it comes closest.
+        # A ray that only grazes the tool is shaded where it comes closest.
         at = start + rays[touching] * reach[touching][:, None]
         which = distance(parts, at)[1]
         material[touching] = np.array([part.material for part in parts], np.int8)[which]

@@ -56,7 +56,7 @@ def seen_points(scene: SyntheticScene, eye: Eye, time_s: float) -> NDArray[np.bo
     column, row = (np.floor(pixels[:, k]).astype(int) for k in (0, 1))
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
     column, row = column.clip(0, width - 1), row.clip(0, height - 1)
-    # Half a pixel away the surface may be a little nearer: allow for its slope.
+    # Half a pixel away the surface may be slightly nearer. Allow for its slope.
     slope = np.hypot(*np.gradient(eye.tissue_depth))[row, column]
     in_front = z <= eye.tissue_depth[row, column] + HIDDEN_MM + slope
     return np.asarray(inside & in_front & ~eye.tool[row, column])
