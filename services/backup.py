@@ -55,15 +55,15 @@ class BackupFailed(UserError):
 
 @dataclass(frozen=True)
 class Places:
-    """Locations of the data that belongs into a backup."""
+    """Folders of a service whose data belongs in a backup."""
 
     data: Path
     recordings: Path
     replays: Path
     database_is_ours: bool
-    """False for PostgreSQL, which has its own backup tools."""
+    """True for SQLite, which is part of the backup; False for PostgreSQL, which has its own backup tools."""
     blobs_are_ours: bool
-    """False for an object store, which has its own backup tools."""
+    """True for model files in a folder, which are part of the backup; False for an object store."""
 
     @classmethod
     def of(cls, settings: ServiceSettings) -> Places:
@@ -85,7 +85,7 @@ class Places:
 
 @dataclass(frozen=True)
 class Backup:
-    """Backup that was made or checked."""
+    """Properties of a backup, returned after it was made, checked or restored."""
 
     files: int
     size_bytes: int
@@ -93,7 +93,7 @@ class Backup:
     version: str
     """Version of the program that made the backup."""
     elsewhere: tuple[str, ...]
-    """Data not in the backup, which needs other means of backup."""
+    """Names of data outside of the backup (PostgreSQL, object store), which need their own backup."""
     missing: tuple[str, ...]
     """Rows of the database whose files were already missing at the time of the backup."""
     audit: str
@@ -182,7 +182,7 @@ def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
             for _, target in staged:
                 sync_folder(target)
         except OSError as error:
-            stages.pop_all()  # they mark the folders as incomplete
+            stages.pop_all()  # keep the staging folders, which mark the targets as incomplete
             raise BackupFailed(
                 f"the backup was not restored as a whole: {error}; empty the folders and try again"
             ) from error
@@ -190,10 +190,10 @@ def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
 
 
 def refuse_unfinished_restore(settings: ServiceSettings) -> None:
-    """Check that no restore into the folders of a service was stopped before its end.
+    """Check that the folders of a service contain no staging folder of an unfinished restore.
 
     Raises:
-        BackupFailed: if one was, or if it still runs.
+        BackupFailed: if a restore was interrupted, or still runs.
     """
     places = Places.of(settings)
     for target in (places.data, places.recordings, places.replays):
@@ -238,7 +238,7 @@ def _fill(places: Places, folder: Path) -> Backup:
             _copy_database(places.database, data / "registry" / DATABASE_FILE)
         _copy_files(places, data)
         missing = set(map(str, _missing(data))) if (data / "registry" / DATABASE_FILE).exists() else set()
-        if missing in (set(), known):  # files missing twice are missing in the service itself
+        if missing in (set(), known):  # files missing in two copies are missing in the service itself
             break
         known = missing
     _copy_audit(places.data, data)
@@ -288,7 +288,7 @@ def _require_space(folder: Path, wanted: int) -> None:
 
 
 def _sources(places: Places) -> dict[str, Path]:
-    """Return the copied folders, by their place in the backup."""
+    """Return the service's folders to be copied, by their path in the backup."""
     found = {"recordings": places.recordings, "replays": places.replays, "snapshots": places.data / "snapshots"}
     return found | ({"registry/blobs": places.data / "registry" / "blobs"} if places.blobs_are_ours else {})
 
@@ -364,7 +364,7 @@ def _missing(data: Path) -> list[Any]:
     engine = sa.create_engine(f"sqlite:///{(data / 'registry' / DATABASE_FILE).absolute()}")
     try:
         with engine.connect() as connection:
-            # Without a folder of files in the backup, the registry uses an object store.
+            # A backup without a blob folder is from a service whose registry uses an object store.
             return missing_files(
                 connection, StoredFiles(data / "recordings", data / "replays", blobs if blobs.is_dir() else None)
             )

@@ -46,7 +46,7 @@ class ClockGuard:
 
     @property
     def doubt(self) -> str | None:
-        """Check the clock. Returns a message while it is not trusted, otherwise None."""
+        """Check the clock. Return the reason while it is not trusted, otherwise None."""
         with self._lock:
             self._look()
             if self._since_s is None:

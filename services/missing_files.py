@@ -40,7 +40,7 @@ class StoredFiles:
 
 @dataclass(frozen=True)
 class MissingFile:
-    """Row without its file."""
+    """Row of the database whose file is missing."""
 
     kind: str
     """`model`, `recording` or `replay`."""
@@ -53,7 +53,8 @@ class MissingFile:
 
 
 def missing_files(connection: sa.Connection, files: StoredFiles) -> list[MissingFile]:
-    """Return the rows whose files are missing. Missing tables count as empty."""
+    """Return the models, recordings and replays in the database whose files are missing. Missing tables count as
+    empty."""
     tables = set(sa.inspect(connection).get_table_names())
     looked_at = {"versions": _models, "recordings": _recordings, "jobs": _replays}
     return [each for table, rows in looked_at.items() if table in tables for each in rows(connection, files)]
@@ -99,8 +100,8 @@ FRESH_S = 60.0
 
 
 class StoredFilesWatch(Collector):
-    """Watch on missing files. /readyz needs no key and reports numbers only; names are in the log
-    and the API states."""
+    """Periodic check for missing files. /readyz reports only their number, because it can be read without a key.
+    The log and the states in the API have the names."""
 
     def __init__(
         self,
@@ -129,7 +130,7 @@ class StoredFilesWatch(Collector):
         yield
 
     def missing(self) -> list[MissingFile]:
-        """Return rows whose files are missing, cached for `FRESH_S`.
+        """Return the rows whose files are missing, from a check that is at most `FRESH_S` old.
 
         Raises:
             StoreUnavailable: if the database does not answer.

@@ -77,7 +77,7 @@ class StreamMessages:
         return picture.pack() + camera.pack() + self.state(said, at_s)
 
     def state(self, said: str, at_s: float | None = None) -> bytes:
-        """Pack a STRING with the state of the picture."""
+        """Pack a STRING message with the text `said`, the state of the picture, at Unix time `at_s` (None: now)."""
         message: bytes = self._library.StringMessage(
             said, timestamp=at_s or time.time(), device_name=f"{self._name}_State"
         ).pack()
@@ -108,7 +108,7 @@ class MessageServer:
     """Server that sends each client the newest message once the previous one is sent."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Listen at an address.
+        """Start to listen at an address.
 
         Raises:
             OutputError: if that fails.
@@ -184,8 +184,8 @@ class MessageServer:
             client.close()
 
     def _newer_than(self, sent: int, client: socket.socket) -> tuple[int, bytes] | None:
-        """Return the newest message and its number. Empty after a timeout; None if the client has
-        left or the server closes."""
+        """Wait for a message newer than number `sent`. Return its number and bytes; `(sent, b"")` after a timeout;
+        None if the client has disconnected or the server closes."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._number > sent, 0.5)
             if self._closed:

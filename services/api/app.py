@@ -1,4 +1,4 @@
-"""Application factory: routes, guards and limits around the given parts."""
+"""Application factory: routes, access guards and limits for the components of a server."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
     for folder in (data, uploads):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     keep = settings.audit
-    # Opened first: its lock proves that no other server uses these folders.
+    # The audit log is opened before the stores, because its lock excludes other servers from these folders.
     audit = AuditLog(
         data / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days, parts.trusts_ages)
     )

@@ -1,4 +1,4 @@
-"""Assembly of a server's parts from its settings."""
+"""Construction of a server's components (streams, models, recordings, replays, exports) from its settings."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Archive:
-    """Recording and replay parts of a server."""
+    """Components of a server for recordings and replay jobs."""
 
     recordings: RecordingStore
     recording_retention: RecordingRetention
@@ -68,13 +68,12 @@ class Archive:
 def new_archive(
     settings: ServiceSettings, events: SystemEvents, trusts_ages: Callable[[], bool] = lambda: True
 ) -> Archive:
-    """Create the parts from the settings. The registry must already have created the database
-    folder.
+    """Create the components for recordings and replays. The registry must already have created the database folder.
 
     Args:
         settings: settings of the service.
         events: receives events for the audit log.
-        trusts_ages: returns True if data may be deleted by age now.
+        trusts_ages: returns True while the clock is trusted, so that data may be deleted by age.
 
     Raises:
         StoreUnavailable: if the database or the folders cannot be used.
@@ -160,7 +159,7 @@ ERRORS: dict[type[Exception], type[Problem]] = {
 
 
 def assembled(settings: ServiceSettings) -> Parts:
-    """Create all parts of the control plane.
+    """Create all components of the control plane.
 
     Raises:
         RuntimeFolderUnusable: if the runtime folder cannot be used.
@@ -183,7 +182,7 @@ def assembled(settings: ServiceSettings) -> Parts:
 
     async def streams_are_well() -> CheckResult:
         unwell = [stream for stream in streams.all() if stream.state in ("failed", "source lost")]
-        # without reasons, because /readyz needs no key
+        # The reasons are left out, because /readyz can be read without a key.
         said = "; ".join(f"{stream.name}: {stream.state}" for stream in unwell)
         return CheckResult(not unwell, said or "no stream has failed or lost its source", needed=False)
 
@@ -233,8 +232,8 @@ def assembled(settings: ServiceSettings) -> Parts:
 def event_receiver(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEvent], None]:
     """Return the receiver of process events, for metrics and audit log.
 
-    The audit log records a reason only if the supervisor worded it. Other texts could contain a
-    file name that identifies a patient.
+    The audit log records a reason only if its text is composed by the supervisor. A text from the stream process could
+    contain a file name that identifies a patient.
     """
 
     def tell(event: StreamEvent) -> None:

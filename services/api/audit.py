@@ -36,7 +36,7 @@ def wanted_of(
     since: Annotated[Moment | None, Query(description="Start time (inclusive), with a time zone.")] = None,
     until: Annotated[Moment | None, Query(description="End time (exclusive), with a time zone.")] = None,
 ) -> Wanted:
-    """Build the filter from the query parameters."""
+    """Build the filter of audit entries from the query parameters."""
     return Wanted(event, actor, subject, outcome, since, until)
 
 
@@ -93,7 +93,7 @@ async def export_audit(
 
 
 def _said(wanted: Wanted) -> dict[str, Any]:
-    """Return a filter as the detail of an audit entry."""
+    """Return a filter's values as the detail of the audit entry that records the search."""
     times = {name: time.isoformat() for name in ("since", "until") if (time := getattr(wanted, name)) is not None}
     names = ("event", "actor", "subject", "outcome")
     return {name: value for name in names if (value := getattr(wanted, name)) is not None} | times

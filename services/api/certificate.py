@@ -1,4 +1,4 @@
-"""The server's TLS certificate: loaded again when its files change, its expiry in /readyz and in the metrics."""
+"""The server's TLS certificate: reloaded when its files change, with its expiry in /readyz and in the metrics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from services.schemas.service import CheckResult
 
 log = logging.getLogger(__name__)
 LOOK_S = 2.0
-"""Time between two looks at the files."""
+"""Interval in seconds at which the files are checked for changes."""
 _CERTIFICATE = re.compile(r"-----BEGIN CERTIFICATE-----.+?-----END CERTIFICATE-----", re.DOTALL)
 _SEQUENCE, _VERSION, _UTC_TIME = 0x30, 0xA0, 0x17
 
@@ -30,12 +30,12 @@ _SEQUENCE, _VERSION, _UTC_TIME = 0x30, 0xA0, 0x17
 class ServerCertificate(Collector):
     """Certificate chain and key of a server, reloaded when the files change.
 
-    New connections get the newest pair that loaded successfully. A pair that fails to load is
-    logged, the previous one stays in use, and /readyz reports degraded.
+    New connections use the newest chain and key that loaded successfully. If new files fail to load, the error is
+    logged, the previous chain and key stay in use, and /readyz reports degraded.
     """
 
     def __init__(self, certfile: Path, keyfile: Path, events: SystemEvents | None = None) -> None:
-        """Load the pair.
+        """Load the certificate chain and its key.
 
         Raises:
             OSError: if loading fails (ssl.SSLError is a subclass).
@@ -52,7 +52,7 @@ class ServerCertificate(Collector):
         return datetime.fromtimestamp(self._expires_s, UTC)
 
     def attach(self, context: ssl.SSLContext) -> None:
-        """Make connections of a listening context use the newest pair."""
+        """Make new connections of a listening TLS context use the newest chain and key."""
 
         def choose(connection: ssl.SSLObject | ssl.SSLSocket, name: str | None, _: ssl.SSLContext) -> None:
             connection.context = self._context
@@ -61,10 +61,10 @@ class ServerCertificate(Collector):
         context.sni_callback = choose
 
     def look(self) -> bool:
-        """Reload the files if they changed.
+        """Reload chain and key if their files changed.
 
         Returns:
-            True if a new pair is in use.
+            True if a new chain and key are in use.
         """
         stamp = self._stamp_now()
         if stamp == self._stamp:
@@ -85,7 +85,7 @@ class ServerCertificate(Collector):
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """Poll the files for changes while the block runs."""
+        """Check the files for changes periodically while the block runs."""
         looking = asyncio.create_task(self._watch(), name="changes of the certificate")
         try:
             yield

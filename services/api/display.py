@@ -27,7 +27,7 @@ from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
 LOOK_S = 1.0
-"""Seconds between two checks of a viewer's key."""
+"""Interval in seconds at which an open display checks that its viewer's key is still valid."""
 REFUSED = 1008
 REFUSED_WHY = "the key was revoked or has expired"
 
@@ -85,31 +85,32 @@ def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) 
 
 @dataclass
 class Ending:
-    """Reason why a display ended; filled when the block ends."""
+    """Reason for the end of a display, set when the block of `until_ended` ends."""
 
     refused: bool = False
-    """The viewer's key was revoked or has expired."""
+    """True if the display ended because the viewer's key was revoked or has expired."""
 
 
 @asynccontextmanager
 async def until_ended(
     connection: HTTPConnection, left: Coroutine[Any, Any, None], caller: Caller
 ) -> AsyncIterator[Ending]:
-    """Run a block until the display has to end.
+    """Run a block, and cancel it when the display has to end.
 
     The block is cancelled when the server drains, `left` returns, the connection breaks, or the caller's key becomes
     invalid.
 
     Args:
         connection: the viewer's connection.
-        left: returns when the viewer has left.
+        left: coroutine that returns when the viewer disconnects.
         caller: checked every `LOOK_S`.
 
     Yields:
         The reason, readable after the block.
 
     Raises:
-        ViewerStalled: if the connection accepts nothing more; waiting for the close would block forever.
+        ViewerStalled: if the connection accepts no more data, so that waiting for its orderly close would block
+        forever.
     """
     control = control_of(connection)
     stalled: ViewerStalled | None = None

@@ -1,4 +1,4 @@
-"""Guard of every route, and audit entries of changes.
+"""Access check of every route, and audit entries of changes.
 
 Every route declares its role, which is checked before any byte of the body is read. A change is written to the audit log before the caller gets the answer.
 """
@@ -26,7 +26,7 @@ from services.auth.roles import ANYBODY, Caller, Role
 JSON = "application/json"
 MOST_TOKEN_LENGTH = 256
 BodyLimit = Literal["body_bytes", "model_bytes", "recording_bytes"]
-"""Setting that limits the body size."""
+"""Names of the settings in `limits` that limit the size of a request body."""
 Scope = Literal["all", "stream", "any"]
 """Access of stream-limited keys to a route. `all`: none. `stream`: if the path parameter `name` is
 one of the key's streams. `any`: always, because the route itself checks `Caller.streams`."""
@@ -141,7 +141,7 @@ CallerOf = Annotated[Caller, Depends(_caller_of)]
 def still_valid(control: ControlState, caller: Caller) -> bool:
     """Return False once a caller lost access: key revoked, expired or changed in role or streams, or token expired.
 
-    For connections that outlast their admission, such as displays.
+    Long connections, such as displays, call this repeatedly.
     """
     if caller.federated:
         return caller.expires_at is None or time.time() < caller.expires_at

@@ -79,7 +79,7 @@ def _log_uncaught(kind: type[BaseException], error: BaseException | None, trace:
 
 
 def say_start(*lines: str) -> None:
-    """Log the service's addresses regardless of the log level, because launch scripts wait for these lines."""
+    """Log lines with the service's addresses regardless of the log level, because launch scripts wait for them."""
     logger = logging.getLogger("intrasplat.start")
     logger.setLevel(logging.INFO)
     for line in lines:
@@ -87,7 +87,7 @@ def say_start(*lines: str) -> None:
 
 
 def _is_no_refused_websocket(record: logging.LogRecord) -> bool:
-    """Filter out uvicorn's error for refused WebSockets, which the request log already records."""
+    """Log filter: return False for uvicorn's error about a refused WebSocket, which the request log already records."""
     return record.getMessage() != "ASGI callable returned without completing handshake."
 
 

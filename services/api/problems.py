@@ -152,7 +152,7 @@ class Unavailable(Problem):
 
 
 class NotBuiltIn(Unavailable):
-    """The server runs without the part that the request needs."""
+    """The server runs without the component that the request needs."""
 
     title = "Not built into this server"
 
@@ -177,7 +177,7 @@ TITLES: dict[int, str] = {status: kind.title for status, kind in OF_STATUS.items
 }
 log = logging.getLogger(__name__)
 KNOWN: dict[type[Exception], type[Problem]] = {AuditUnwritable: Unavailable}
-"""Errors of base packages and the problem each maps to. `Parts.errors` adds those of the parts."""
+"""Errors of base packages and the problem each maps to. `Parts.errors` adds the exceptions of the components."""
 OF_ERRNO: dict[int, type[Problem]] = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), NoSpace),
     **dict.fromkeys((errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE), Unavailable),
@@ -231,7 +231,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
 
     Args:
         app: the application to extend.
-        errors: problem type for each error type of the parts, in addition to `KNOWN`.
+        errors: problem type for each exception type of the components, in addition to `KNOWN`.
     """
 
     async def on_problem(connection: HTTPConnection, error: Exception) -> Response | None:
@@ -290,7 +290,8 @@ def _methods_of(app: FastAPI, connection: HTTPConnection) -> str:
 
 
 def _of_validation(error: RequestValidationError | WebSocketRequestValidationError) -> Problem:
-    """Describe a validation error by location and message. Values are left out because they may be secrets."""
+    """Convert a validation error to a problem with location and message. Values are left out because they may be
+    secrets."""
     errors = [{"at": ".".join(str(part) for part in each["loc"]), "what": each["msg"]} for each in error.errors()]
     said = "; ".join(f"{each['at']}: {each['what']}" for each in errors[:3])
     return Unprocessable(f"{said}; /docs describes what is expected", errors=errors[:20])

@@ -33,12 +33,12 @@ BatchId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["8f20c9a35d7e
 
 
 def jobs_of(connection: HTTPConnection) -> Replays:
-    """Return the job store of this server."""
+    """Return the replay jobs of this server. Raises NotBuiltIn if the server has none."""
     return part(connection, lambda parts: parts.jobs, "replays")
 
 
 def view_of(jobs: Replays, job_id: str) -> ReplayView:
-    """Return a replay with its available results."""
+    """Return the API record of a replay, with the names of its result files."""
     job = jobs.get(job_id)
     return ReplayView.model_validate(job).model_copy(update={"results": list(jobs.files(job))})
 

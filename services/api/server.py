@@ -110,7 +110,7 @@ class AddressBound:
             return key
 
     def leave(self, key: str) -> None:
-        """Discount a closed connection."""
+        """Uncount a closed connection; `key` is the result of `enter`."""
         with self._lock:
             self._open[key] -= 1
             if self._open[key] <= 0:
@@ -172,19 +172,19 @@ class BoundedListener(socket.socket):
 
 
 class _Connection(socket.socket):
-    """Connection that calls `left` once when it is closed or detached."""
+    """Accepted connection that calls `left` once when it is closed or detached."""
 
     left: Callable[[], None] | None = None
 
     def close(self) -> None:
-        """Close the connection and discount it."""
+        """Close the connection and uncount it."""
         super().close()
         left, self.left = self.left, None
         if left is not None:
             left()
 
     def detach(self) -> int:
-        """Release the descriptor and discount the connection."""
+        """Release the descriptor and uncount the connection."""
         left, self.left = self.left, None
         if left is not None:
             left()
@@ -195,8 +195,8 @@ SOCKET, WATCHDOG_US, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_
 
 
 class ServiceManager:
-    """Client of the systemd notification socket. Removes the variables from the environment, so
-    child processes cannot notify."""
+    """Client of the systemd notification socket. The constructor removes systemd's variables from the environment,
+    so that child processes cannot send notifications."""
 
     def __init__(self, environment: MutableMapping[str, str] | None = None) -> None:
         found = os.environ if environment is None else environment
@@ -204,7 +204,8 @@ class ServiceManager:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         meant = after_us.isdigit() and pid in ("", str(os.getpid()))
         self.feed_s = int(after_us) / 2e6 if meant and address else None
-        """Watchdog interval in seconds, half of systemd's timeout. None without a watchdog."""
+        """Interval of watchdog notifications in seconds, half of systemd's timeout. None if systemd requests no
+        watchdog."""
 
     def tell(self, *lines: str) -> None:
         """Send `NAME=value` lines to systemd. Failures are logged and otherwise ignored."""
@@ -225,8 +226,8 @@ class ServiceManager:
 
 
 MOST_UNSENT_BYTES = 64 * 1024
-"""Unsent bytes that the kernel buffers per connection. A small buffer keeps old pictures from
-queueing for a slow viewer."""
+"""Limit of unsent bytes that the kernel buffers per connection. A small limit prevents a queue of outdated pictures
+for a slow viewer."""
 MOST_MESSAGE_BYTES = 4096
 """Largest WebSocket message accepted from a viewer. The server ignores the content."""
 
@@ -314,7 +315,7 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
 
 
 class DrainingServer(uvicorn.Server):
-    """uvicorn server that signals the drain to the application at once, so that endless displays end."""
+    """uvicorn server that notifies the application at once when it starts to drain, so that endless responses end."""
 
     def __init__(
         self,

@@ -1,7 +1,8 @@
-"""State shared by the routes of one application: parts, stores, open displays, cached answers, and checks of disk and audit log.
+"""State shared by the routes of one application: components, stores, open displays, cached answers, and checks of disk
+and audit log.
 
-The registry, recordings, replays and exports are synchronous and thread-safe; routes call them in worker threads. `Parts.errors` maps their errors to
-problems.
+The registry, recordings, replays and exports are synchronous and thread-safe; routes call them in worker threads.
+`Parts.errors` maps their exceptions to problem answers.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of a server. Requests for an absent part are answered with 503."""
+    """Components of a server. A request that needs an absent component is answered with 503."""
 
     streams: SupervisedStreams | None = None
     models: ModelRegistry | None = None
@@ -62,11 +63,11 @@ class Parts:
     collectors: Sequence[Collector] = ()
     """Metric collectors for /metrics."""
     events: SystemEvents = field(default_factory=SystemEvents)
-    """Events of the parts for the audit log, not caused by a request."""
+    """Queue of audit events that no request causes, such as ended processes."""
     trusts_ages: Callable[[], bool] = lambda: True
-    """Return True if old audit segments may be deleted by age now."""
+    """Returns True while the clock is trusted, so that old audit segments may be deleted by age."""
     errors: Mapping[type[Exception], type[Problem]] = field(default_factory=dict)
-    """Problem type for each error type of the parts; the error text is sent to the caller."""
+    """Problem type for each exception type of the components. The exception's message is sent to the caller."""
 
 
 class ViewerCount:
@@ -83,7 +84,7 @@ class ViewerCount:
 
     @contextmanager
     def one_more(self) -> Iterator[None]:
-        """Count one display while the block runs."""
+        """Count one open display while the block runs."""
         self._open += 1
         try:
             yield
@@ -218,7 +219,7 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class ControlState:
-    """Parts, stores and limits of one application; obtained by `control_of`."""
+    """Components, stores and limits of one application. Routes obtain it by `control_of`."""
 
     settings: ServiceSettings
     parts: Parts
@@ -234,7 +235,7 @@ class ControlState:
     persons: OpenIdPersons | None = None
     """OpenID Connect provider, if the settings configure one."""
     uploads_of: Counter[str] = field(default_factory=Counter)
-    """Running uploads per key."""
+    """Number of running uploads by key id."""
     draining: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server starts to drain; endless responses then end."""
     repeated: Repeated = field(default_factory=Repeated)
@@ -252,15 +253,15 @@ def control_of(connection: HTTPConnection) -> ControlState:
 
 
 def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], name: str) -> Part:
-    """Return a part of this server.
+    """Return a component of this server.
 
     Args:
         connection: current request or WebSocket.
-        choose: selects the part.
-        name: name of the part for the error message.
+        choose: selects the component; returns None if it is absent.
+        name: name of the component for the error message.
 
     Raises:
-        NotBuiltIn: if the part is absent.
+        NotBuiltIn: if the component is absent.
     """
     found = choose(control_of(connection).parts)
     if found is None:
@@ -269,13 +270,13 @@ def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], nam
 
 
 def known_problem(control: ControlState, error: BaseException) -> type[Problem] | None:
-    """Return the problem type for an error of a part, or None for an unknown error (a bug)."""
+    """Return the problem type for an exception of a component, or None for an unknown exception (a bug)."""
     known = control.parts.errors
     return next((known[each] for each in type(error).__mro__ if each in known), None)
 
 
 async def is_missing(control: ControlState, look: Callable[[], object]) -> bool:
-    """Return True if `look` raises an error that maps to Missing."""
+    """Return True if `look`, called in a worker thread, raises an exception that maps to the problem Missing."""
     try:
         await asyncio.to_thread(look)
     except Exception as error:

@@ -1,4 +1,5 @@
-"""Receipt of uploads: the body is written to a temporary file, and its digest is computed on the way and compared with the header."""
+"""Receipt of uploads. The body is written to a temporary file while its digest is computed, which must equal the
+header's."""
 
 from __future__ import annotations
 

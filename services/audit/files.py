@@ -95,7 +95,7 @@ def digest_of(values: dict[str, Any]) -> str:
 
 
 def digest_of_entry(entry: Entry) -> str:
-    """Return the correct digest of an entry."""
+    """Compute the digest that the line of an entry must state."""
     return digest_of(asdict(entry))
 
 
@@ -141,7 +141,7 @@ MOST_BYTES = 4096
 
 @dataclass(frozen=True)
 class Head:
-    """Number and digest of an entry. `seq` is -1 before the first entry."""
+    """Number and digest of an entry, as stored in head and anchor files. `seq` is -1 for a log without entries."""
 
     seq: int = -1
     digest: str = FIRST
@@ -158,7 +158,7 @@ def anchor_path(log: Path) -> Path:
 
 
 def read_head(log: Path) -> Head | None:
-    """Read the head of a log; None if the file is missing.
+    """Read the head of a log, which names its newest entry; None if the file is missing.
 
     Raises:
         ValueError: if the file is malformed.
@@ -167,7 +167,7 @@ def read_head(log: Path) -> Head | None:
 
 
 def read_anchor(log: Path) -> Head | None:
-    """Read the anchor of a log; None if nothing was removed.
+    """Read the anchor of a log, which names the last entry removed by retention; None if no entry was removed.
 
     Raises:
         ValueError: if the file is malformed.
@@ -176,12 +176,12 @@ def read_anchor(log: Path) -> Head | None:
 
 
 def write_head(log: Path, head: Head) -> None:
-    """Replace the head atomically."""
+    """Replace a log's head file atomically."""
     _write(head_path(log), head)
 
 
 def write_anchor(log: Path, anchor: Head) -> None:
-    """Replace the anchor atomically."""
+    """Replace a log's anchor file atomically."""
     _write(anchor_path(log), anchor)
 
 
@@ -227,7 +227,7 @@ class Keeping:
     segments: int | None = None
     days: float | None = None
     trusts_ages: Callable[[], bool] = lambda: True
-    """Return True if the clock is trusted. Otherwise no file is removed by age."""
+    """Returns True while the clock is trusted. Otherwise no file is removed by age."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ class Segment:
     path: Path
 
     def last(self) -> tuple[Entry, str]:
-        """Return its last entry and the stated digest.
+        """Return the segment's last entry and the digest stated in its line.
 
         Raises:
             ValueError: if the file has no valid entry.
@@ -273,7 +273,7 @@ def segment_path(log: Path, first_seq: int) -> Path:
 
 
 def too_old(segments: list[Segment], keeping: Keeping) -> list[Segment]:
-    """Return the oldest segments, beyond the retention limits."""
+    """Return the segments that exceed the retention limits, oldest first."""
     surplus = 0 if keeping.segments is None else max(0, len(segments) - keeping.segments)
     if keeping.days is not None and keeping.trusts_ages():
         until = datetime.now(UTC) - timedelta(days=keeping.days)

@@ -92,7 +92,7 @@ class AuditLog:
             ValueError: if a value is not permitted in the log.
         """
         with self._lock:
-            # validates the entry before anything is changed
+            # An invalid entry must raise before the file is changed.
             self._next(event, actor, role, subject, outcome, request_id, detail or {})
             with self._unwritable():
                 self._take_back()
@@ -197,7 +197,7 @@ class AuditLog:
         self._descriptor = descriptor
 
     def _is_current(self) -> bool:
-        """Return True if the open file is still at the log's path, and not renamed to a segment."""
+        """Return True if the open file is still at the log's path; False if it was renamed to a segment."""
         try:
             return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(self._descriptor))
         except FileNotFoundError:
@@ -217,7 +217,7 @@ class AuditLog:
                 write_anchor(self.path, Head(last.seq, digest))
             anchor = read_anchor(self.path)
             gone = [each for each in all_segments(self.path) if anchor is not None and each.first_seq <= anchor.seq]
-            for each in gone:  # includes segments whose removal was interrupted by a kill
+            for each in gone:  # includes segments that an earlier process did not finish removing
                 each.path.unlink()
             if gone:
                 sync_folder(self.path.parent)
@@ -243,7 +243,7 @@ class AuditLog:
             self._say("audit.recovered", "done", **found)
 
     def _checked_end(self, whole_bytes: int) -> Head:
-        """Return the newest entry, which becomes the head.
+        """Check the chain from the stored head to the newest entry, store the newest entry as the head, and return it.
 
         Raises:
             ValueError: if the chain does not lead to it from the stored head.

@@ -30,13 +30,13 @@ class Wanted:
     event: str | None = None
     """Event name such as `model.activate`, or `model` for all its events."""
     actor: str | None = None
-    """Part of the actor: name or id of a key."""
+    """Text contained in the actor, which has the name and id of a key."""
     subject: str | None = None
     "Text contained in the subject."
     outcome: Outcome | None = None
     since: datetime | None = None
     until: datetime | None = None
-    """End of the time range, exclusive. Both times have a zone."""
+    """End of the time range, exclusive. `since` and `until` have a time zone."""
 
     def fits(self, values: Mapping[str, Any]) -> bool:
         """Return True if the values of an entry match."""
@@ -53,7 +53,8 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Page:
-    """Entries, newest first, and the number before which the next page begins. None at the beginning of the log."""
+    """Entries, newest first. `before` is the argument for the next page; None if the beginning of the log is
+    reached."""
 
     entries: list[Entry]
     before: int | None
@@ -87,7 +88,7 @@ def search(log: Path, wanted: Wanted, count: int, before: int | None = None) -> 
             found = _search([*([log] if log.exists() else []), *older], wanted, count, before)
         except FileNotFoundError:  # closed or removed a moment ago
             continue
-        # otherwise a segment was closed or removed meanwhile, and entries may be missing
+        # Another list means that a segment was closed or removed during the search, so entries may be missing.
         if closed == closed_segments(log):
             return found
 

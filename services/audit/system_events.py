@@ -18,7 +18,7 @@ MOST_WAITING = 1000
 
 @dataclass(frozen=True)
 class SystemEvent:
-    """Pending audit entry; the fields are those of `Entry`."""
+    """Audit entry that waits to be written. The fields have the meaning of those in `Entry`."""
 
     event: str
     subject: str
@@ -77,6 +77,6 @@ class SystemEvents:
 def _append(audit: AuditLog, said: SystemEvent) -> None:
     try:
         audit.append(said.event, actor="system", subject=said.subject, outcome=said.outcome, detail=said.detail)
-    # no request to refuse: the failure goes to the log and the metrics
+    # The event is already past and cannot be refused. The failure is logged and counted in the metrics.
     except (AuditUnwritable, ValueError) as error:
         log.error("%s of %s is not in the audit log: %s", said.event, said.subject, error)

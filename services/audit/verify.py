@@ -55,20 +55,20 @@ class Verdict:
 
 @dataclass
 class _Walk:
-    """State of the verification after some lines."""
+    """State of the verification after the lines read so far."""
 
     before: Head
-    """Last entry."""
+    """Number and stated digest of the last entry read."""
     count: int = 0
     last_line: int = 0
     unfinished: bool = False
     findings: list[Finding] = field(default_factory=list)
     digests: dict[str, int] = field(default_factory=dict)
     retired: set[Head] = field(default_factory=set)
-    """Removed ranges according to entries."""
+    """Last entries of removed ranges, as named by the entries `audit.retired`."""
 
     def read(self, path: Path, name: str) -> None:
-        """Process the lines of a file; `name` is empty for the current file."""
+        """Verify the lines of a file. `name` is the segment's name for findings, empty for the current file."""
         self.last_line = 0
         for number, line in enumerate(_lines(path), start=1):
             if not line.endswith(b"\n") and len(line) <= MOST_LINE_BYTES and not name:
@@ -94,7 +94,7 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
 
     Args:
         path: path of the log.
-        expected_head: digest noted elsewhere, which some entry must have, or None.
+        expected_head: digest of an entry, noted outside of the log, which must still exist; None for no such check.
 
     Returns:
         The findings.
@@ -104,7 +104,7 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
     """
     for _ in range(MOST_READINGS):
         try:
-            # read before the lines, because the service may be writing
+            # Head and anchor are read before the lines, because a running service may append entries in between.
             kept, anchor = read_head(path), read_anchor(path)
             closed = closed_segments(path)
         except ValueError as error:

@@ -79,12 +79,12 @@ class ApiKey:
     """Streams that the key is limited to; None for all."""
 
     def has_expired(self, now: datetime | None = None) -> bool:
-        """Return True from `expires_at` on."""
+        """Return True if the key has expired at `now`, by default the current time."""
         return self.expires_at is not None and datetime.fromisoformat(self.expires_at) <= (now or datetime.now(UTC))
 
 
 class KeyStore:
-    """Key file shared by several processes; reread after each change."""
+    """API keys in a file that several processes share. The file is read again when it has changed."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -96,7 +96,7 @@ class KeyStore:
         self._saved: tuple[float, dict[str, str]] = float("-inf"), {}
 
     def watch(self, on_change: Callable[[str, ApiKey], None]) -> None:
-        """Report later key changes of other processes.
+        """Register a callback for later changes of the key file by other processes.
 
         Args:
             on_change: called with `key.create` or `key.revoke` and the key.
@@ -288,7 +288,7 @@ class KeyStore:
             keys = dict(self._current())
             yield keys
             _write(self._path, keys)
-            with self._lock:  # changes by this process itself are not reported
+            with self._lock:  # adopt the new keys here, so that this process's own change is not reported to `watch`
                 self._keys, self._read = keys, self._stamp()
 
 
@@ -440,8 +440,8 @@ def limits_of(key: ApiKey) -> Detail:
 
 
 def changed_outside(audit: AuditLog, event: str, key: ApiKey) -> None:
-    """Append the audit entry of a change by another process. The change is already made, so a
-    failure is only logged."""
+    """Append the audit entry of a key change by another process. That change cannot be refused, so a failure is
+    only logged."""
     try:
         append_key_change(audit, event, key)
     except (AuditUnwritable, ValueError) as error:
@@ -471,6 +471,6 @@ def _look_once(keys: KeyStore, *, ends: bool = False) -> None:
     try:
         keys.all()
         keys.save_used(now=ends)
-    # requests are answered with an error until the file is readable again
+    # Requests are refused until the file is readable again, so the polling continues.
     except (OSError, ValueError, TypeError, KeyError) as error:
         log.error("the file of the API keys cannot be read: %s", error)

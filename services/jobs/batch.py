@@ -31,7 +31,7 @@ DATABASE = BATCH_DATABASE
 WHO = "batch"
 SAY_S = 0.5
 RECORDINGS = ".recordings.json"
-"""File with the fingerprints of the recordings, by name."""
+"""File in the output folder with the fingerprint of each recording, by name."""
 MOST_NOTES_BYTES = 1 << 26
 FINGERPRINT_BYTES = 4096
 Counts = Mapping[str, int]
@@ -43,11 +43,11 @@ class Summary:
 
     counts: Counts
     already: int
-    """Number of results from earlier runs."""
+    """Number of recordings whose results exist from earlier runs."""
     failed: Sequence[JobRecord]
     seconds: float
     unusable: Sequence[tuple[str, str]] = ()
-    """Names of skipped recordings, with the reason."""
+    """Names of skipped files and folders, each with the reason."""
 
     @property
     def is_whole(self) -> bool:
@@ -59,7 +59,7 @@ class Batch:
     """Batch of one folder of recordings and one output folder.
 
     Raises:
-        InvalidSetting: if the folders do not fit.
+        InvalidSetting: if the input folder has no usable recordings, or the output folder has foreign files.
         StoreUnavailable: if the output folder or the database cannot be used.
     """
 
@@ -149,7 +149,7 @@ class Batch:
         raise InvalidSetting(f"files of the result {folder} are missing; remove that folder, and it is made anew")
 
     def _check_same(self, recordings: Sequence[Path]) -> None:
-        """Compare recordings with the noted fingerprints and note new ones.
+        """Compare recordings with their stored fingerprints, and store the fingerprints of new recordings.
 
         Raises:
             InvalidSetting: if a recording with a result was replaced.
@@ -185,7 +185,7 @@ def _removed_on_failure(out: Path) -> Iterator[None]:
         if DATABASE not in (before or ()):
             for name in (*(f"{DATABASE}{suffix}" for suffix in ("", "-wal", "-shm", "-journal")), RECORDINGS):
                 (out / name).unlink(missing_ok=True)
-            with suppress(OSError):  # not empty, or not there
+            with suppress(OSError):  # not empty, or missing
                 (out / RUNNING).rmdir()
             with suppress(OSError):
                 if before is None:

@@ -80,7 +80,7 @@ class JobPool:
             self._close()
 
     def step(self) -> None:
-        """Do one round: settle ended attempts, renew claims and start new attempts.
+        """Run one round: publish the results of ended attempts, renew claims and start new attempts.
 
         Raises:
             StoreUnavailable: if the database does not answer.
@@ -119,7 +119,7 @@ class JobPool:
         log.info("%s began, attempt %d", claimed.id, claimed.attempt)
 
     def _renew_claims(self) -> None:
-        """Renew the claims; kill attempts whose job was lost or cancelled."""
+        """Renew the claims. Kill attempts whose job another pool has claimed, or whose cancellation was requested."""
         heard = self._claims.renew({job_id: task.progress() for job_id, (_, task) in self._running.items()})
         for job_id in heard.lost:
             log.warning("%s is another's now; this attempt is ended", job_id)
@@ -133,7 +133,7 @@ class JobPool:
         self._busy_s = time.monotonic()
         outcome = task.outcome()
         if outcome is None:
-            # The process died or was killed: requeue, unless the job was cancelled or had too many
+            # The attempt's process died or was killed. The job is queued again, unless it was cancelled or had too many
             # attempts.
             if self._claims.give_back(claimed.id, counts=True):
                 log.warning("%s: its process died: %s", claimed.id, how)
@@ -145,7 +145,7 @@ class JobPool:
             self._claims.end(claimed.id, *outcome)
             log.info("%s is %s", claimed.id, outcome[0])
         self._workspace.remove(Path(task.folder))
-        self._searched_s -= DATABASE_S  # a slot is free: look for the next job at once
+        self._searched_s -= DATABASE_S  # a worker slot is free: query the next job in the next round
 
     def _publish(self, claimed: Claimed, task: Task) -> None:
         self._results.publish(task.out, claimed.folder)
@@ -183,11 +183,11 @@ class PoolProcess:
     results: str
     pool: PoolSettings = field(default_factory=PoolSettings)
     ray: str | None = None
-    """Address of a Ray cluster; None runs local processes."""
+    """Address of a Ray cluster; None to fork local processes."""
     idle_s: float = 60.0
 
     def line(self) -> bytes:
-        """Return the configuration as an input line."""
+        """Return the configuration as the line of standard input that `of_line` parses."""
         return json.dumps(asdict(self)).encode() + b"\n"
 
     @classmethod
@@ -214,7 +214,7 @@ def new_runner(ray: str | None) -> Runner:
 
 
 def main() -> int:
-    """Run until the input closes.
+    """Run the pool until standard input closes.
 
     Returns:
         The exit code.

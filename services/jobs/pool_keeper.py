@@ -16,7 +16,7 @@ from services.supervisor.process import Restarts
 log = logging.getLogger(__name__)
 RELAY_S = 1.0
 LEVELS = {"WARNING": logging.WARNING, "ERROR": logging.ERROR, "CRITICAL": logging.ERROR, "Traceback": logging.ERROR}
-"""Log levels by the first word of a pool's output line."""
+"""Log level of a line of the pool's output, by its first word."""
 LOOK_S = 0.5
 END_S = 10.0
 """Seconds that a pool may take to requeue its jobs."""
@@ -106,7 +106,7 @@ class PoolKeeper:
 
 
 async def relayed(said: asyncio.StreamReader) -> None:
-    """Log each line of a process's standard error in this program's log format."""
+    """Log each line that a process writes to standard error, in this program's log format."""
     while True:
         try:
             line = await said.readline()

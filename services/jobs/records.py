@@ -63,7 +63,7 @@ class JobRecord:
 
 @dataclass(frozen=True)
 class Claimed:
-    """Job claimed by one owner for the length of a lease."""
+    """Job claimed by one pool for the length of a lease."""
 
     id: str
     recording: str
@@ -75,7 +75,7 @@ class Claimed:
 
 @dataclass(frozen=True)
 class NewJob:
-    """Recording to replay. Without `folder`, the result folder is named after the job."""
+    """Recording to replay in a new job. Without `folder`, the result folder has the job's id as its name."""
 
     recording: str
     source: str | None = None
@@ -150,7 +150,7 @@ JOBS = sa.Table(
     sa.Column("ended_at", sa.String(40), nullable=True),
 )
 """Jobs. `folder` is the unique result folder. `owner` is the pool that runs the job, until
-`lease_until_ms` (wall clock). `cancelled_by` asks the owner to end the job."""
+`lease_until_ms` (wall clock). A value in `cancelled_by` makes the owner end the job."""
 SUBMISSIONS = sa.Table(
     "submissions",
     METADATA,

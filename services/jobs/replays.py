@@ -201,7 +201,7 @@ class ReplayRetention:
 
 
 async def again_and_again(enforce: Callable[[], Awaitable[None]]) -> None:
-    """Run `enforce` periodically until cancelled. Database failures are logged and retried."""
+    """Call `enforce` periodically until cancelled. Failures of the database are logged, and the next call retries."""
     while True:
         try:
             await enforce()

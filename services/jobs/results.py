@@ -32,7 +32,7 @@ FILES = {
 
 
 class Results:
-    """Folder of results.
+    """Folder with one sub-folder of published results per job.
 
     Raises:
         StoreUnavailable: if the folder cannot be used.
@@ -107,7 +107,7 @@ class Workspace:
         os.close(self._lock)
 
     def dead(self) -> list[str]:
-        """Return the ids of dead pools, whose locks are free."""
+        """Return the ids of pools that have died, which no longer hold the lock of their working folder."""
         return [path.name for path in self._running.iterdir() if not _is_locked(path / LOCK)]
 
     def remove_dead(self, pools: list[str]) -> None:
@@ -135,7 +135,7 @@ PROGRESS, OUTCOME, LOG = "progress.json", "outcome.json", "log"
 
 @dataclass(frozen=True)
 class Task:
-    """Work order of an attempt; JSON-serialisable."""
+    """Description of one attempt of a job, and its reports in the attempt's folder; JSON-serialisable."""
 
     id: str
     source: str
@@ -158,11 +158,11 @@ class Task:
         return Path(self.folder) / LOG
 
     def say_progress(self, reached: JobProgress) -> None:
-        """Report the progress."""
+        """Write the progress to a file in the attempt's folder."""
         _write(Path(self.folder) / PROGRESS, asdict(reached))
 
     def say_outcome(self, state: JobState, reason: str | None = None) -> None:
-        """Report the outcome, after everything is written."""
+        """Report the outcome. Called after all result files are written."""
         _write(Path(self.folder) / OUTCOME, {"state": str(state), "reason": reason})
 
     def progress(self) -> JobProgress:

@@ -38,7 +38,7 @@ class Runner(Protocol):
 
 
 ORPHANED = 3
-"""Exit code of a process whose pool has died."""
+"""Exit code of an attempt's process that ended itself because its pool has died."""
 
 
 def load() -> None:
@@ -125,7 +125,8 @@ def _print_into(task: Task) -> None:
 
 
 def _end_with_the_pool(life: int) -> None:
-    """Exit when the pool has ended. Only the pool holds the pipe's write end, so a read returns after its death."""
+    """Exit this process when the pool has ended. Only the pool holds the pipe's write end, so a read returns at its
+    death."""
     os.read(life, 1)
     os._exit(ORPHANED)
 
@@ -172,7 +173,7 @@ class OnRay:
 
     def start(self, task: Task) -> None:
         """See `Runner`."""
-        # Ray never retries an attempt; the pool does, if it still holds the claim.
+        # Ray's own retries are off. The pool retries a failed attempt if it still holds the claim.
         remote = self._ray.remote(
             max_retries=0, max_calls=ATTEMPTS_OF_A_PROCESS,
             num_cpus=task.threads, num_gpus=1 if task.options.get("device") == "cuda" else 0,

@@ -215,7 +215,7 @@ def uses_recording(connection: sa.Connection, recording: str) -> bool:
 
 
 def job_row(connection: sa.Connection, job_id: str) -> sa.RowMapping:
-    """Return the row of a job.
+    """Return the database row of a job.
 
     Raises:
         NotFound: if the job does not exist.
@@ -246,7 +246,7 @@ MOST_REASON = 1000
 
 @dataclass(frozen=True)
 class Heard:
-    """Result of renewing claims."""
+    """Jobs of an owner that changed in the database since its last renewal."""
 
     lost: frozenset[str]
     """Jobs that this owner lost: taken over by another owner, or deleted."""
@@ -255,20 +255,20 @@ class Heard:
 
 
 class Claims:
-    """Claims of one owner (a pool)."""
+    """Jobs that one owner, a pool, has claimed in the database."""
 
     def __init__(
         self, database: Database, owner: str, lease_s: float, most_attempts: int, is_published: Callable[[str], bool]
     ) -> None:
-        """Set up the claims.
+        """Set the owner and its lease, without a claim.
 
         Args:
             database: database of the jobs.
             owner: id of the pool.
             lease_s: length of a lease in seconds.
             most_attempts: attempts before a job counts as failed.
-            is_published: returns True if a folder has a result. Finds results of a pool that died
-                before recording them.
+            is_published: returns True if a result folder exists. Detects a result that a pool published before it died
+                without recording it.
         """
         self._database, self.owner, self._lease_ms = database, owner, int(lease_s * 1000)
         self._most, self._is_published = most_attempts, is_published

@@ -43,7 +43,7 @@ def work(task: Task) -> None:
 
 
 class _Teller:
-    """Progress callback that reports a few times per second."""
+    """Progress callback of a run that writes `JobProgress` to the attempt's folder a few times per second."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._said_s = task, 0.0
