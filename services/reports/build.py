@@ -306,7 +306,7 @@ def require_shown(outcome: RunOutcome) -> None:
         raise NothingShown(f"{came}, and the run ended before one was on the screen ({outcome.stop_reason}); {hint}")
     counts = ", ".join(f"{_named(outcome, reason)}: {count}" for reason, count in withheld.most_common())
     # Frames of a recorded session were checked when they were recorded.
-    if live or outcome.find(OutOfBodyFrames) is not None:
+    if live or (outcome.find(OutOfBodyFrames) is not None and not source.withheld):
         remedies = "; ".join(dict.fromkeys(REMEDIES.get(reason, CHECK_PICTURE) for reason, _ in withheld.most_common()))
         where = ""
     else:
@@ -319,7 +319,8 @@ def require_shown(outcome: RunOutcome) -> None:
 def withheld_frames(outcome: RunOutcome) -> Counter[str]:
     """Count a run's withheld frames by reason, from the gates of a live run or from the recording."""
     training, source = outcome.find(TrainingCounts), outcome.find(SourceResult)
-    if training is not None:
+    # A session was checked when it was recorded, and its replay does not train on such frames.
+    if training is not None and (source is None or not source.withheld):
         return Counter(training.withheld)
     found = Counter() if source is None else Counter(source.withheld)
     if source is not None and source.damaged:
