@@ -1,17 +1,17 @@
-# gsplat_core_cuda: the CUDA kernels, a library of its own, so that the CPU's neither needs nor notices it.
+# gsplat_core_cuda: the CUDA kernels in a separate library, so that the CPU library has no CUDA dependency.
 #
-# The compiler is, in this order: CMAKE_CUDA_COMPILER or $CUDACXX, then the one that `make cuda` puts into build/cuda-toolkit
-# (NVIDIA's pip packages), then an nvcc on the PATH. CMake's own FindCUDAToolkit expects a whole toolkit and is not used.
+# The compiler is the first of: CMAKE_CUDA_COMPILER or $CUDACXX, the compiler that `make cuda` installs in build/cuda-toolkit
+# (NVIDIA's pip packages), nvcc on the PATH. CMake's FindCUDAToolkit requires a complete toolkit and is not used.
 set(CUDA_PACKAGES ${CMAKE_CURRENT_SOURCE_DIR}/build/cuda-toolkit/nvidia/cu13)
-string(STRIP "$ENV{CUDACXX}" COMPILER_ASKED_FOR)  # may be set and empty
+string(STRIP "$ENV{CUDACXX}" COMPILER_ASKED_FOR)  # may be set but empty
 if(NOT CMAKE_CUDA_COMPILER AND COMPILER_ASKED_FOR STREQUAL "" AND EXISTS ${CUDA_PACKAGES}/bin/nvcc)
   set(CMAKE_CUDA_COMPILER ${CUDA_PACKAGES}/bin/nvcc)
 endif()
 if(CMAKE_CUDA_COMPILER MATCHES "^${CUDA_PACKAGES}/")
-  set(ENV{LIBRARY_PATH} "${CUDA_PACKAGES}/lib:$ENV{LIBRARY_PATH}")  # CMake links a program to try the compiler
+  set(ENV{LIBRARY_PATH} "${CUDA_PACKAGES}/lib:$ENV{LIBRARY_PATH}")  # CMake tests the compiler by linking a program
 endif()
-# portable: what a library for others has, and what CI compiles. The front end runs once for compute capability 8.x and once for
-# 9.0 and all that come later, whose instructions are the same to it: what the kernels ask is only whether a GPU has those of 9.0.
+# portable: all supported architectures, for distributed libraries and CI. The front end runs once for compute capability 8.x and once
+# for 9.0 and later, because the kernels only distinguish GPUs with and without the instructions of 9.0.
 if(INTRASPLAT_CUDA_ARCHITECTURES STREQUAL "portable")
   set(CMAKE_CUDA_ARCHITECTURES OFF)
   set(PORTABLE_CODE "--generate-code=arch=compute_80,code=[sm_80,sm_86,sm_89]"
@@ -28,7 +28,7 @@ if(NOT TORCH_CUDA_LIBRARY)
   message(FATAL_ERROR "the torch in ${TORCH_ROOT} was built without CUDA; install one with CUDA, or leave INTRASPLAT_CUDA off")
 endif()
 
-# Headers and static runtime lie beside the compiler, whose folder may be a link (/usr/local/cuda/bin).
+# Headers and the static runtime are found relative to the compiler, whose folder may be a link (/usr/local/cuda/bin).
 file(REAL_PATH ${CMAKE_CUDA_COMPILER} CUDA_COMPILER_PATH)
 cmake_path(GET CUDA_COMPILER_PATH PARENT_PATH CUDA_BIN)
 cmake_path(GET CUDA_BIN PARENT_PATH CUDA_ROOT)
@@ -40,7 +40,7 @@ find_library(CUDA_RUNTIME NAMES libcudart_static.a PATHS ${CUDA_ROOT}/lib ${CUDA
 file(GLOB_RECURSE CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/*.cu)
 add_core_library(gsplat_core_cuda ${CUDA_SOURCES} ${CUDA_HOST_SOURCES})
 target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_CUDA GSPLAT_ISA=device)
-# Device functions are unused in the host's pass; Clang says so of each.
+# Device functions are unused in the host pass; Clang warns about each of them.
 target_compile_options(gsplat_core_cuda PRIVATE
   $<$<COMPILE_LANGUAGE:CXX>:${CORE_FLAGS}>
   $<$<COMPILE_LANGUAGE:CUDA>:${PORTABLE_CODE} --expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall,-Wno-unused-function>)
@@ -49,6 +49,6 @@ target_include_directories(gsplat_core_cuda SYSTEM PRIVATE ${TORCH_ROOT}/include
                            $<$<COMPILE_LANGUAGE:CXX>:${CUDA_INCLUDE}>)
 find_package(Threads REQUIRED)
 target_link_libraries(gsplat_core_cuda PRIVATE ${TORCH_CPU_LIBRARY} ${TORCH_CUDA_LIBRARY} ${CUDA_RUNTIME} Threads::Threads dl rt)
-# The static runtime is linked by its path: every toolkit then gives a library that needs no CUDA but the driver.
+# The static runtime is linked by its path. The library then depends on the CUDA driver only, with any toolkit.
 set_target_properties(gsplat_core_cuda PROPERTIES LINKER_LANGUAGE CXX CUDA_RUNTIME_LIBRARY None
                       CUDA_VISIBILITY_PRESET hidden)

@@ -1,5 +1,5 @@
-# Compiles all host code without writing objects, warnings as errors: `make compilers` does so with every compiler of the machine.
-# The CUDA library's host files come along where CUDA's headers are: INTRASPLAT_CUDA_INCLUDE.
+# Compiles all host code without writing objects, with warnings as errors; `make compilers` runs it with every installed compiler.
+# INTRASPLAT_CUDA_INCLUDE, the folder of the CUDA headers, adds the host files of the CUDA library.
 set(SYNTAX_TARGETS core_host kernels_baseline)
 if(TARGET kernels_avx2)
   list(APPEND SYNTAX_TARGETS kernels_avx2 kernels_avx512)

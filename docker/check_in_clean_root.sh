@@ -1,8 +1,8 @@
 #!/bin/bash
-# Run the steps of docker/Dockerfile's target `cpu` without a Docker engine: in a root made by debootstrap instead of the base image (Debian bookworm with its own
-# Python 3.11). At the end the service runs as user 10001 with its health check.
+# Run the steps of docker/Dockerfile's target `cpu` without a Docker engine, in a root created by debootstrap instead of the base image
+# (Debian bookworm with its own Python 3.11). At the end the service and its health check run as user 10001.
 # Needs root, debootstrap, a network, 12 GB and half an hour. Usage: docker/check_in_clean_root.sh FOLDER [MIRROR]
-# TORCH_INDEX_URL and TORCH_SHA256 are those of the image; with an empty TORCH_INDEX_URL, torch comes from the lock.
+# TORCH_INDEX_URL and TORCH_SHA256 have the meaning of the image's build arguments. With an empty TORCH_INDEX_URL, torch comes from the lock.
 set -euo pipefail
 repository=$(cd "$(dirname "$0")/.." && pwd)
 root=${1:?give a folder that is not there yet}
@@ -61,6 +61,6 @@ for _ in $(seq 60); do
   if as_user env HEALTHCHECK_URL=http://127.0.0.1:8792/livez python -I /opt/intrasplat/healthcheck.py > /dev/null; then break; fi
 done
 as_user env HEALTHCHECK_URL=http://127.0.0.1:8792/livez python -I /opt/intrasplat/healthcheck.py
-pkill -TERM --parent $served  # tini, which hands it on
+pkill -TERM --parent $served  # tini, which forwards the signal
 wait $served
 step "done: the service ended with 0"

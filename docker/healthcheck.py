@@ -31,7 +31,7 @@ def main() -> int:
             said = f"status {answer.status}"
     except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError) as error:
         said = str(error)
-    sys.stdout.write(f"{url}: {said}\n")  # `docker inspect` shows it
+    sys.stdout.write(f"{url}: {said}\n")  # shown by `docker inspect`
     return 1
 
 

@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rest, torch = Path(folder, "rest.txt"), Path(folder, "torch.txt")
         rest.write_text(kept, encoding="utf-8")
         torch.write_text(wanted + (f" --hash=sha256:{given.torch_sha256}" if given.torch_sha256 else "") + "\n")
-        # The lock is complete: nothing is resolved, so that nothing brings the CUDA build back. `check` says if that leaves anything out.
+        # The lock is complete. Dependencies are not resolved, because they would reinstall the CUDA build. `pip check` reports missing packages.
         return (
             pip("install", "--require-hashes", "--no-deps", "-r", str(rest))
             or pip("install", "--no-deps", "--index-url", given.torch_index_url, "-r", str(torch))

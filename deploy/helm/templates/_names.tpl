@@ -22,7 +22,7 @@ helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version }}
 {{ .Values.persistence.existingClaim | default (printf "%s-data" (include "intrasplat.name" .)) }}
 {{- end }}
 
-{{- /* The service's names within the cluster. */ -}}
+{{- /* Host names of the service within the cluster. */ -}}
 {{- define "intrasplat.hosts" -}}
 {{- $name := include "intrasplat.name" . -}}
 {{ list $name (printf "%s.%s" $name .Release.Namespace) (printf "%s.%s.svc" $name .Release.Namespace) (printf "%s.%s.svc.cluster.local" $name .Release.Namespace) | toJson }}

@@ -8,8 +8,8 @@ namespace gsplat::stereo_matching {
 namespace {
 
 constexpr int kAhead = 8;  // pixels whose costs are prefetched
-constexpr int kPathThreads =
-    64;  // threads per block; paths are few and long, so small blocks spread them over all multiprocessors
+// Threads per block. Paths are few and long, so small blocks spread them over all multiprocessors.
+constexpr int kPathThreads = 64;
 
 // Start of a path, and the distance between its pixels.
 struct Path {
