@@ -112,7 +112,7 @@ class RecordingDepth(NamedTuple):
     frames: list[Frame]
     """Frames; some have depth in the unit of the camera positions. Depth without confidence is an extrapolation."""
     doubts: Mapping[str, int]
-    """Reasons why other frames have none, as sentences with numbers of frames."""
+    """Reasons why frames of the recording have no depth, as sentences with numbers of frames."""
     at_rest: bool = False
     """True if depth was estimated for static tissue; differences between frames are then errors, not motion."""
 
@@ -155,7 +155,8 @@ PAIRS = (
     (np.s_[:-1, :-1], np.s_[1:, 1:]),
     (np.s_[:-1, 1:], np.s_[1:, :-1]),
 )
-"""Slices that pair every pixel with four of its neighbours; the other four are covered by symmetry."""
+"""Slices that pair every pixel with four of its eight neighbours. The pairs with the remaining four follow by symmetry.
+"""
 
 
 def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -238,7 +239,7 @@ class Look:
     """Depth map at reduced size with its camera, for comparisons."""
 
     inverse: NDArray[np.float32]
-    """Inverse depth [h, w]."""
+    """Inverse depth of a reduced depth map, [h, w]."""
     believed: NDArray[np.float32]
     """Validity [h, w]: 1 where the depth is confident, 0 elsewhere."""
     camera: Camera

@@ -200,7 +200,7 @@ LARGEST_RELIEF = 4.0
 LEAST_PARALLAX_PX = 1.5
 """Smallest median parallax in pixels, in the view with the most parallax; with less, depth is noise."""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
-"""A view contradicts its pose if its median residual exceeds both this many pixels and this share of its parallax."""
+"""Median residual in pixels, and as a share of the view's parallax. A view that exceeds both contradicts its pose."""
 POSE_ERROR_PX = 0.6
 """Residual of static tissue in pixels, from errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
@@ -342,7 +342,7 @@ def _off_px(c: Array, d: Array, focal: float, inverse: Array) -> Array:
 
 
 WORKING_PX = 320
-"""Longest side in pixels of the compared pictures, when there is no real-time limit."""
+"""Longest side in pixels of the compared pictures when there is no real-time limit."""
 MOST_VIEWS = 6
 """Largest number of other views compared with one picture."""
 SHORTEST_BASELINE = 0.1

@@ -65,7 +65,7 @@ Array = NDArray[np.float64]
 SURFACE_CELL_PX = 2
 """Side of the cells in which points are accumulated, in pixels."""
 NEAR_PX, FAR_PX = 9.0, 24.0
-"""Standard deviations in pixels of the window where points are dense and where they are sparse."""
+"""Standard deviations in pixels of the fit's window, where points are dense and where they are sparse."""
 ENOUGH = 1.5
 """Effective number of points in the narrow window from which the wide one is ignored."""
 FLOOR = 0.005

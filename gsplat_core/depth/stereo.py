@@ -56,7 +56,7 @@ class Disparity:
     px: Tensor
     """Disparity in pixels, float32 [H, W]; 0 where unknown."""
     known: Tensor
-    """Validity, bool [H, W]."""
+    """Validity of the disparities, bool [H, W]."""
     error_px: Tensor
     """Standard deviation in pixels estimated from the pictures, float32 [H, W]; infinite where unknown."""
 
@@ -314,9 +314,9 @@ SAMPLED_PX = 200
 LEAST_BELIEVED = 0.05
 """Share of the pixels that must be confident."""
 ROWS_FROM_PX = 0.05
-"""Row differences below this are not corrected, since resampling costs sharpness, in pixels."""
+"""Row difference between the eyes in pixels below which rows are not corrected, since resampling costs sharpness."""
 SAID_FROM_PX = 1.0
-"""Row differences above this are reported, in pixels."""
+"""Row difference between the eyes in pixels above which the user gets a remark."""
 PLAUSIBLE_MM = (2.0, 1000.0)
 """Plausible median distances for a scope inside the body, in millimetres."""
 SAME_FOCAL, SAME_ROW_PX, SAME_AXES = 1e-3, SAID_FROM_PX, 1e-6

@@ -23,7 +23,7 @@ BLOCK_WIDTH_PX, BLOCK_HEIGHT_PX, SEARCH_PX = 16, 12, 8
 DARK = 28
 """Level below which pixels are not compared, since black surrounds and cavities look alike in every scene."""
 OFFSET = 8.0
-"""Offset of levels before the logarithm, to suppress noise in dark regions."""
+"""Value added to grey levels before the logarithm, to suppress noise in dark regions."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(OFFSET))
 RIM_PX = 2
 HUE_BINS, HUE_RANGE = 16, 0.8
@@ -127,15 +127,16 @@ def _moved(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
 
 
 SAME_DIFFERENCE = 0.15
-"""Difference up to which two frames show the same scene without further tests."""
+"""Largest `Likeness.difference` at which two frames show the same scene without further tests."""
 SAME_STRUCTURE = 0.72
-"""Structure from which two frames show the same scene."""
+"""Smallest `Likeness.structure` at which two frames show the same scene."""
 SAME_MOVED = 0.83
 """Correlation of a quarter of the picture, searched over the whole other picture, from which
 two frames show the same scene.
 """
 SAME_AFTER_GAP_DIFFERENCE = 0.2
-"""Difference up to which frames after a gap of unusable frames may show the same scene, if their colours agree as well.
+"""Largest `Likeness.difference` at which frames before and after a gap of unusable frames may show the same scene, if
+their colours agree as well.
 """
 SAME_AFTER_GAP_COLOURS = 0.65
 """Overlap of colours required for frames after a gap."""

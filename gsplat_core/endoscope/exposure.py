@@ -43,7 +43,7 @@ class Reference:
 
     sample: Sample
     log_gain: NDArray[np.float64]
-    """Log gains, [3]."""
+    """Logarithms of the picture's channel gains, [3]."""
 
 
 def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None) -> Sample:
@@ -98,7 +98,9 @@ DEAD_ZONE = 0.08
 DRIFT_ZONE = 0.1
 """Threshold for slow changes against older references; larger because the tissue has moved since."""
 MORE_PIXELS = 1.5
-"""Ratio of pixels that agree with a change to those that agree with no change."""
+"""Ratio of the pixels that agree with a gain change to those that agree with no change, from which the change is
+accepted.
+"""
 ANCHOR_ZONE = 0.15
 """Largest deviation of a settled gain from the comparison with the scene's first frame, if that is possible."""
 RELEASE_ZONE = 0.04

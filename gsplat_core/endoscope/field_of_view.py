@@ -25,7 +25,7 @@ SURROUND_RANGE = 12
 EDGE_CONTRAST = 18
 """Smallest brightness step from the surround to the inside of the outline."""
 EDGE_SHARE = 0.6
-"""Share of the outline that must have this step."""
+"""Share of the outline that must have a brightness step of at least `EDGE_CONTRAST`."""
 LEAST_SURROUND = 0.015
 """Smallest share of the picture covered by the surround."""
 LEAST_FIELD = 0.15

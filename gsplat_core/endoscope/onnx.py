@@ -146,7 +146,7 @@ class PictureSettings(BaseModel):
     output: str | None = None
     """Name of the output; None for the first one."""
     threads: Annotated[int, Field(ge=1, le=64)] = 1
-    """Number of CPU threads."""
+    """Number of CPU threads for running the network."""
 
 
 class ToolSettings(PictureSettings):

@@ -36,7 +36,7 @@ DIM = 40.0
 CLIPPED = 252
 """Level from which a channel counts as clipped. With two clipped channels a pixel's colour is unknown."""
 LEAST_LIT, LEAST_JUDGED = 0.05, 0.1
-"""Smallest share of lit pixels in the picture, and of unclipped ones among them, for a judgement."""
+"""Smallest share of lit pixels in the picture, and of unclipped pixels among the lit ones, for a judgement."""
 NOISE = 6.0
 """Offset added to each channel before ratios are computed."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(NOISE))

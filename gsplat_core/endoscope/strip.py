@@ -30,7 +30,7 @@ REMEMBERED_FRAMES = 40
 EDGE_LEVELS = 10.0
 """Smallest step of a strip's edge, in levels."""
 EDGE_STEADINESS = 2.5
-"""Smallest ratio of this step to its mean temporal deviation."""
+"""Smallest ratio of a strip's edge step to the step's mean temporal deviation."""
 EDGE_SHARE = 0.15
 """Smallest length of an unbroken edge, as a share of the border."""
 WHOLE_SHARE = 0.6
@@ -38,7 +38,7 @@ WHOLE_SHARE = 0.6
 TEXT_LEVELS = 25.0
 """Smallest step of text, in levels."""
 TEXT_STEADINESS = 5.0
-"""Smallest ratio of this step to its mean temporal deviation."""
+"""Smallest ratio of a text's edge step to the step's mean temporal deviation."""
 TEXT_LENGTH = 0.02
 """Smallest extent of text as a share of the longer side of the band; a third of it in the other direction."""
 

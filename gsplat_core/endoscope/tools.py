@@ -27,7 +27,9 @@ SMALLEST_REGION = 0.003
 SMALLEST_INNER_REGION = 0.01
 """Smallest area of a region that does not reach the border."""
 MOST_GLARE = 0.3
-"""Share of such a region that may be as bright as the brightest pixels, as highlights are."""
+"""Share of a tool region without contact to the border that may be as bright as the brightest pixels, as highlights
+are.
+"""
 SHARP_EDGE = 0.36
 """Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare change gradually."""
 CORE = 0.35
@@ -37,7 +39,7 @@ CLEARLY_BELOW = 0.08
 KNOWN = 0.5
 """Share of a region that was tool in the previous frame, from which thresholds are reduced."""
 KNOWN_DISCOUNT = 0.75
-"""Factor of the thresholds for such a region."""
+"""Factor of the thresholds for a region that was mostly tool in the previous frame (`KNOWN`)."""
 DARKEST = 0.15
 """Share of the mean brightness below which colour is ignored."""
 EDGE_AT = 0.6
@@ -209,7 +211,7 @@ balance grey is at 0 and pale tissue at 0.3.
 NO_VALLEY, SHARPER_EDGE = 0.25, 0.8
 """Threshold without a valley, which includes pale tissue, and the sharper outline then required of tools."""
 CLEAR_VALLEY = 1.15
-"""Smallest ratio of both peaks to a valley."""
+"""Smallest ratio of both neighbouring peaks of the redness distribution to the valley between them."""
 SMALLEST_SHARE = 0.003
 """Smallest share of pixels below the threshold."""
 HELD_FRAMES = 3
@@ -228,7 +230,7 @@ class View:
     """Frame at working size."""
 
     redness: Plane
-    """Log of red over the other two channels, [h, w]."""
+    """Log of red over green and blue, [h, w]."""
     brightness: Bytes
     """Largest channel, [h, w]."""
     inside: Bytes

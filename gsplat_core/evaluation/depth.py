@@ -119,7 +119,7 @@ class DepthErrors:
     """Depth errors over tissue pixels with known depth, averaged over frames."""
 
     mae_mm: float
-    """Mean absolute error."""
+    """Mean absolute depth error in mm."""
     rmse_mm: float
     """Root of the mean squared error."""
     relative: float

@@ -61,7 +61,7 @@ class PartShares:
     """Positions and orientations of Gaussians."""
     colour: float
     size: float
-    """Sizes and opacities."""
+    """Share explained by changes of sizes and opacities."""
     explained: float
     """Sum of the three shares. The rest of the change is explained by none of the parts."""
     reference_s: float

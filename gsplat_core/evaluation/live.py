@@ -85,7 +85,7 @@ class Live:
     previous: BaselineScore
     """Baseline for `score`: the previous raw frame, over the same frames and pixels."""
     settled_previous: BaselineScore
-    """Baseline for `settled`."""
+    """Baseline for `settled`: the previous raw frame, over the same frames and pixels."""
     age_when_shown: Ages | None
     """Time from a frame's arrival until its picture is displayed."""
     age_on_screen: Ages | None

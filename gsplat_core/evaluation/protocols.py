@@ -341,7 +341,7 @@ class Retention:
     """Score on the last seconds of the stream."""
     last_range_s: Range
     frozen: BaselineScore
-    """Baseline: the stream's last frame shown for all of these seconds."""
+    """Baseline: the stream's last frame shown for all of the last seconds."""
     places: tuple[PlaceScore, ...]
 
 

@@ -36,7 +36,7 @@ class TrajectoryErrors:
     rigid_rmse: float
     """`rigid_share` in the unit of the true path."""
     rotation_deg: float
-    """Mean angle between true and estimated orientations, after the same rotation."""
+    """Mean angle in degrees between true and estimated orientations, after the rotation of the alignment."""
     scale: float
     """Scale factor of the similarity alignment."""
     path: float

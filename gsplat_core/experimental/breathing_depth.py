@@ -39,7 +39,7 @@ from gsplat_core.scene.frames import Frame
 MOVES_PX = 2.0
 """Error against the periodic motion in pixels from which a point may be pulled."""
 FEWEST_PULL_POINTS = 30
-"""Average number of such points per picture needed for an estimate."""
+"""Average number of points per picture with an error above `MOVES_PX` that an estimate needs."""
 SPREAD_PX = 0.7
 """Cauchy scale of errors in pixels."""
 ROUNDS = 8
@@ -56,7 +56,7 @@ class Pull:
     direction: Array
     """Unit direction in camera coordinates, [3]."""
     error_px: float
-    """Median deviation of the points from this direction in pixels."""
+    """Median deviation of the points' motion from the common direction, in pixels."""
 
     def along(self, rays: Array, off: Array) -> tuple[Array, Array]:
         """Return the relative motion along the line of sight and the unexplained error.

@@ -123,7 +123,7 @@ EARLIER_COUNTS = 0.64
 FOLLOWED = 6
 """Number of most similar moments whose next motion is averaged."""
 Weighted: TypeAlias = tuple[float, Flow]
-"""Motion with its weight."""
+"""Weight of a motion, and the motion as a flow."""
 
 
 class SimilarMoments:
@@ -202,7 +202,7 @@ class _Guesses:
     moved: Field
     """Newest picture moved by the expected motion, [h, w, 3]."""
     others: list[Field]
-    """Differences of the other predictions from it, [h, w, 3] each."""
+    """Differences of the alternative predictions from `moved`, [h, w, 3] each."""
 
 
 class ExpectedPicture:

@@ -289,7 +289,7 @@ weight for their neighbours.
 LEAST_LEFT = 0.3
 """Share of a point's observations that must remain; otherwise all of them are used."""
 ROBUST_ROUNDS = 2
-"""Number of refits."""
+"""Number of refits that exclude disturbed observations."""
 
 
 def fitted_undisturbed(tracks: GridTracks, motion: PeriodicMotion) -> PeriodicMotion:

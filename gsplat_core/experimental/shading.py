@@ -91,7 +91,7 @@ class SmallPicture:
     """Picture reduced for the analysis of its light."""
 
     levels: NDArray[np.uint8]
-    """RGB levels [H, W, 3]."""
+    """Reduced picture, RGB uint8 [H, W, 3]."""
     usable: NDArray[np.float32]
     """Weights [H, W]: 1 on tissue that is well exposed and away from tool shadows, else 0."""
     tissue: NDArray[np.uint8]

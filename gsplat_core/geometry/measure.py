@@ -33,7 +33,7 @@ class SurfacePoint:
     pixel: tuple[float, float]
     """Column and row; the first pixel's centre is at (0.5, 0.5)."""
     position: tuple[float, float, float]
-    """World coordinates."""
+    """Position of the surface point in world coordinates."""
     depth: float
     """z in camera coordinates."""
     depth_error: float

@@ -28,7 +28,7 @@ RETURN_PX = 0.5
 """Largest accepted forward-backward error in pixels."""
 BORDER_PX = 6
 SAME_PX = 3.0
-"""Distance in pixels below which two points count as one."""
+"""Distance in pixels below which two tracked points count as one point."""
 
 Numbers = NDArray[np.int64]
 
@@ -42,7 +42,7 @@ class SmallPicture:
     usable: NDArray[np.uint8]
     """Validity uint8 [h, w]; 0 on tools, highlights and the border."""
     camera: Camera
-    """Camera scaled to this size."""
+    """Camera scaled to the size of the reduced picture."""
 
     def rays(self, pixels: Points) -> NDArray[np.float64]:
         """Return rays x / z and y / z [N, 2] of pixel positions in OpenCV's convention."""

@@ -42,9 +42,9 @@ class Waypoint:
 
     time_s: float
     camera_to_world: NDArray[np.float64]
-    """[4, 4]."""
+    """Camera-to-world pose [4, 4]."""
     intrinsics: tuple[float, ...] | None = None
-    """fx, fy, cx and cy; None for those of the camera that follows the path."""
+    """fx, fy, cx and cy in pixels; None to keep the intrinsics of the camera that follows the path."""
 
 
 class CameraPath:

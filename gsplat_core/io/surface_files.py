@@ -27,9 +27,9 @@ class TriangleMesh(NamedTuple):
     """Vertex positions and triangles of a mesh."""
 
     vertices: NDArray[np.float64]
-    """[V, 3]."""
+    """Vertex positions [V, 3]."""
     triangles: NDArray[np.int64]
-    """[T, 3]; empty for a point cloud."""
+    """Vertex indices of the triangles, [T, 3]; empty for a point cloud."""
 
 
 def read_surface(path: Path) -> TriangleMesh:

@@ -228,7 +228,7 @@ POINTS, LEAST_SEEN = 600, 5
 """Number of points used, most often observed first, and the least number of observations of each."""
 FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
-"""Accepted initial depths relative to the median; points outside this range start at the median depth."""
+"""Range of accepted initial depths relative to the median depth. Points outside it start at the median depth."""
 FINEST = 0.0017
 STAGES = (
     (0.014, 3, 0.0),

@@ -177,7 +177,7 @@ class Bundle:
     poses: Tensor
     """World-to-camera poses [C, 4, 4]."""
     points: Tensor
-    """World positions [P, 3]."""
+    """World positions of the points, [P, 3]."""
     camera: Tensor
     """Camera index of each observation, int64 [M]."""
     point: Tensor

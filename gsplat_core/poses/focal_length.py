@@ -28,9 +28,9 @@ from gsplat_core.threads import one_thread
 SHORTEST, LONGEST = 0.6, 1.6
 """Bounds of the search in units of the picture's longer side, corresponding to fields of view of 80° and 35°."""
 CANDIDATES = 8
-"""Focal lengths tried between the bounds, in equal ratios, before refinement."""
+"""Number of focal lengths tried between the bounds, in equal ratios, before the refinement."""
 REFINEMENTS = 4
-"""Focal lengths evaluated by the golden-section search, two per step."""
+"""Number of focal lengths evaluated by the golden-section search, two per step."""
 NEARLY_AS_WELL = 0.01
 """Relative increase of the error up to which a focal length is as plausible as the best one. Tissue motion alone
 changes the error by this much.

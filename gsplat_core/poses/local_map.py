@@ -240,7 +240,7 @@ FEWEST_MATCHES, MATCH_PX = 12, 8.0
 their depth is interpolated from known points.
 """
 TRIES = 100
-"""RANSAC iterations."""
+"""Number of RANSAC iterations for the pose from feature matches."""
 Pose = NDArray[np.float64]
 
 
@@ -251,11 +251,11 @@ class Recognised:
     key: KeyFrame
     places: LocalMap
     pose: Pose
-    """Pose of the picture estimated from these points alone, world to camera [4, 4]."""
+    """World-to-camera pose [4, 4] of the picture, estimated from the recognised points alone."""
     numbers: Numbers
     """Numbers of the points found, ascending."""
     pixels: Points
-    """Pixel positions of these points [N, 2]."""
+    """Pixel positions of the recognised points, [N, 2]."""
 
 
 def seen_again(

@@ -164,7 +164,7 @@ class SurfaceField:
     """Nodes of a vector field with its prior."""
 
     nodes: Tensor
-    """Node positions [M, 3]."""
+    """Positions of the field's nodes, [M, 3]."""
     middle: Tensor
     """Median position of the points [3]."""
     stiffness: Tensor

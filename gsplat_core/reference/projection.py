@@ -185,7 +185,7 @@ class _Ellipses(NamedTuple):
     conics: Tensor
     compensations: Tensor
     positive: Tensor
-    """bool: the covariance is invertible; otherwise the conic is meaningless."""
+    """Mask, bool: True where the 2D covariance is invertible; elsewhere the conic is meaningless."""
 
 
 def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Ellipses:

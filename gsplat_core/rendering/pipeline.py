@@ -70,7 +70,7 @@ class RenderedSplats(NamedTuple):
     """
 
     image: Tensor
-    """[..., C, H, W, channels]: colours, then the sum of weight times z if depth is rendered."""
+    """Rendered channels [..., C, H, W, channels]: colours, then the sum of weight times z if depth is rendered."""
     alphas: Tensor
     rows: DenseProjection | PackedProjection
     channels: Tensor

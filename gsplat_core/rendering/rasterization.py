@@ -85,7 +85,7 @@ class RenderOutput(NamedTuple):
     image: Tensor
     """Colours [H, W, 3], 0 to 1 for an ordinary scene (not clamped above)."""
     alpha: Tensor
-    """Opacity [H, W]."""
+    """Accumulated opacity [H, W], 0 to 1."""
     depth: Tensor
     """Expected z [H, W] in the scene's unit, weighted by contribution; 0 where alpha is 0."""
 

@@ -39,9 +39,9 @@ class SplatPlanes(NamedTuple):
     """Splats projected to one camera; values of culled splats are finite and meaningless."""
 
     rows: DenseProjection
-    """[N, ...]."""
+    """Projections of the splats to one camera, [N, ...]."""
     opacities: Tensor
-    """[N]."""
+    """Opacities of the splats, [N]."""
     slopes: Tensor
     """Change of z along a splat per pixel to the right and down, [N, 2]."""
     variances: Tensor
@@ -58,7 +58,7 @@ class TileLists(NamedTuple):
     """Splats of every tile in depth order."""
 
     ids: Tensor
-    """int32 [M]."""
+    """Splat indices of all lists, one list after another, int32 [M]."""
     starts: Tensor
     """Start of each tile's list, int32 [tile_height, tile_width]."""
 
@@ -161,7 +161,7 @@ class TileOfRays(NamedTuple):
     rows: slice
     columns: slice
     splats: Tensor
-    """Splat indices [L]."""
+    """Indices of the splats in the tile's list, [L]."""
     weights: Tensor
     """Blending weight of each splat in each pixel, [P, L]."""
     through: Tensor
@@ -230,7 +230,7 @@ class Surface(NamedTuple):
     """Surface seen by one camera, in the scene's unit and camera axes (x right, y down, z forward)."""
 
     alpha: Tensor
-    """Opacity [H, W]."""
+    """Accumulated opacity [H, W], 0 to 1."""
     ray_depth: Tensor
     """Expected z [H, W] at the rays' intersections with the splats; 0 where unobserved."""
     normals: Tensor

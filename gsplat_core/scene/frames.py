@@ -46,7 +46,7 @@ class Frame:
     depth_origin: DepthOrigin | None = None
     """Origin of `depth`; None without depth. Depth without an origin counts as recorded with the frame (`MEASURED`)."""
     mask: NDArray[np.uint8] | None = None
-    """[H, W]; 1 = tissue (keep), 0 = tool."""
+    """Tissue mask [H, W]; 1 = tissue (keep), 0 = tool."""
     pose: NDArray[np.float64] | None = None
     """World-to-camera [4, 4], OpenCV axes."""
     status: FrameStatus = FrameStatus.REPLAY

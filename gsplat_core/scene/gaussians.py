@@ -171,16 +171,17 @@ class Gaussians:
 
 
 RAW_COLUMNS = 16
-"""Columns of a row; those beyond `OPACITY` are unused and zero, so that a row is four aligned float4."""
+"""Number of columns of a raw row. Columns beyond `OPACITY` are unused and zero, so that a row is four aligned float4.
+"""
 POSITION = slice(0, 3)
-"""x, y, z."""
+"""Columns of the position delta x, y, z in a raw row."""
 ROTATION = slice(3, 7)
 """Quaternion as w, x, y, z."""
 LOG_SCALE = slice(7, 10)
 COLOUR = slice(10, 13)
 """Red, green, blue of the first spherical-harmonics coefficient."""
 OPACITY = slice(13, 14)
-"""Logit of the opacity."""
+"""Column of the opacity logit in a raw row."""
 
 
 def width_of(*groups: slice) -> int:

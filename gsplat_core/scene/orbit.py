@@ -26,7 +26,7 @@ class Orbit:
     azimuth_deg: float = 0.0
     """Rotation to the right around the point at the centre of the picture, in degrees."""
     elevation_deg: float = 0.0
-    """Upward rotation around the same point, in degrees."""
+    """Upward rotation around the point at the centre of the picture, in degrees."""
     zoom: float = 1.0
     """Factor by which the camera is closer to that point."""
 

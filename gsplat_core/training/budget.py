@@ -37,9 +37,9 @@ class Budget:
     deadline_s: float = math.inf
     """Time on `clock` by which the last step must be finished, in seconds."""
     at_least: int = 1
-    """Steps that are made even if they miss the deadline."""
+    """Number of steps that are made even if they miss the deadline."""
     at_most: int | None = None
-    """Largest number of steps before the deadline, or None."""
+    """Largest number of steps before the deadline; None for no limit."""
     clock: Callable[[], float] = time.monotonic
     """Monotonic clock in seconds."""
 

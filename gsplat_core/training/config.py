@@ -40,9 +40,9 @@ class LearningRates:
     logit_opacities: float = 2e-2
     sh: float = 5e-3
     right_share: float = 0.1
-    """Factor of the rate `sh` for the right eye's own colours. Without depth, the colour difference
-    between the eyes is what moves Gaussians to the right depth, so these colours must follow
-    slowly. A scene that starts from stereo depth offline uses 1.
+    """Factor of the rate `sh` for the right eye's own colours. Without depth, only the colour difference between the
+    eyes moves Gaussians to the right depth. The right eye's colours must therefore adapt slowly, so that they do not
+    absorb that difference. A scene that starts from stereo depth offline uses 1.
     """
     field: FieldRates | None = None
     """Rates of the deformation field, of type `FIELDS[name].rates`; None for its defaults."""
@@ -102,7 +102,7 @@ class ReconstructorConfig:
     motion_detail: Detail = "full"
     """Resolution at which a motion prior processes pictures; `half` is faster."""
     start_from_motion: bool = False
-    """Move the scene by the motion prior to a new frame before its first step."""
+    """True to move the scene by the motion prior to the time of a new frame before the first step on the frame."""
     depth_from_motion: bool = False
     """Estimate the scene's depth online from camera motion by the motion prior, if poses but no depth are given."""
     depth_of_recording: str | None = None

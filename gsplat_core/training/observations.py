@@ -36,9 +36,9 @@ class Observation:
     rehearsal_mask: Tensor | None = None
     """Mask uint8 [H, W]; 0 = ignored when the frame is trained on again later."""
     right_eye: RightEye | None = None
-    """Right eye's picture of the same time, if it is trained on (`BothEyes`)."""
+    """Right eye's picture taken at the same time, if the right eye is trained on (`BothEyes`)."""
     of_right: bool = False
-    """True if this is an observation of the right eye."""
+    """True if the picture is the right eye's."""
 
     @property
     def right(self) -> Observation | None:

@@ -82,7 +82,7 @@ def steadiness(observations: Sequence[Observation]) -> float:
 
 
 SMOOTH_EVERY = 20
-"""Steps between two smoothings, which process all columns, unlike a step."""
+"""Number of training steps between two smoothings. A smoothing processes all columns, unlike a training step."""
 MOST_AT_ONCE = 0.5
 """Largest share of the way to the neighbours' mean in one smoothing."""
 

@@ -38,7 +38,7 @@ FOLLOWS = 0.2
 SHIFT_STAYS = 4
 """Search range around the last shift, in pixels of the compared pictures."""
 LEAST_OVERLAP = 0.4
-"""Smallest overlap of the two views, as a share of the width."""
+"""Smallest overlap of the two eyes' views at which a shift is considered, as a share of the width."""
 QUANTILES = (10, 50, 90)
 """Compared quantiles in per cent. Highlights and shadows, which differ between the eyes, are outside their range."""
 FLAT_LEVELS = 8.0
@@ -57,7 +57,9 @@ class EyeColours:
         """Gains and offsets as a matrix [3, 4], or None for no correction."""
         self._frames = 0
         self.shift: float | None = None
-        """Shift of the right picture to the left, as a share of its width, at the last comparison; None before it."""
+        """Shift of the right picture to the left, as a share of its width, at the last comparison; None before the
+        first one.
+        """
 
     def corrected(self, frame: Frame) -> NDArray[np.uint8]:
         """Return the right picture of a stereo frame in the colours of the left one."""
@@ -175,7 +177,7 @@ class PreparedPicture(NamedTuple):
     """Right picture in the left one's colours, on the host."""
 
     image: NDArray[np.uint8]
-    """RGB [H, W, 3]."""
+    """Right picture in the left picture's colours, RGB [H, W, 3]."""
     mask: NDArray[np.uint8]
     """Mask [H, W]; 1 = tissue."""
     steady: NDArray[np.uint8] | None

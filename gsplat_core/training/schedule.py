@@ -31,7 +31,7 @@ STEP_TIME_DECAY = 0.3
 LONGER_STEP_DECAY = 0.1
 """Weight of longer steps in the estimated step time of a live stream."""
 REHEARSED_IN_FLIGHT = 2
-"""Rehearsal steps that may be queued on a GPU; the next frame's first step waits for them."""
+"""Largest number of rehearsal steps queued on a GPU. The next frame's first step waits for them."""
 REHEARSED_CORRECTION = 0.5
 """Share of `colour_relaxation` in rehearsal steps. A correction at one time also affects
 neighbouring times, which are corrected themselves.
@@ -58,7 +58,7 @@ class LiveTraining:
     rate_steps: int = 30
     """Number of steps from the first to the last factor in equal ratios; further steps use the last factor."""
     recent_share: float = 0.6
-    """Share of the rehearsal steps on the newest frame; the others are spread evenly over the window."""
+    """Share of the rehearsal steps on the newest frame. The other rehearsal steps are spread evenly over the window."""
     colour_relaxation: float = 0.0
     """Above 0, colours are corrected by this multiple of the mean residual (`colour_correction`) instead of trained
     with a learning rate, if the field has temporal colours. On a GPU this requires spherical harmonics of degree 0, and

@@ -28,15 +28,15 @@ class Rows:
     """N Gaussians on the host, float32."""
 
     means: Array
-    """[N, 3]."""
+    """Centres [N, 3] in world units."""
     rotations: Array
-    """Unit quaternions wxyz [N, 4]; those of zero length become the identity."""
+    """Unit quaternions wxyz [N, 4]; quaternions of zero length become the identity."""
     scales: Array
     """Standard deviations [N, 3]."""
     opacities: Array
-    """0 to 1, [N]."""
+    """Opacities from 0 to 1, [N]."""
     sh: Array
-    """[N, K, 3]."""
+    """Spherical-harmonics coefficients [N, K, 3]."""
 
 
 def rows_of(gaussians: Gaussians) -> Rows:

@@ -50,7 +50,7 @@ class Calibration:
 
     camera: Camera
     poses: NDArray[np.float64] | None
-    """World-to-camera poses [N, 4, 4]; None if unknown, then frame 0's camera is used for all."""
+    """World-to-camera poses [N, 4, 4]. None if unknown; the camera of frame 0 is then used for all frames."""
     source: str
     assumed: bool = False
     """True if the intrinsics are a guess because the recording does not contain any."""

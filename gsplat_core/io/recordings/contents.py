@@ -65,7 +65,7 @@ class Contents:
     right: FrameImages | None = None
     masks: MaskFiles | None = None
     valid_mask: NDArray[np.uint8] | None = None
-    """uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue."""
+    """Mask uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue."""
     depth: DepthFiles | None = None
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None

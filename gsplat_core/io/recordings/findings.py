@@ -21,7 +21,7 @@ class Finding:
     message: str
     """Description of the defect with the observed value."""
     advice: str
-    """Remedy."""
+    """Remedy for the defect, addressed to the user."""
     missing: bool = False
     """True if the file does not exist (RecordingMissing), False if it is wrong (RecordingInvalid)."""
 

@@ -67,7 +67,7 @@ class Eyes:
     right: tuple[Path, ...]
     """Right-eye files, in the order of the corresponding left-eye files."""
     others: tuple[Path, ...]
-    """Files of neither eye."""
+    """Files whose names state neither eye."""
 
 
 def split_eyes(files: Sequence[Path]) -> Eyes | None:

@@ -19,7 +19,7 @@ _CRC32 = 0xBF
 _TIMESTAMP = 0xE7
 _BLOCK = 1 << 20
 _MOST_OTHERS = 10_000
-"""Maximum number of elements other than clusters; bounds the time to walk a file of empty ones."""
+"""Maximum number of elements other than clusters; bounds the time to parse a file of empty elements."""
 _MAX_ID_BYTES, _MAX_LENGTH_BYTES = 4, 8
 
 

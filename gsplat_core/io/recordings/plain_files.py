@@ -180,7 +180,7 @@ class Picture:
     """Decoded picture with the damage found in it."""
 
     image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3]."""
+    """Decoded picture, RGB uint8 [H, W, 3]."""
     damage: str | None = None
     """Description of damage, after which parts may be the decoder's error concealment; None without any sign of damage.
     """

@@ -39,7 +39,7 @@ class Recording(Protocol):
     height_px: int
     fps: float
     camera: Camera
-    """The camera of frame 0."""
+    """Camera of frame 0."""
     notes: tuple[str, ...]
     """Sentences about fallbacks that were applied."""
     fields: frozenset[str]

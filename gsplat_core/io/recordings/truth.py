@@ -167,9 +167,10 @@ class TrueMotion:
     """Motion from one frame to the next at the size of the frame; NaN where unknown."""
 
     flow: NDArray[np.float32]
-    """[H, W, 2], pixels."""
+    """Optical flow to the next frame, [H, W, 2] in pixels."""
     scene_flow: NDArray[np.float32] | None
-    """[H, W, 3], in the recording's unit and world; None where the recording has none."""
+    """Displacement of the tissue to the next frame, [H, W, 3] in the recording's unit and world; None if not recorded.
+    """
 
 
 @dataclass(frozen=True)
@@ -241,9 +242,9 @@ class Tracks:
     """Trajectories of tissue points."""
 
     points: NDArray[np.float64]
-    """[frames, points, 3], in the recording's world."""
+    """Positions of the points in the recording's world, [frames, points, 3]."""
     seen: NDArray[np.bool_]
-    """bool [frames, points]: visibility in the left eye."""
+    """Visibility of the points in the left eye, bool [frames, points]."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ class VideoIndex:
     positions: array
     """Display position of each packet's picture; -1 if not displayed."""
     key_packets: bytes
-    """For each packet, 1 if decoding can start there, else 0."""
+    """One byte per packet: 1 if decoding can start at the packet, else 0."""
     damaged: dict[int, str]
     """Damage reported by the container, by packet number."""
     frame_count: int

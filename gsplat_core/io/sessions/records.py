@@ -33,7 +33,7 @@ from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
-"""Timestamp in milliseconds within the track's file, for each track with a picture of this line."""
+"""Timestamps of a log line's pictures, in milliseconds within the track's file, by track."""
 
 
 class SegmentBegins(Record):
@@ -46,7 +46,7 @@ class SegmentBegins(Record):
     utc: Text
     """Wall-clock date and time in ISO 8601."""
     monotonic_ns: Nanoseconds
-    """The same moment on the monotonic clock of `arrived_ns` and `shown_ns`."""
+    """Start of the segment in nanoseconds on the monotonic clock of `arrived_ns` and `shown_ns`."""
 
 
 class _PictureLine(Record):
@@ -58,7 +58,7 @@ class _PictureLine(Record):
     height_px: Side
     tracks: Tracks
     pose: Pose | None = None
-    """World-to-camera."""
+    """World-to-camera pose of the frame."""
 
 
 class FrameLine(FrameFields, _PictureLine):

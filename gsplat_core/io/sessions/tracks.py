@@ -40,7 +40,7 @@ CODINGS: Mapping[str, Coding] = {
     "depth_confidence": "float",
     "shown": "vp9",
 }
-"""Coding of each track."""
+"""Video coding of the pictures of each track."""
 PIXEL_FORMATS: Mapping[Coding, str] = {"colour": "bgr0", "grey": "gray", "float": "gray", "vp9": "yuv420p"}
 ENCODERS: Mapping[Coding, str] = {"colour": "ffv1", "grey": "ffv1", "float": "ffv1", "vp9": "libvpx-vp9"}
 _VP9 = {

@@ -79,13 +79,17 @@ class Frame(NamedTuple):
     tile_offsets: Tensor
     """Start of each tile's instances in `sorted`, int32 [tiles + 1]. Empty with segments."""
     sorted: Tensor
-    """int32 [capacity]: instances by tile and depth. Empty unless training; may contain -1 if the lists overflowed."""
+    """Instances sorted by tile and depth, int32 [capacity]. Empty unless training; may contain -1 if the lists
+    overflowed.
+    """
     splat_starts: Tensor
     """First instance of each splat, int32 [N + 1]. Empty unless training."""
     instance_splats: Tensor
     """Splat of each instance, int32 [capacity]. Empty unless training."""
     status: Tensor
-    """int32 [4], see `STATUS_NEEDED`. Reading it synchronises with the host."""
+    """Frame status, int32 [4], indexed by `STATUS_NEEDED` and the following constants. Reading it synchronises with the
+    host.
+    """
 
 
 def render_frame(

@@ -22,9 +22,9 @@ class View(NamedTuple):
     """Camera for the frame path; its tensors are read on the device at every launch and replay."""
 
     viewmat: Tensor
-    """[4, 4] world to camera, OpenCV axes."""
+    """World-to-camera matrix [4, 4], OpenCV axes."""
     K: Tensor
-    """[3, 3] in pixels, without skew."""
+    """Intrinsics [3, 3] in pixels, without skew."""
     width: int
     height: int
     background: Tensor | None = None

@@ -44,11 +44,11 @@ class GaussianAdam(NamedTuple):
     """Five contiguous tensors with the Gaussians' shapes and separate memory; also `second_moments`."""
     second_moments: Sequence[Tensor]
     rates: Tensor
-    """float32 [5], the learning rates in the order of the tensors."""
+    """Learning rates in the order of the tensors, float32 [5]."""
     step: Tensor
     """Step number from 1, int64 or int32 [1]; smaller values count as 1."""
     skipped: Tensor
-    """int64 [5]; incremented by the number of unchanged rows of each tensor."""
+    """Number of rows left unchanged so far, for each tensor, int64 [5]; incremented by the step."""
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 
@@ -62,7 +62,7 @@ class ColourCorrection(NamedTuple):
     residuals: Tensor
     """[H, W, 4]: tissue mask times (target - rendered) for red, green, blue; and the tissue mask."""
     relaxation: Tensor
-    """float32 [1]."""
+    """Share of the mean residual by which colours are corrected, float32 [1]."""
 
 
 def render_frame_backward(

@@ -28,15 +28,15 @@ class TrainingState(NamedTuple):
     """Values of the forward pass saved for the backward pass."""
 
     deltas: Tensor
-    """[N, 16] in the layout of `scene.gaussians`."""
+    """Deltas of the raw parameters [N, 16] in the layout of `scene.gaussians`."""
     coordinates: Tensor
-    """[N, 4]: x, y, z in [-1, 1], and 1. Gaussians with a non-finite position have zeros and are skipped."""
+    """Normalised x, y, z in [-1, 1], and 1, [N, 4]. Gaussians with a non-finite position have zeros and are skipped."""
     lines: Tensor
     """Features of the time planes at the step's timestamp, interpolated along time: lines [U, C] with U samples in
     space and C channels, concatenated.
     """
     features: Tensor
-    """[N, levels * C]."""
+    """Features of each Gaussian at all levels, [N, levels * C]."""
     hidden: Tensor
     """Outputs of the trunk's layers, zero-padded, [depth, N, padded width]."""
     order: Tensor
@@ -61,7 +61,7 @@ class FieldGradient(NamedTuple):
     (y, x, z).
     """
     fractions: Tensor
-    """Interpolation fractions along the major and minor axis, [3 * levels * N, 2], in the same order."""
+    """Interpolation fractions along the major and minor axis, [3 * levels * N, 2], in the order of `rows`."""
     dense_sums: Tensor
     """Sums of dense cells' rows for the four cell corners, by runs of 32 sorted rows.
 
@@ -82,11 +82,11 @@ class AdamOnDevice(NamedTuple):
     """Adam settings of one step (Kingma and Ba 2015, algorithm 1), read from device memory."""
 
     rate: Tensor
-    """float32 [1], the learning rate."""
+    """Learning rate, float32 [1]."""
     step: Tensor
-    """int64 [1], counted from 1."""
+    """Number of the optimiser step, counted from 1, int64 [1]."""
     status: Tensor | None = None
-    """int32 [4] of a frame; if its lists overflowed, nothing is changed."""
+    """Status int32 [4] of the rendered frame; if its tile lists overflowed, the step changes nothing."""
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 

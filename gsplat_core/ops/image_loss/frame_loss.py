@@ -15,11 +15,11 @@ class FrameLoss(NamedTuple):
     """Loss with its gradients, the input of `render_frame_backward`."""
 
     loss: Tensor
-    """Scalar."""
+    """Weighted sum of the terms, a scalar."""
     terms: Tensor
     """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth L1."""
     grad_image: Tensor
-    """dL/dimage [H, W, 4]."""
+    """Gradient of the loss by the rendered image, dL/dimage [H, W, 4]."""
     grad_alphas: Tensor
     """dL/dalphas [H, W]; non-zero only through the depth term."""
 

@@ -29,13 +29,13 @@ class DenseProjection(NamedTuple):
     """One row per camera and Gaussian; zeros where the Gaussian is culled."""
 
     radii: Tensor
-    """int32 [..., C, N, 2]: half width and half height of the bounding box in pixels; (0, 0) = culled."""
+    """Half width and half height of the bounding box in pixels, int32 [..., C, N, 2]; (0, 0) = culled."""
     means2d: Tensor
-    """[..., C, N, 2] in pixels."""
+    """Projected centres [..., C, N, 2] in pixels."""
     depths: Tensor
     """Camera-space z [..., C, N]."""
     conics: Tensor
-    """[..., C, N, 3]: inverse of the blurred 2D covariance as (xx, xy, yy)."""
+    """Inverse of the blurred 2D covariance as (xx, xy, yy), [..., C, N, 3]."""
     compensations: Tensor | None
     """Antialiasing factor on the opacity [..., C, N], or None."""
 
@@ -44,11 +44,11 @@ class PackedProjection(NamedTuple):
     """One row per camera and Gaussian that is not culled, ordered by batch, camera, Gaussian."""
 
     batch_ids: Tensor
-    """int64 [nnz], over the flattened batch dimensions."""
+    """Batch index of each row, int64 [nnz], over the flattened batch dimensions."""
     camera_ids: Tensor
-    """int64 [nnz]."""
+    """Camera index of each row, int64 [nnz]."""
     gaussian_ids: Tensor
-    """int64 [nnz]."""
+    """Gaussian index of each row, int64 [nnz]."""
     radii: Tensor
     means2d: Tensor
     depths: Tensor

@@ -77,13 +77,13 @@ class Inputs(NamedTuple):
     scales: Tensor | None
     opacities: Tensor
     colors: Tensor | None
-    """[..., (C,) N, K, 3] or [..., (C,) N, D]; None without colour."""
+    """SH coefficients [..., (C,) N, K, 3] or plain colours [..., (C,) N, D]; None to render without colour."""
     viewmats: Tensor
     Ks: Tensor
     centers: Tensor | None
     """Camera centres [..., C, 3] if their gradient is needed; otherwise computed from the matrices."""
     backgrounds: Tensor | None
-    """[..., C, channels]."""
+    """Background colours [..., C, channels]; None for black."""
 
 
 class Saved(NamedTuple):
@@ -96,7 +96,7 @@ class Saved(NamedTuple):
     splat_ids: Tensor
     """Tile lists, int32 [M]; a splat's id is image * N + Gaussian."""
     sorted: Tensor
-    """int32 [M]: index of each list entry among the (splat, tile) pairs in splat order."""
+    """Index of each list entry among the (splat, tile) pairs in splat order, int32 [M]."""
     splat_starts: Tensor
     """Start of each splat's pairs, int32 [images * N + 1]."""
     row_of: Tensor | None

@@ -25,9 +25,9 @@ class Matches(NamedTuple):
     """Disparity of each pixel of the left picture."""
 
     sixteenths: Tensor
-    """int32 [H, W]: x in the left picture minus x in the right one, in 1/16 px; `UNKNOWN` if unmatched."""
+    """Disparity (x in the left picture minus x in the right one) in 1/16 px, int32 [H, W]; `UNKNOWN` if unmatched."""
     one_surface: Tensor
-    """bool [H, W]: no disparity jump or hole nearby."""
+    """Mask bool [H, W] of pixels without a disparity jump or hole nearby."""
 
 
 def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> Matches:

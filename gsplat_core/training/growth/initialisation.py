@@ -24,7 +24,7 @@ THICKNESS = 0.3
 
 FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
-"""Margin around tools that is in-painted with them, since masks end slightly early, in pixels."""
+"""Width in pixels of the margin around tools that is in-painted together with them, since masks end slightly early."""
 
 MAX_ANGLE_RAD = math.radians(85)
 """Largest angle to the axis at which a fisheye pixel is placed; larger ones are clamped."""

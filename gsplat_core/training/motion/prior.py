@@ -221,7 +221,7 @@ class MotionPrior(Protocol):
         """Time after the newest frame for which the velocity applies, in seconds."""
 
     revealed_px: float
-    """Width in pixels of the strip revealed at an edge since this was last set to 0."""
+    """Width in pixels of the strip revealed at an edge of the picture since the attribute was last set to 0."""
 
     def forget(self) -> None:
         """Reset for a new scene."""

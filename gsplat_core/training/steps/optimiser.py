@@ -45,7 +45,7 @@ class FusedAdam:
         self.epsilon = epsilon
         self.rows = rows
         self.steps = 0
-        """Number of steps taken."""
+        """Number of optimiser steps taken."""
         self._skipped: int | Tensor = 0
         self._spare_rows = 0
         """Allocated but unused rows at the end of the moments; see `reserve`."""

@@ -103,7 +103,7 @@ class TrainingStep:
             self._adam.reserve(config.max_gaussians)
             gaussians = self._rows.used
         self.gaussians = gaussians
-        """Gaussians in use."""
+        """Gaussians of the scene, without unused preallocated rows."""
         kind = kind_of(field.kind)
         self._field_rates = config.rates.field or kind.rates
         if not isinstance(self._field_rates, type(kind.rates)):

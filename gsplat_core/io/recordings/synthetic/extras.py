@@ -79,4 +79,4 @@ class Extras:
 
 
 CLEAR = Extras()
-"""No optional content."""
+"""Extras of a recording without any optional content."""

@@ -26,11 +26,11 @@ class Lamp:
     """Geometry of the light source in mm, in the coordinates of the rendering camera."""
 
     fibres: Array
-    """[2, 3]."""
+    """Positions of the two light fibres in mm, [2, 3]."""
     axis: Array
     """Beam axis, a unit vector [3]."""
     shadow_from: Array
-    """[3]."""
+    """Origin of the shadow rays in mm, [3]."""
     reference_mm: float = REFERENCE_MM
     """Reference distance in mm that sets the exposure."""
 

@@ -129,11 +129,11 @@ class Eye:
     """Picture, depth and material coordinates of the pixels of one camera."""
 
     image: NDArray[np.uint8]
-    """sRGB [H, W, 3]."""
+    """Rendered picture, sRGB uint8 [H, W, 3]."""
     depth: Array
     """Depth z in mm [H, W] of the first surface, tool or tissue, on the ray of each pixel centre."""
     tool: NDArray[np.bool_]
-    """bool [H, W]; pixels at least partly covered by the tool."""
+    """Mask bool [H, W] of pixels at least partly covered by the tool."""
     tissue_depth: Array
     """Depth z in mm [H, W] of the tissue, also behind the tool."""
     u: Array

@@ -19,7 +19,7 @@ from gsplat_core.io.recordings.synthetic.lamp import REFERENCE_MM
 PERIOD_S = 3.4
 """Mean period of a breath, in seconds."""
 WANDER_PERIODS_S = (6.1, 9.7)
-"""Periods of the two waves that modulate the rate: about two and three breaths."""
+"""Periods in seconds of the two waves that modulate the breathing rate: about two and three breaths."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,10 @@ class TissueTexture:
         relief_mm = cv2.GaussianBlur(relief_mm.astype(np.float32), (0, 0), 0.22 / self.texel_mm)
         wetness = 0.12 + 0.88 * _smoothstep(-0.3, 1.2, self._noise(rng, (16.0, 6.0, 2.5), 0.6))
         self.reflectance = np.ascontiguousarray(np.clip(np.dstack([colour, wetness]), 0.004, 0.95), np.float32)
-        """[S, S, 4]: linear RGB, wetness."""
+        """Linear RGB reflectance and wetness of each texel, [S, S, 4]."""
         slope_v, slope_u = np.gradient(relief_mm, np.float32(self.texel_mm))
         self.slope = np.ascontiguousarray(np.dstack([slope_u, slope_v]), np.float32)
-        """[S, S, 2]: the relief's derivatives by u and v."""
+        """Derivatives of the fine relief by u and v at each texel, [S, S, 2]."""
 
     def sample(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return reflectance and wetness [H, W, 4] and relief slopes [H, W, 2] of material points [H, W]."""
@@ -226,7 +226,7 @@ class Tissue:
         ]
         self._tilt = rng.uniform(-0.10, 0.10, 2)
         self.breathing = Breathing(float(rng.uniform(0, 2 * np.pi)))
-        """Default; replaced if a recording requests other breathing."""
+        """Breathing of a tissue without extras; replaced if a recording requests other breathing."""
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
         self.texture = TissueTexture(rng, texel_mm)
 

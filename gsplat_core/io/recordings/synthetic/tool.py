@@ -44,7 +44,7 @@ class ToolHits:
     """Intersections of rays with the tool."""
 
     distance_mm: Array
-    """Distance along the ray; infinity without a hit before the limit."""
+    """Distance in mm along the ray; infinity if the ray hits nothing before its limit."""
     cover: Array
     """Coverage of the pixel, 0..1, by the ray's distance from the tool."""
     normal: Array
