@@ -1,4 +1,4 @@
-// Requests to the API with the key of this tab. A key that is refused asks for another one.
+// API requests with this tab's key. If the server rejects the key, the user is asked for another one.
 
 import { sha256 } from "./sha256.js";
 
@@ -8,7 +8,7 @@ let askForKey = async () => { throw new Error("nobody asks for a key yet"); };
 let asked = null;
 let changed = () => {};
 
-/** An answer that is no success, with what the server says about it. */
+/** A response with an error status, with the problem document of the server. */
 export class Problem extends Error {
   constructor(status, document) {
     super(document?.detail || document?.title || `the server answered ${status}`);
@@ -16,35 +16,35 @@ export class Problem extends Error {
   }
 }
 
-/** `ask` is an async function that resolves to a key; it is called once for all requests that wait. `onChange` is called after there is a new key. */
+/** Set `ask`, an async function that resolves to a key; pending requests share one call. `onChange` is called after a key change. */
 export function setKeyDialog(ask, onChange) {
   askForKey = ask;
   changed = onChange;
 }
 
-/** Forget the key of this tab, and all that was shown with it. */
+/** Delete this tab's key, and reload to remove the displayed data. */
 export function signOut() {
   sessionStorage.removeItem(STORED);
   location.reload();
 }
 
-/** The key of this tab from now on; kept until the tab is closed. */
+/** Use a key for all further requests; it is stored until the tab is closed. */
 export function useKey(given) {
   key = given.trim();
   sessionStorage.setItem(STORED, key);
 }
 
 async function newKey(reason) {
-  asked ??= askForKey(reason).then(useKey).finally(() => { asked = null; changed(); }); // nothing waits for it: it may need another key
+  asked ??= askForKey(reason).then(useKey).finally(() => { asked = null; changed(); }); // not awaited: its requests may ask for another key
   await asked;
 }
 
-/** Call the API; returns the JSON of the answer, or null where it has none. Throws Problem, and TypeError without a connection. */
+/** Call the API and return the JSON body, or null without one. Throws Problem, or TypeError without a connection. */
 export async function call(method, path, body, headers = {}) {
   return documentOf(await ask(method, path, body, headers));
 }
 
-/** Fetch a file and let the browser save it under the name that the server gives it. Throws as `call`. */
+/** Fetch a file and let the browser save it under the server's file name. Throws like `call`. */
 export async function download(path) {
   const answer = await ask("GET", path);
   const name = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "")?.[1] ?? "export";
@@ -53,19 +53,19 @@ export async function download(path) {
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
 
-/** Fetch a file; returns the answer. Throws as `call`. */
+/** Fetch a file and return the response. Throws like `call`. */
 export async function fetched(path) {
   return ask("GET", path);
 }
 
-/** The address of a path with a ticket, for what cannot send a key. It is good once, and soon. */
+/** Return the URL of a path with a ticket, for requests that cannot send a header. A ticket is short-lived and valid once. */
 export async function useTicket(path) {
   const { ticket } = await call("POST", "/v1/tickets", { path });
   return `${path}?ticket=${encodeURIComponent(ticket)}`;
 }
 
 async function documentOf(answer) {
-  if (answer.status === 204) return null; // it has no body, whatever its type says
+  if (answer.status === 204) return null; // no body, whatever the content type
   return answer.headers.get("content-type")?.includes("json") ? answer.json() : null;
 }
 
@@ -85,11 +85,11 @@ async function ask(method, path, body, headers = {}) {
   }
 }
 
-/** Put a file, with its SHA-256 and a call of `progress(share)` now and then. Throws Problem. */
+/** Upload a file with its SHA-256; `progress(share)` is called during the upload. Throws Problem. */
 export async function upload(path, file, progress) {
   const digest = await sha256(file);
   return new Promise((resolve, reject) => {
-    const request = new XMLHttpRequest(); // fetch does not say how much was sent
+    const request = new XMLHttpRequest(); // fetch does not report upload progress
     request.open("PUT", path);
     request.setRequestHeader("Authorization", `Bearer ${key}`);
     request.setRequestHeader("Content-Type", "application/octet-stream");

@@ -1,4 +1,4 @@
-// The page of the audit log: the newest entries first, filtered, and saved as a file.
+// The audit log page: entries in reverse order with a filter, and export to a file.
 
 import { call, download } from "./api.js";
 import { long, row } from "./table.js";
@@ -8,7 +8,7 @@ const at = (id) => document.getElementById(id);
 const COUNT = 50;
 const FIELDS = ["event", "actor", "subject", "outcome"];
 
-/** Returns what renews the page. */
+/** Return a function that refreshes the page. */
 export function auditPage(report) {
   let before = null;
   let wanted = new URLSearchParams();
@@ -21,7 +21,7 @@ export function auditPage(report) {
     await older();
   }
 
-  /** The next entries. A page of a search may be empty though there are more: each reads a part of the log. */
+  /** Append the next entries. A filtered page may be empty although more entries exist, because each request searches a part of the log. */
   async function older() {
     let found = 0;
     do {
@@ -42,14 +42,14 @@ export function auditPage(report) {
     event.preventDefault();
     report(renew);
   });
-  at("audit-filter").addEventListener("reset", () => setTimeout(() => report(renew))); // after the fields were emptied
+  at("audit-filter").addEventListener("reset", () => setTimeout(() => report(renew))); // after the browser has cleared the fields
   for (const form of ["csv", "jsonl"]) {
     at(`save-${form}`).addEventListener("click", () => report(() => download(`/v1/audit/export?${new URLSearchParams([...chosen(), ["format", form]])}`)));
   }
   return renew;
 }
 
-/** What the form asks for. Its times are in the zone of this browser; the server gets them in UTC. */
+/** Return the form's query. Its times are in the browser's time zone and are converted to UTC. */
 function chosen() {
   const query = new URLSearchParams();
   for (const field of FIELDS) {

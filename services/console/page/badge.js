@@ -1,8 +1,8 @@
-// The state and the age of one picture, beside it. A picture of which nothing is heard any more must not look as if it were live.
+// State and age of one image, displayed next to it. An image whose connection is lost must not look live.
 
 const SILENT_MS = 1500;
 
-/** Writes into an element: `say(header)` for each picture, `lost()` without a connection. */
+/** Writes the state to an element. Call `say(header)` for each image, and `lost()` when the connection is lost. */
 export class Badge {
   constructor(place) {
     Object.assign(this, { place, heard_ms: performance.now(), state: "", timer: setInterval(() => this.look(), 250) });

@@ -1,10 +1,10 @@
-// Questions before something that cannot be undone, and a secret that is shown once.
+// Confirmation of irreversible actions, and the display of a new key.
 
 const at = (id) => document.getElementById(id);
 
 /**
- * Ask before something is deleted or ended. `what` names it with its number, `consequence` says what is lost, `verb` is the button's text.
- * Resolves to true only after that button was pressed; Escape and Cancel are no.
+ * Ask for confirmation. `what` identifies the object, `consequence` describes the data loss, `verb` is the label of the button.
+ * Resolves to true if that button was pressed, and to false after Escape or Cancel.
  */
 export async function confirmed({ title, what, consequence, verb = "Delete" }) {
   const dialog = at("confirm");
@@ -15,12 +15,12 @@ export async function confirmed({ title, what, consequence, verb = "Delete" }) {
   at("confirm-yes").textContent = verb;
   dialog.returnValue = "";
   dialog.showModal();
-  at("confirm-no").focus(); // Enter alone deletes nothing
+  at("confirm-no").focus(); // so that Enter does not confirm
   await new Promise((resolve) => dialog.addEventListener("close", resolve, { once: true }));
   return dialog.returnValue === "yes";
 }
 
-/** Show a new key until the dialog is closed; it is nowhere on the page afterwards. */
+/** Show a new key until the dialog is closed, then remove it from the page. */
 export async function showKey(made) {
   const dialog = at("made-key"), place = at("made-key-secret");
   at("made-key-name").textContent = `${made.name}, ${made.role}, ID ${made.id}`;
@@ -37,7 +37,7 @@ at("made-key-copy").addEventListener("click", async () => {
   try {
     await navigator.clipboard.writeText(at("made-key-secret").value);
     at("made-key-copied").value = "copied";
-  } catch { // without TLS a page has no clipboard
+  } catch { // the clipboard API requires a secure context
     at("made-key-copied").value = "selected: press Ctrl+C";
   }
 });

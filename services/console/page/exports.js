@@ -1,4 +1,4 @@
-// Files from the server: snapshots of a stream, exports of models. Each is fetched with the key of this tab and then saved.
+// Downloads: snapshots of a stream and exports of models.
 
 import { call, download } from "./api.js";
 import { button, size } from "./table.js";
@@ -15,7 +15,7 @@ const FORMATS = {
   "points-ply": "surface points (.ply)",
 };
 
-/** Elements to save something in a format: `path` is what `/exports/FORMAT` follows. */
+/** Create the controls to save an object in a chosen format; `path` is the URL before `/exports/FORMAT`. */
 export function exportControls(path, name, report) {
   const choice = document.createElement("select");
   choice.setAttribute("aria-label", `Format to save ${name} in`);
@@ -23,7 +23,7 @@ export function exportControls(path, name, report) {
   return [choice, button("Save", () => download(`${path}/exports/${choice.value}`), report)];
 }
 
-/** The snapshots of a stream, in `place`. Returns `watch(stream)`. */
+/** Create the snapshot controls in `place`. Returns `watch(stream)`, which selects the stream. */
 export function snapshotsOf(place, report) {
   let stream = "";
   const name = document.createElement("input");
@@ -53,7 +53,7 @@ export function snapshotsOf(place, report) {
   row.append(take, label);
   place.append(row, said, kept);
 
-  /** The state of a new version once the server has looked at it. */
+  /** Wait for the server to check a new version, and return its state. */
   async function checked({ name: model, version }) {
     for (let wait_ms = 200; ; wait_ms = Math.min(2 * wait_ms, 2000)) {
       const now = await call("GET", `/v1/models/${model}/versions/${version}`);

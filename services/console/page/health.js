@@ -1,4 +1,4 @@
-// The page of the service's health: what /readyz says, versions, and the streams with their processes.
+// The health page: checks of /readyz, versions, and the streams with their processes.
 
 import { call } from "./api.js";
 import { replaceRows, row } from "./table.js";
@@ -6,7 +6,7 @@ import { processFacts } from "./streams.js";
 
 const at = (id) => document.getElementById(id);
 
-/** Returns what renews the page. */
+/** Return a function that refreshes the page. */
 export function healthPage() {
   return async function renew() {
     const [ready, version, streams] = await Promise.all([readiness(), call("GET", "/v1/version"), call("GET", "/v1/streams")]);
@@ -22,7 +22,7 @@ export function healthPage() {
   };
 }
 
-/** The answer of /readyz, which has a body with 503, too. It needs no key. */
+/** Fetch /readyz, which also has a body with status 503 and requires no key. */
 async function readiness() {
   const answer = await fetch("/readyz?verbose");
   if (answer.ok || answer.status === 503) return answer.json();

@@ -1,4 +1,4 @@
-// The page of API keys: made, listed, revoked. Administrators alone.
+// The page of API keys: create, list, revoke. For administrators only.
 
 import { call } from "./api.js";
 import { confirmed, showKey } from "./dialogs.js";
@@ -8,7 +8,7 @@ import { when } from "./times.js";
 const at = (id) => document.getElementById(id);
 const DAY_MS = 86_400_000;
 
-/** Returns what renews the page. `mine()` is the number of the key that this page uses. */
+/** Return a function that refreshes the page. `mine()` returns the id of the key in use. */
 export function keysPage(report, mine) {
   async function renew() {
     replaceRows(at("key-rows"), (await call("GET", "/v1/keys")).map(line));

@@ -1,4 +1,4 @@
-// Further pictures of a stream: depth, confidence, and the view of its virtual camera. Each is drawn by the server only while it is chosen here.
+// Optional layers of a stream: depth, confidence, and the view of its virtual camera. The server renders a layer only while it is subscribed.
 
 import { Badge } from "./badge.js";
 import { drawLegend } from "./legend.js";
@@ -21,7 +21,7 @@ const made = (tag, properties = {}, ...inside) => {
   return element;
 };
 
-/** The buttons in `choices` and the pictures in `grid`. Returns `watch(stream)`, which shows what is chosen of that stream. */
+/** Create layer buttons in `choices` and images in `grid`. Returns `watch(stream)`, which shows the chosen layers of a stream. */
 export function layersOf(choices, grid, report) {
   const chosen = new Set(JSON.parse(sessionStorage.getItem(STORED) ?? "[]").filter((layer) => layer in LAYERS));
   const open = new Map();
@@ -48,7 +48,7 @@ export function layersOf(choices, grid, report) {
     for (const layer of Object.keys(LAYERS)) {
       if (stream && chosen.has(layer) && !open.has(layer)) open.set(layer, new Picture(stream, layer, report));
     }
-    // In the order of the buttons, whichever was chosen first.
+    // Keep the order of the buttons.
     grid.append(...Object.keys(LAYERS).filter((layer) => open.has(layer)).map((layer) => open.get(layer).figure));
     grid.dataset.count = String(grid.childElementCount);
   }
@@ -59,7 +59,7 @@ export function layersOf(choices, grid, report) {
   };
 }
 
-/** One further picture: its figure, its viewer, and for the virtual camera what turns it. */
+/** One layer: its figure, its viewer, and the controls of the virtual camera. */
 class Picture {
   constructor(stream, layer, report) {
     const { title, note, label } = LAYERS[layer];

@@ -1,8 +1,8 @@
-// What the colours of a picture mean: a bar from low to high, as the picture's header says.
+// Colour legend of a layer: a bar from low to high, with the limits of the image header.
 
 const UNITS = { mm: "mm", relative: "× median depth, no scale known", confidence: "confidence" };
 
-/** Draw the legend of a header into a canvas. */
+/** Draw the legend of an image header on a canvas. */
 export function drawLegend(canvas, legend) {
   const said = JSON.stringify(legend);
   if (!legend || canvas.dataset.said === said) return;

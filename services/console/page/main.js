@@ -1,4 +1,4 @@
-// The console: which page is open, which stream is looked at, and what its picture says of itself.
+// The console: page navigation, stream selection, and the state of the live images.
 
 import { call, setKeyDialog, signOut, useKey } from "./api.js";
 import { auditPage } from "./audit.js";
@@ -27,13 +27,13 @@ let viewers = [];
 let watched = "";
 let heard_ms = 0;
 
-/** Run something that was asked for, and show what goes wrong until the next thing is asked for. */
+/** Run an action of the user; an error is shown until the next action. */
 async function report(act) {
   at("problem").hidden = true;
   await quietly(act);
 }
 
-/** Run something that nobody has asked for: what went wrong before stays readable. */
+/** Run a background action without clearing an earlier error message. */
 async function quietly(act) {
   try {
     await act();
@@ -45,7 +45,7 @@ async function quietly(act) {
 
 function say(state, age_ms) {
   const place = at("state");
-  if (place.dataset.state !== state) { // once: it is read aloud
+  if (place.dataset.state !== state) { // only on change, because screen readers announce it
     place.dataset.state = state;
     place.firstElementChild.textContent = state;
   }
@@ -87,7 +87,7 @@ function shown(header) {
   at("psnr-now").value = quality(header);
 }
 
-/** What is not said any more must not look as if it were: without pictures the state goes. */
+/** Clear the state if no image arrives, because an outdated state must not look current. */
 setInterval(() => {
   if (watched && heard_ms && performance.now() - heard_ms > SILENT_MS && at("state").dataset.state !== "no connection") {
     say("no picture", performance.now() - heard_ms);
@@ -106,10 +106,10 @@ function chooseAmong(streams) {
 }
 
 let myself = null;
-/** What each page asks for; one that the key may not see is not offered. */
+/** Permission that each page requires; pages without permission are hidden. */
 const NEEDS = { models: "everything", recordings: "everything", replays: "everything", keys: "admin", audit: "admin" };
 
-/** Show whose key this page uses, and offer the pages that it may see. */
+/** Show the name and role of the key in use, and the pages that it may access. */
 async function renewAccount() {
   myself = await call("GET", "/v1/me");
   const limits = [myself.streams && `only ${myself.streams.join(", ")}`, myself.expires_at && `until ${new Date(myself.expires_at).toLocaleDateString()}`];
@@ -125,7 +125,7 @@ async function renewAccount() {
 
 const replays = replaysPage(report);
 
-/** Open the page of replays with a recording chosen, before its list has come. */
+/** Open the replay page with a recording selected, before its list has loaded. */
 function replay(name) {
   replays.choose(name);
   const opened = open("replays");
@@ -177,7 +177,7 @@ setKeyDialog((reason) => new Promise((resolve) => {
 }), () => quietly(renewAccount));
 at("sign-out").addEventListener("click", signOut);
 
-// A key behind # is not sent to any server; it goes from the address at once.
+// The fragment of a URL is not sent to any server. The key is removed from the address immediately.
 if (location.hash.startsWith("#key=")) {
   useKey(decodeURIComponent(location.hash.slice(5)));
   history.replaceState(null, "", location.pathname);

@@ -8,7 +8,7 @@ import { when } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 
-/** Returns what renews the page. `report(act)` runs an async function and shows what goes wrong. */
+/** Return a function that refreshes the page. `report(act)` runs an async function and shows its errors. */
 export function modelsPage(report) {
   async function renew() {
     const models = await call("GET", "/v1/models");
@@ -61,7 +61,7 @@ export function modelsPage(report) {
     });
   });
 
-  /** Wait until the server has looked at a version; it says itself what it found. */
+  /** Wait until the server has checked a version. Throws if it is rejected. */
   async function checked({ name, version }) {
     for (let wait_ms = 200; ; wait_ms = Math.min(2 * wait_ms, 2000)) {
       await renew();

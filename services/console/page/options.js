@@ -1,10 +1,10 @@
-// Form fields for options of the engine, made from the server's OpenAPI document.
+// Form fields for engine options, generated from the server's OpenAPI document.
 
 import { call } from "./api.js";
 
 let described = null;
 
-/** Fill `place` with a field for each option of the request `schema`, such as "ReplayRequest". Does nothing if it has them already. */
+/** Add a field to `place` for each option of the request `schema`, such as "ReplayRequest". Does nothing if `place` has fields. */
 export async function offerOptions(place, schema) {
   if (place.childElementCount) return;
   described ??= call("GET", "/openapi.json").catch((error) => { described = null; throw error; });
@@ -14,7 +14,7 @@ export async function offerOptions(place, schema) {
   if (!place.childElementCount) place.replaceChildren(...Object.entries(properties).map(labelled));
 }
 
-/** The options in `place` that differ from their defaults, by name. */
+/** Return the options in `place` that differ from their defaults, by name. */
 export function chosenOptions(place) {
   const options = {};
   for (const field of place.querySelectorAll("[data-option]")) {
@@ -36,7 +36,7 @@ function labelled([name, schema]) {
   return label;
 }
 
-/** An empty field stands for the default, which it shows. */
+/** Create the field of an option. An empty field means the default, which is its placeholder. */
 function fieldOf(schema) {
   const kinds = schema.anyOf ?? [schema], usual = schema.default ?? /; null: (.*)\.$/.exec(schema.description ?? "")?.[1] ?? "";
   const words = kinds.flatMap((kind) => kind.enum ?? []);

@@ -1,4 +1,4 @@
-// Turns a stream's virtual camera: by dragging, by touch, by the wheel, by keys. All who watch share it, and the last one wins.
+// Control of a stream's virtual camera by drag, touch, wheel and keys. All viewers share one camera; the last request wins.
 
 import { call } from "./api.js";
 
@@ -9,7 +9,7 @@ const SEND_MS = 100;
 const START = { azimuth_deg: 0, elevation_deg: 0, zoom: 1 };
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
-/** `controls` is an element with a reset button; `shown(virtual)` says where the camera of the last picture was. */
+/** `controls` receives the reset button. Call `shown(virtual)` with the camera of each displayed image. */
 export class Orbit {
   constructor(stream, canvas, report) {
     Object.assign(this, { stream, canvas, report, wanted: { ...START }, sent_ms: 0, timer: null, sending: false, pointers: new Map(), moved_ms: 0 });
@@ -31,7 +31,7 @@ export class Orbit {
     this.controls.append(reset, this.where, "drag or arrow keys turn, wheel or + − zoom");
   }
 
-  /** Take over where the camera is: somebody else may have turned it. What this page has just asked for goes first. */
+  /** Adopt the camera of the displayed image, which another viewer may have moved, unless a recent request of this page is pending. */
   shown(virtual) {
     if (!virtual) return;
     const name = (value) => `${value > 0 ? "+" : ""}${value.toFixed(0)}°`;
@@ -49,7 +49,7 @@ export class Orbit {
     event.preventDefault();
   }
 
-  /** One pointer turns, two zoom by their distance. What is dragged follows the hand: the camera goes the other way. */
+  /** One pointer rotates; two pointers zoom by their distance. The scene follows the pointer, so the camera moves the opposite way. */
   drag(event) {
     const before = this.pointers.get(event.pointerId);
     if (!before) return;
@@ -69,7 +69,7 @@ export class Orbit {
     });
   }
 
-  /** Ask for a place, at most ten times a second; the newest wins. */
+  /** Request a camera position, at most ten times a second; only the newest position is sent. */
   to(wanted) {
     this.wanted = wanted;
     this.moved_ms = performance.now();

@@ -1,9 +1,9 @@
-// A line of the last values over time, with its axis.
+// Line plot of the most recent values, with its axis.
 
 const KEPT = 300;
 const STEPS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 
-/** Draws the last values that it was given; null is a gap. It has as many pixels as the screen gives it, so that its text is never stretched. */
+/** Plots the most recent values; null is a gap. The canvas matches the size in device pixels, so that text is not stretched. */
 export class Plot {
   constructor(canvas, { from_zero = true } = {}) {
     Object.assign(this, { canvas, from_zero, values: [], due: false });
@@ -29,9 +29,9 @@ export class Plot {
 
   draw() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (!width || !height) return; // its page is not open
+    if (!width || !height) return; // its page is hidden
     const pen = this.canvas.getContext("2d"), scale = window.devicePixelRatio || 1;
-    this.canvas.width = Math.round(width * scale); // empties it
+    this.canvas.width = Math.round(width * scale); // clears the canvas
     this.canvas.height = Math.round(height * scale);
     pen.scale(scale, scale);
     const known = this.values.filter((value) => value !== null);

@@ -1,4 +1,4 @@
-// The page of recordings: upload, what was found in each, delete.
+// The page of recordings: upload, check results, delete.
 
 import { call, upload } from "./api.js";
 import { confirmed } from "./dialogs.js";
@@ -7,7 +7,7 @@ import { when } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 
-/** Returns what renews the page. `replay(name)` opens the page of replays for a recording. */
+/** Return a function that refreshes the page. `replay(name)` opens the replay page for a recording. */
 export function recordingsPage(report, replay) {
   async function renew() {
     replaceRows(at("recording-rows"), (await call("GET", "/v1/recordings")).map(line));
@@ -39,7 +39,7 @@ export function recordingsPage(report, replay) {
       bar.hidden = false;
       try {
         await upload(`/v1/recordings/${name}`, at("recording-file").files[0], (share) => { bar.value = share; });
-        bar.removeAttribute("value"); // it was sent, and is being looked at
+        bar.removeAttribute("value"); // upload complete; the server is checking it
         await checked(name);
       } finally {
         bar.hidden = true;
@@ -48,7 +48,7 @@ export function recordingsPage(report, replay) {
     });
   });
 
-  /** Wait until the server has looked at a recording; it says itself what it found. */
+  /** Wait until the server has checked a recording. Throws if it is rejected. */
   async function checked(name) {
     for (let wait_ms = 200; ; wait_ms = Math.min(2 * wait_ms, 2000)) {
       await renew();

@@ -1,4 +1,4 @@
-// The page of replays: started from an uploaded recording, watched as they run, their reports, videos and models.
+// The page of replays: start from a recording, progress, and the resulting reports, videos and models.
 
 import { call, download, fetched, useTicket } from "./api.js";
 import { confirmed } from "./dialogs.js";
@@ -10,10 +10,10 @@ const at = (id) => document.getElementById(id);
 const OPEN = ["queued", "running"];
 const MOST_WATCHED = 8;
 
-/** Returns `renew`, which renews the page, and `choose(name)`, which chooses a recording in its form. */
+/** Return `renew`, which refreshes the page, and `choose(name)`, which selects a recording in its form. */
 export function replaysPage(report) {
   let shown = [];
-  let asked = 0, current = 0; // how many lists were asked for, and the first one that knows the chosen recording
+  let asked = 0, current = 0; // number of list requests, and the first request whose result includes the chosen recording
   const watched = new Map();
 
   async function renew() {
@@ -38,7 +38,7 @@ export function replaysPage(report) {
     replaceRows(at("replay-rows"), shown.map(line));
   }
 
-  /** Follow a replay until it has ended or the connection has; opening the page again takes it up again. */
+  /** Follow a replay until it ends or the connection closes; opening the page again resumes it. */
   async function watch(id) {
     if (watched.has(id)) return;
     watched.set(id, null);
@@ -88,7 +88,7 @@ export function replaysPage(report) {
     return row(replay.recording, replay.id, state, progress(replay), ...figures, options, started, actions);
   }
 
-  /** In a page of its own, which may do nothing but show itself. */
+  /** Open a report in a new tab. The server sandboxes it by its content security policy. */
   async function openReport(path) {
     window.open(await useTicket(path), "_blank", "noopener");
   }
@@ -122,7 +122,7 @@ export function replaysPage(report) {
     });
   });
 
-  /** Choose a recording in the form at once. Lists that were asked for earlier may not have it and do not change the form. */
+  /** Select a recording in the form immediately. Results of earlier list requests may lack it and do not change the form. */
   function choose(name) {
     const choice = at("replay-recording");
     if (![...choice.options].some((option) => option.value === name)) choice.add(new Option(name, name));

@@ -1,9 +1,9 @@
-// SHA-256 of a file of any length. The browser's own digest wants all of it in memory, and is there on secure pages only.
+// Incremental SHA-256 of a file. crypto.subtle.digest requires the whole file in memory and a secure context.
 
 const MOST_AT_ONCE = 64 * 2 ** 20;
 const K = new Uint32Array(64), START = new Uint32Array(8);
 
-/** The first 32 bits behind the point of the square and cube roots of the first primes, as the standard has them. */
+/** Constants of FIPS 180-4: the first 32 fractional bits of the square and cube roots of the first primes. */
 (() => {
   const bits = (x) => Math.floor((x - Math.floor(x)) * 2 ** 32);
   for (let n = 2, found = 0; found < 64; n += 1) {
@@ -16,7 +16,7 @@ const K = new Uint32Array(64), START = new Uint32Array(8);
   }
 })();
 
-/** Takes bytes piece by piece. */
+/** Incremental hash. */
 export class Sha256 {
   constructor() {
     Object.assign(this, { state: START.slice(), block: new Uint8Array(64), filled: 0, length: 0, words: new Uint32Array(64) });
@@ -38,7 +38,7 @@ export class Sha256 {
     this.filled = bytes.length - at;
   }
 
-  /** The digest of all that was added; nothing can be added then. */
+  /** Return the digest of all added bytes. No more bytes may be added. */
   digest() {
     const bits = this.length * 8;
     const tail = new Uint8Array(this.filled < 56 ? 64 - this.filled : 128 - this.filled);
@@ -75,7 +75,7 @@ export class Sha256 {
   }
 }
 
-/** The SHA-256 of a file, in base64; `progress(share)` is called now and then. */
+/** Return the SHA-256 of a file in base64; `progress(share)` is called during the computation. */
 export async function sha256(file, progress = () => {}) {
   if (file.size <= MOST_AT_ONCE && globalThis.crypto?.subtle) {
     return base64(new Uint8Array(await crypto.subtle.digest("SHA-256", await file.arrayBuffer())));

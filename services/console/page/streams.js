@@ -1,4 +1,4 @@
-// The page of streams: made, started, stopped, and how their processes are.
+// The page of streams: create, start, stop, and the state of their processes.
 
 import { call } from "./api.js";
 import { confirmed } from "./dialogs.js";
@@ -8,7 +8,7 @@ import { age } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 
-/** Returns what renews the page and the choice of a stream. */
+/** Return a function that refreshes the page and the stream selection. */
 export function streamsPage(report, onStreams) {
   async function renew() {
     const streams = await call("GET", "/v1/streams");
@@ -57,7 +57,7 @@ export function streamsPage(report, onStreams) {
   return renew;
 }
 
-/** A process in a cell: its state, rate, restarts, and why it is not well. */
+/** Return the cell text of a process: its state, rate, restarts, and the reason of a failure. */
 export function processFacts(process) {
   if (!process) return "";
   const said = [process.state];
@@ -68,7 +68,7 @@ export function processFacts(process) {
   return said.join(", ");
 }
 
-/** The PSNR that a picture or its header has, and the trivial predictors' next to it where the server tells them. */
+/** Return the PSNR of an image header, followed by the PSNR of the trivial predictors if the server sends them. */
 export function quality(report) {
   const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
   const own = decibels(report.psnr_db);

@@ -1,6 +1,6 @@
-// Rows of a table from data, without markup in strings: what a server says is text.
+// Table rows from data. Server data is inserted as text only, never as markup.
 
-/** A row of cells; a cell is text, or elements. */
+/** Create a row; each cell is text or elements. */
 export function row(...cells) {
   const line = document.createElement("tr");
   for (const cell of cells) {
@@ -12,7 +12,7 @@ export function row(...cells) {
   return line;
 }
 
-/** A button that does something async; it cannot be pressed again before that is over. `name` tells what it acts on to programs that read aloud. */
+/** Create a button with an async action; it is disabled until the action ends. `name` is its label for screen readers. */
 export function button(text, act, report, name = "") {
   const made = document.createElement("button");
   made.type = "button";
@@ -22,19 +22,19 @@ export function button(text, act, report, name = "") {
     made.disabled = true;
     await report(act);
     made.disabled = false;
-    const has = document.activeElement; // not this button, which was disabled: nothing, or what a closed dialog had
+    const has = document.activeElement; // the disabled button lost the focus to the body or to a closed dialog
     if (!has || has === document.body || has.closest("dialog:not([open])")) sameButton(made)?.focus();
   });
   return made;
 }
 
-/** The button, or the one of its name in a table that was drawn anew. */
+/** Return the button, or its successor with the same name after the table was redrawn. */
 function sameButton(made) {
   const name = made.getAttribute("aria-label");
   return made.isConnected ? made : [...document.querySelectorAll("button[aria-label]")].find((each) => each.getAttribute("aria-label") === name);
 }
 
-/** Put rows in place of those of a table, unless somebody uses a button in it right now. */
+/** Replace the rows of a table, unless one of its buttons is in use. */
 export function replaceRows(body, rows) {
   if (body.contains(document.activeElement)) {
     const at = [...body.querySelectorAll("button")].indexOf(document.activeElement);
@@ -45,7 +45,7 @@ export function replaceRows(body, rows) {
   body.replaceChildren(...rows);
 }
 
-/** A number of bytes for people. */
+/** Format a number of bytes. */
 export function size(bytes) {
   const units = ["B", "KiB", "MiB", "GiB"];
   let unit = 0;
@@ -53,7 +53,7 @@ export function size(bytes) {
   return `${bytes.toFixed(unit ? 1 : 0)} ${units[unit]}`;
 }
 
-/** The beginning of a SHA-256, and all of it when the pointer rests on it. */
+/** Show the beginning of a SHA-256, with the complete value as tooltip. */
 export function digest(hex) {
   const place = document.createElement("code");
   place.textContent = hex.slice(0, 12);
@@ -61,7 +61,7 @@ export function digest(hex) {
   return place;
 }
 
-/** Text that may have no spaces, such as an address: it is broken anywhere, and its column is not narrower than some words. */
+/** Text that may lack spaces, such as a URL. It may wrap anywhere, and its column keeps a minimum width. */
 export function long(text) {
   return Object.assign(document.createElement("span"), { className: "long", textContent: text });
 }

@@ -1,10 +1,10 @@
-// Times for people: the browser's zone, named; UTC when the pointer rests on it.
+// Display of times in the browser's time zone, with UTC as tooltip.
 
 const LOCAL = new Intl.DateTimeFormat(undefined, {
   year: "numeric", month: "2-digit", day: "2-digit", hour: "2-digit", minute: "2-digit", second: "2-digit", timeZoneName: "short",
 });
 
-/** An element with a time of the server's, in the zone of this browser. Text for null. */
+/** Return an element with a server time in the browser's time zone, or `otherwise` for null. */
 export function when(iso, otherwise = "") {
   const time = new Date(iso ?? NaN);
   if (Number.isNaN(time.getTime())) return iso ?? otherwise;
@@ -15,7 +15,7 @@ export function when(iso, otherwise = "") {
   return place;
 }
 
-/** A length of time in a few characters. */
+/** Format a duration in a few characters. */
 export function age(ms) {
   if (!Number.isFinite(ms)) return "";
   return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;

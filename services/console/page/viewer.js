@@ -1,12 +1,12 @@
-// A stream's pictures from its WebSocket into a canvas. A connection that ends is made again.
+// Displays a stream's images from its WebSocket on a canvas. A closed connection is reopened.
 
 import { call } from "./api.js";
 
 const AGAIN_MS = [250, 500, 1000, 2000, 4000];
 
-/** Shows one kind of picture (`raw` or `shown`) of a stream until `close` is called. */
+/** Shows one kind of image (`raw`, `shown` or a layer) of a stream until `close` is called. */
 export class Viewer {
-  /** onPicture(header) is called for each picture that was drawn, onLost() when there is no connection. */
+  /** onPicture(header) is called for each drawn image, and onLost() when the connection is lost. */
   constructor(stream, kind, canvas, { onPicture, onLost }) {
     Object.assign(this, { stream, kind, canvas, onPicture, onLost, closed: false, attempt: 0, socket: null, waiting: null, drawing: false });
     this.connect();
@@ -23,7 +23,7 @@ export class Viewer {
       this.socket.onmessage = (message) => { this.attempt = 0; this.take(message.data); };
       this.socket.onclose = () => this.again();
     } catch {
-      this.again(); // said by the state; the next attempt may find the server
+      this.again(); // the state shows the failure; the next attempt may succeed
     }
   }
 
@@ -34,7 +34,7 @@ export class Viewer {
     setTimeout(() => { if (!this.closed) this.connect(); }, wait_ms);
   }
 
-  /** The newest message wins: one that comes while the last is drawn replaces the one that waits. */
+  /** Draw a message. While one is being drawn, only the newest further message is kept. */
   async take(message) {
     this.waiting = message;
     if (this.drawing) return;
