@@ -104,7 +104,7 @@ async def ask_async(endpoint: str, command: str, *, timeout_s: float = ANSWER_S,
 
 
 def _to(endpoint: str, context: Any) -> Any:
-    """Create a socket for one command."""
+    """Create a socket that is connected to a process, for one command."""
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
@@ -131,7 +131,7 @@ class CommandServer:
         self._handlers = handlers
         self._stop = threading.Event()
         self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
-        self._socket.setsockopt(zmq.LINGER, 200)  # lets the answer to the stop command leave before the process ends
+        self._socket.setsockopt(zmq.LINGER, 200)  # send the answer to the command `stop` before the process ends
         self._socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
         self._socket.bind(endpoint)
         self._thread = threading.Thread(target=self._serve, name="commands", daemon=True)
@@ -187,7 +187,8 @@ frames/s. Longer durations have their own bucket."""
 
 
 class Durations:
-    """Histogram of one kind of duration. One thread adds; another thread may read counts that lag by at most one."""
+    """Histogram of durations. One thread adds values; other threads may read, with counts that lag by at most one
+    value."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
@@ -223,21 +224,21 @@ PERIOD_S = 0.25
 
 
 class Heartbeats:
-    """Publishes the result of `report` from its own thread until closed."""
+    """Publisher of heartbeats: sends the result of `report` periodically from its own thread until closed."""
 
     def __init__(self, endpoint: str, report: Callable[[], Mapping[str, Any]]) -> None:
         self._report = report
         self._stop = threading.Event()
         self._now = threading.Event()
         self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.PUB)
-        self._socket.setsockopt(zmq.LINGER, 200)  # lets the last heartbeat leave, which states why the process ends
+        self._socket.setsockopt(zmq.LINGER, 200)  # send the last heartbeat, which has the reason for the end
         self._socket.setsockopt(zmq.SNDHWM, 8)
         self._socket.bind(endpoint)
         self._thread = threading.Thread(target=self._beat, name="heartbeats", daemon=True)
         self._thread.start()
 
     def say_now(self) -> None:
-        """Publish at once, because the state has changed."""
+        """Publish a heartbeat at once, after a change of the state."""
         self._now.set()
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ from services.errors import BadMessage
 HIGH_WATER = 4
 """Pictures queued per reader on either side; further ones are dropped for that reader. Readers
 drain the queue and use the newest picture. A smaller value would lose pictures of fast readers,
-because ZeroMQ updates the queue length only now and then."""
+because ZeroMQ updates its count of delivered messages with a delay."""
 MAX_PARTS = 1 + MAX_PIECES
 MAX_PART_BYTES = max(np.dtype(array.kind).itemsize * array.values for array in ARRAYS.values()) * MAX_PIXELS
 """Limits of a message: number of parts, and bytes of each."""
@@ -152,7 +152,7 @@ def _side(value: Any) -> int:
 
 
 class WatchedPublisher(PicturePublisher):
-    """Publisher that knows whether readers are connected. For use by one thread."""
+    """Picture publisher that detects connected readers. For use by one thread."""
 
     kind = zmq.XPUB
 
@@ -162,7 +162,7 @@ class WatchedPublisher(PicturePublisher):
 
     @property
     def watched(self) -> bool:
-        """Return True if a reader is connected; a dead reader does not count."""
+        """True while at least one living reader is connected."""
         while self._socket.poll(0):
             # Each message is one byte and the topic: 1 for the first reader, 0 after the last one
             # left.

@@ -52,7 +52,7 @@ class ProcessIdentity:
 
     @property
     def is_alive(self) -> bool:
-        """Return True if this process still runs."""
+        """True while the process with this id and start time runs."""
         return ProcessIdentity.of(self.pid) == self
 
     def signal(self, number: int) -> bool:
@@ -66,8 +66,7 @@ class ProcessIdentity:
         except ProcessLookupError:
             return False
         try:
-            # The handle refers to this process, so the identity check stays valid when the signal
-            # is sent.
+            # The pidfd refers to one process. A process id that is reused after this check therefore gets no signal.
             if not self.is_alive:
                 return False
             pidfd_send_signal(handle, number)
@@ -192,7 +191,8 @@ class StreamFolder:
         return self.path / f"{role}.log"
 
     def record(self, role: Role) -> ProcessRecord | None:
-        """Return the record of the running process for a role, or None. Files of an ended process are removed."""
+        """Return the record of the running process for a role, or None. If the process has ended, remove its
+        sockets and its record."""
         try:
             content = parsed_json((self.path / f"{role}.json").read_bytes())
             identity = ProcessIdentity(int(content["pid"]), str(content["started"]))

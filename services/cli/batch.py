@@ -61,7 +61,8 @@ def _checked(options: Mapping[str, Any]) -> JobOptions:
 
 
 class _Asked:
-    """Stop flag set by signals. The pool polls it, so no thread is started."""
+    """Stop flag that signals set and the pool polls. Unlike `InterruptRequest` it starts no thread, because the
+    pool forks."""
 
     def __init__(self) -> None:
         self._number = 0
@@ -76,7 +77,7 @@ class _Asked:
 
 
 class _Teller:
-    """Progress output of a batch on standard error, every few seconds."""
+    """Progress callback that prints the job counts of a batch to standard error every few seconds."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet, self._said_s, self._said = quiet, 0.0, ""

@@ -124,7 +124,7 @@ def _core() -> list[Check]:
 
 
 def _cuda(ops: list[str]) -> list[Check]:
-    """Check the GPU, the built kernels, and their compatibility."""
+    """Check for a usable GPU, for compiled CUDA kernels, and that the kernels support the GPU."""
     from gsplat_core.ops.native import CUDA_MISSING, cuda_build, cuda_refusal
     from services.cli.gpu_check import look
 

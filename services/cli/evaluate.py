@@ -43,7 +43,7 @@ def evaluation_settings(recording: Path, options: EvaluateOptions) -> Evaluation
 
 
 def _place(text: str) -> Visits:
-    """Parse two visits of one place, `0:2,60:62` in seconds.
+    """Parse the start and end times, in seconds, of two visits to a place, such as `0:2,60:62`.
 
     Raises:
         InvalidSetting: if the text is malformed.

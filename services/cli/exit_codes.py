@@ -65,10 +65,10 @@ def user_sentence(error: BaseException, arguments: Iterable[str] = ()) -> str | 
     where = ""
     for link in _causes(error):
         if isinstance(link, OperatorFailed):
-            # the operator is the place of the error; its cause is the reason
+            # OperatorFailed names the operator; its cause has the reason.
             frame = "" if link.seq is None else f" on frame {link.seq}"
             where = f"\n  in operator {link.operator}{frame}"
-        elif not isinstance(link, RunFailed):  # RunFailed only reports the early end; its cause holds the reason
+        elif not isinstance(link, RunFailed):  # RunFailed only states the early end; its cause has the reason
             said = str(link) if isinstance(link, UserError) else _of_the_machine(link, arguments)
             return None if said is None else sentence(said) + where
     return None
@@ -106,7 +106,7 @@ def _is_out_of_memory(error: BaseException) -> bool:
 
 
 def _related(named: str, argument: str) -> bool:
-    """Return True if a file is, is inside, or is an ancestor of the path in an argument."""
+    """Return True if the path `named` equals, is inside, or is an ancestor of the path in an argument."""
     _, equals, value = argument.partition("=")
     given = os.path.abspath(value if equals and argument.startswith("-") else argument)
     named = os.path.abspath(named)

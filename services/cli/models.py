@@ -74,8 +74,8 @@ def _check_target(model: Path, file: Path, overwrite: bool) -> None:
 
 
 def _check_saved_whole(model: Path) -> None:
-    """Refuse a save that was interrupted between its two renames. Such a bundle loads, but its two
-    files do not match."""
+    """Raise BundleError for a bundle whose save was interrupted between its two renames, so that manifest and
+    tensors do not match. `load_bundle` accepts such a bundle."""
     manifest = parse_manifest((model / MANIFEST).read_bytes(), MANIFEST) if (model / MANIFEST).exists() else None
     if manifest is None or manifest.tensors_sha256 != _sha256(model / TENSORS):
         raise BundleError(f"{model} was not saved to its end; load it and save it again before it is packed")
@@ -97,7 +97,7 @@ def export_command(
 
     Raises:
         BundleError: if the model cannot be used.
-        InvalidSetting: if an option does not fit.
+        InvalidSetting: if an option does not apply to the format or is out of range.
         ExportError: if the model cannot be exported to the format.
         OutputError: if the file cannot be written.
     """

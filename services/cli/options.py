@@ -110,7 +110,8 @@ def _annotation(each: Declared) -> Any:
 
 
 def _shared(name: str) -> Any:
-    """Return the typer declaration of an option of the engine, for a command with options of its own."""
+    """Return the typer declaration of an engine option, for a command whose other options are declared in this
+    module."""
     return typer.Option(help=help_of(options_of(ReplayOptions)[name]))
 
 
@@ -187,8 +188,8 @@ class SynthesizeOptions:
 
 
 def takes_options(kind: type[Section], command: Command) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Decorate a command whose parameter `options` is a mapping: each option of the class `kind` that applies to
-    `command` becomes a command line option. The mapping has their values by name."""
+    """Decorate a command that has a mapping parameter `options`. Each option of the class `kind` that applies to
+    `command` becomes a command line option. The mapping receives the option values by name."""
     declared = options_for(kind, command)
     annotations = {name: _annotation(each) for name, each in declared.items()}
     defaults = {name: _default(each) for name, each in declared.items()}
@@ -237,8 +238,8 @@ def _with_parameters(
     made: Callable[[Mapping[str, Any]], Any],
     replaced: str = "options",
 ) -> Callable[..., int]:
-    """Return the command with the parameters `annotations` in place of its parameter `replaced`, which `made` creates
-    from their values."""
+    """Return the command with its parameter `replaced` exchanged for the parameters in `annotations`. `made`
+    converts their values to the argument for `replaced`."""
 
     @functools.wraps(command)
     def call(**values: Any) -> int:
@@ -274,7 +275,7 @@ def require_plain_numbers(command: Any) -> None:
 
 
 def _processed(parameter: Any, process: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
-    """Process a parameter's value, and refuse a text that became a number without being written as one."""
+    """Convert a parameter's value by `process`. Refuse a text such as `1_0`, which Python converts to a number."""
     found = process(context, value)
     is_number = isinstance(found, int | float) and not isinstance(found, bool)
     if is_number and isinstance(value, str) and not is_plain(value):

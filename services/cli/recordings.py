@@ -60,7 +60,8 @@ def _shown(value: object) -> str:
 
 
 MOSTLY = 0.75
-"""Share of the motion that the endoscope must explain; below it a static endoscope is reported as likely."""
+"""Share of the image motion that the estimated camera motion must explain. Below it, the endoscope is reported as
+probably static."""
 OFF = 0.002
 """Share of the focal length. A larger median reprojection error is attributed to tissue motion, not
 to tracking noise."""
@@ -87,7 +88,7 @@ def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwri
                 found, focal = trajectory_without_calibration(read, opened.camera)
             else:
                 found = trajectory_of(read(), opened.camera)
-        except InvalidInput as error:  # it refuses only pictures and cameras, which come from the recording
+        except InvalidInput as error:  # raised only for pictures and cameras, which come from the recording
             raise RecordingInvalid(f"{recording}: {error}") from error
     with storage_errors(out.parent):
         write_poses(out, found.poses, overwrite=overwrite)

@@ -49,7 +49,7 @@ class _Descriptor(io.RawIOBase):
             try:
                 return os.write(self._descriptor, data)
             except BlockingIOError:
-                # another program set the pipe to non-blocking, and it is full
+                # The pipe is full, and another program has set it to non-blocking mode.
                 select.select([], [self._descriptor], [])
             except OSError as error:
                 self.error = error
@@ -98,7 +98,7 @@ def _occupy_closed_descriptors() -> None:
 
 def _guarded(stream: TextIO | None, descriptor: int) -> tuple[_Descriptor | None, TextIO]:
     if stream is None:
-        # closed at program start, so no program reads the output
+        # The stream was closed at program start, so no program reads the output.
         return None, open(os.devnull, "w", encoding="utf-8", errors="replace")
     raw = _Descriptor(descriptor)
     errors = _NAMES if descriptor == 1 else "backslashreplace"
@@ -213,7 +213,8 @@ def size(count: float) -> str:
 INTERRUPTED = 130
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INSISTING = (signal.SIGINT, signal.SIGTERM)
-"""Signals whose repetition ends the run at once. Not SIGHUP, which a closing terminal may send repeatedly."""
+"""Signals whose repetition ends the run at once. SIGHUP is excluded, because a closing terminal may send it
+repeatedly."""
 GRACE_S = 2.0
 """Seconds that a run has to unwind after the second signal before the process is terminated."""
 

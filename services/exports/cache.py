@@ -87,7 +87,7 @@ class ExportPrograms:
             raise ExportFailed(f"the export ended with code {code}: {words[-1][:300]}; the server's log may say more")
 
     def end(self) -> None:
-        """Kill running programs and every later one."""
+        """Kill running export programs, and every program started later."""
         with self._lock:
             self._ended = True
             for process in self._running:
@@ -124,7 +124,7 @@ MOST_WAITING = 8
 
 @dataclass(frozen=True)
 class Exported:
-    """Created file. `file` is open, so it stays readable after an eviction."""
+    """File of an export. `file` is open, so that it stays readable after an eviction from the cache."""
 
     file: BinaryIO
     sha256: str
@@ -133,7 +133,8 @@ class Exported:
 
 
 class ExportCache:
-    """Cache that creates missing exports one at a time. Thread-safe; one process per folder."""
+    """Cache of export files in a folder. It creates missing exports one at a time. Thread-safe; one process per
+    folder."""
 
     def __init__(
         self,
@@ -200,7 +201,8 @@ class ExportCache:
 
     @contextlib.contextmanager
     def _lock_of(self, key: str) -> Iterator[None]:
-        """Serialise requests for the same export; later ones find the first one's file."""
+        """Hold the lock of an export while the block runs. A concurrent request for this export waits, and then
+        finds the cached file."""
         with self._lock:
             lock = self._making.setdefault(key, threading.Lock())
         with lock:

@@ -25,7 +25,7 @@ REFUSED = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Create one file."""
+    """Create one export file. Return the exit code."""
     keep_files_private()
     parser = argparse.ArgumentParser(prog="python -m services.exports.make", description="Export an unpacked model.")
     parser.add_argument("folder", type=Path, metavar="FOLDER")

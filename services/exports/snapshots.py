@@ -56,7 +56,7 @@ class Snapshot:
 
 
 def described(folder: Path, stream: str, by: str, said: Mapping[str, Any]) -> Snapshot:
-    """Create the record of a bundle written by an engine, from the folder and the engine's answer."""
+    """Create the record of a snapshot from its bundle folder and from `said`, the engine's answer to the command."""
     return Snapshot(
         id=secrets.token_hex(8),
         stream=stream,
@@ -90,7 +90,7 @@ class SnapshotStore:
             shutil.rmtree(path, ignore_errors=True)
 
     def keep(self, path: Path, made: Snapshot) -> None:
-        """Store the content of a folder from `new`."""
+        """Move the bundle in a folder from `new` into the store, with its record."""
         write_durably(path / ABOUT, [json.dumps(asdict(made)).encode()])
         of_stream = self._folder / made.stream
         of_stream.mkdir(mode=0o700, exist_ok=True)
@@ -180,7 +180,7 @@ class StreamSnapshots:
             Conflict: if the stream is stopped or just starting.
             BusError: if the engine does not answer.
             ExportFailed: if the snapshot cannot be stored.
-            RegistryError: if the registry does not take it.
+            RegistryError: if the registry rejects the snapshot as a version of `model`.
         """
         engine = self._streams.engine(stream)
         with self._store.new() as new:
@@ -188,7 +188,7 @@ class StreamSnapshots:
             try:
                 said = await engine.command("snapshot", timeout_s=WRITE_S, folder=str(folder))
             except CommandRefused as error:
-                # The engine names its folder, which is a path of the server.
+                # The engine's message contains the path of a server folder, which callers must not see.
                 raise Conflict(str(error).replace(str(folder), "the snapshot")) from error
             taken = await asyncio.to_thread(described, folder, stream, by, said)
             if model is None:

@@ -63,7 +63,8 @@ _ENCRYPTED = 0x1 | 0x40 | 0x2000
 _PLAIN = (0, stat.S_IFREG, stat.S_IFDIR)
 _LEFT_OUT = "__MACOSX"
 _OF_A_LAYOUT = {"images", "images_right", "masks", "depth", "segments"}
-"""Folder names of a recording's layout. A single such folder at the top is not the recording's own folder."""
+"""Sub-folder names of a recording. If one of them is the only top folder, it is a part of the recording and not
+stripped."""
 
 
 class ArchiveInvalid(Exception):
@@ -79,13 +80,13 @@ class Entry:
 
 
 def check_end(file: BinaryIO) -> int:
-    """Check that the file ends with one small directory and nothing after it.
+    """Check that the archive ends with its directory of entries, of limited size, and that no data follows.
 
     Returns:
         Number of entries.
 
     Raises:
-        ArchiveInvalid: if not.
+        ArchiveInvalid: if not, or if the archive is split or of the format zip64.
     """
     size = file.seek(0, 2)
     if size < _END.size:
@@ -161,7 +162,8 @@ def _check_entry(info: zipfile.ZipInfo, number: int) -> None:
 
 
 def _check_places(infos: list[zipfile.ZipInfo], file: BinaryIO, list_at: int) -> None:
-    """Check that no two entries share bytes, by which a small file could unpack to a huge one."""
+    """Check that no two entries share bytes of the archive, by which a small archive could unpack to a huge size.
+    Raises ArchiveInvalid."""
     end = 0
     for info in sorted(infos, key=lambda each: each.header_offset):
         if info.header_offset < end:
@@ -177,7 +179,7 @@ def _check_places(infos: list[zipfile.ZipInfo], file: BinaryIO, list_at: int) ->
 
 
 def _is_left_out(info: zipfile.ZipInfo) -> bool:
-    """Return True for files added by file managers: hidden files, and the resource folder of macOS."""
+    """Return True for an entry that is not unpacked: a hidden file, or the resource folder that macOS adds."""
     parts = info.orig_filename.removesuffix("/").split("/")
     return parts[0] == _LEFT_OUT or any(part.startswith(".") for part in parts)
 

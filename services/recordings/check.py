@@ -86,7 +86,7 @@ def _file_name(options: argparse.Namespace) -> str:
 
 
 def _put(options: argparse.Namespace, path: Path) -> None:
-    """Move the recording to its place, after deleting leftovers of an interrupted check."""
+    """Unpack the archive, or link the video, to `path`, after deleting leftovers of an interrupted check."""
     upload = options.folder / UPLOAD
     if options.kind == ARCHIVE:
         shutil.rmtree(path, ignore_errors=True)

@@ -29,8 +29,8 @@ from services.registry.records import now
 
 
 class State(StrEnum):
-    """State of a recording: `uploaded` → `ready`, or `rejected` with a reason. `missing` if a start
-    did not find its files."""
+    """State of a recording: `uploaded` → `ready`, or `rejected` with a reason. `missing` if its files were not
+    found at a start of the service."""
 
     UPLOADED = "uploaded"
     READY = "ready"
@@ -50,9 +50,9 @@ class RecordingRecord:
     digest: str
     """SHA-256 of the uploaded file in hex."""
     size_bytes: int
-    """Size of the uploaded file."""
+    """Size of the uploaded file in bytes."""
     kept_bytes: int
-    """Current size on the disk."""
+    """Current size of the recording's files on the disk, in bytes."""
     uploaded_by: str
     uploaded_at: datetime
     description: Mapping[str, Any]
@@ -352,8 +352,7 @@ class RecordingStore:
         same = (RECORDINGS.c.name == row["name"], RECORDINGS.c.folder == row["folder"])
         with self._database.writing() as connection:
             connection.execute(sa.update(RECORDINGS).where(*same).values(values))
-        # Delete what is no longer needed: the archive of an unpacked recording, all files of a
-        # rejected one.
+        # Delete the uploaded file, which was unpacked or linked, and all files of a rejected recording.
         (folder / UPLOAD).unlink(missing_ok=True)
         if not ready:
             shutil.rmtree(folder, ignore_errors=True)

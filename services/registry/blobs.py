@@ -25,14 +25,14 @@ from services.registry.bundle_file import PIECE_BYTES, digest_of, members_of
 PART_SUFFIX = ".part"
 """Suffix of incomplete files and folders."""
 OTHERS_UPLOAD_S = 3600.0
-"""Age in seconds below which unreferenced remote files are kept, because another machine may be
-about to reference them."""
+"""Age in seconds below which unreferenced files of an object store are kept, because another machine may insert
+their database row soon."""
 
 
 @dataclass(frozen=True)
 class StoredBlob:
-    """File in a blob store. `abandoned` is True if no process can still be about to reference the
-    file in the database."""
+    """File in a blob store. `abandoned` is True if the file, when no database row references it, is a leftover
+    rather than a running upload."""
 
     key: str
     size: int
@@ -46,7 +46,8 @@ class BlobStore(Protocol):
         """Store a complete, synced local file under a new key, atomically. The local file may be moved away."""
 
     def local_file(self, key: str, folder: Path) -> contextlib.AbstractContextManager[Path]:
-        """Provide the file as a local path inside the block. A remote file is downloaded into `folder`."""
+        """Context manager that yields a local path of the file. A remote file is downloaded into `folder` for the
+        block."""
 
     def remove(self, key: str) -> None:
         """Delete the file; no effect if it does not exist."""
@@ -237,7 +238,7 @@ def stage(file: Path, incoming: Path, digest: str | None, most_bytes: int) -> St
 
 
 class _Copy:
-    """Copy loop that counts bytes against the limit and hashes them."""
+    """Copy of an upload in progress: counts the bytes against the limit and hashes them."""
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes

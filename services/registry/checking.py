@@ -48,7 +48,7 @@ from administrators."""
 
 
 class BroughtDown(Exception):
-    """The checked content terminated the check. The message describes how."""
+    """The check process crashed or exceeded a limit because of the checked content. The message describes the end."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Verdict:
 
 
 class RunningChecks:
-    """Registry of running check processes. Thread-safe."""
+    """Set of running check processes, which `end` kills. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -69,7 +69,8 @@ class RunningChecks:
 
     @contextlib.contextmanager
     def counted(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
-        """Register a process while the block runs, so `end` can kill it. After `end`, the process is killed at once."""
+        """Register a process for `end` while the block runs. If `end` was already called, the process is killed at
+        once."""
         with self._lock:
             self._processes.add(process)
             if self.ended:
@@ -81,7 +82,8 @@ class RunningChecks:
                 self._processes.discard(process)
 
     def end(self) -> None:
-        """Kill all running checks and every later one; each raises CheckFailed."""
+        """Kill all running check processes, and every process registered later. Their `run_check` raises
+        CheckFailed."""
         with self._lock:
             self.ended = True
             for process in self._processes:
@@ -221,7 +223,7 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
         try:
             values = json.loads(line)
         except ValueError:
-            continue  # output of a library; the exit code decides if there is no verdict
+            continue  # a library's output; without a verdict line, the exit code is evaluated
         if isinstance(values, dict):
             yield values
 

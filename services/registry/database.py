@@ -24,16 +24,16 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from services.errors import SchemaTooNew, StoreUnavailable
 
 BUSY_TIMEOUT_S = 10.0
-"""Seconds that a writer waits for another one."""
+"""Seconds that a writer waits for the write lock of another process."""
 INDEX_BYTES = 1 << 16
-"""Free space below which an I/O error of SQLite is caused by a full disk."""
+"""Free bytes on the disk below which an I/O error of SQLite is attributed to a full disk."""
 _WRITERS_LOCK = 0x1_5B1A7
 """Key of the PostgreSQL advisory lock for writers; SQLite locks the file itself."""
 
 
 @dataclass(frozen=True)
 class Schema:
-    """Tables of one package: folder of its migrations, and the table that records the applied ones."""
+    """Tables of one package: folder of its migrations, and name of the table that records the applied migrations."""
 
     migrations: Path
     version_table: str
@@ -43,7 +43,7 @@ REGISTRY = Schema(Path(__file__).parent / "migrations", "alembic_version")
 
 
 class Database:
-    """Database connections. Thread-safe."""
+    """Connections to one database, SQLite or PostgreSQL. Thread-safe."""
 
     def __init__(self, url: str, schema: Schema = REGISTRY) -> None:
         """Create the engine without connecting.

@@ -1,6 +1,7 @@
 """Folder of the registry: its lock, unpacked versions for `load_bundle`, and recovery at start.
 
-Publishing processes share the lock, cleanup holds it alone. Recovery deletes leftovers of dead processes, and only reports damage.
+Processes that publish uploads hold the lock in shared mode; cleanup holds it exclusively. Recovery deletes leftovers of
+dead processes, and reports damaged files without changing them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _RETRY_S = 0.05
 
 
 class FolderLock:
-    """File lock that is opened for each use, so threads of one process exclude each other too."""
+    """Lock on a file. Each use opens the file anew, so that threads of one process exclude each other, too."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -77,12 +78,13 @@ _log = logging.getLogger(__name__)
 
 
 class UnpackedModels:
-    """Folders named by content; versions with equal content share a folder. Safe for threads and several processes."""
+    """Folders with unpacked versions, named by their content; versions with equal content share a folder. Safe for
+    threads and several processes."""
 
     def __init__(self, folder: Path, incoming: Path, blobs: BlobStore, reached: Callable[[str], None]) -> None:
         self._folder, self._incoming, self._blobs, self._reached = folder, incoming, blobs, reached
         self._locks: dict[str, threading.Lock] = {}
-        """Lock per folder. Prevents duplicate unpacking without blocking other folders."""
+        """Lock per folder name, so that a version is unpacked once while other versions are not blocked."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def folder_of(self, row: Mapping[Any, Any]) -> Path:
@@ -210,7 +212,7 @@ def remove_leftovers(
 def findings(
     rows: Sequence[Row], stored: Sequence[StoredBlob], removed: tuple[str, ...], skipped: str | None
 ) -> Recovery:
-    """Report removed items, unchecked versions and damaged files."""
+    """Log unavailable files and return the result of a recovery: removed items, unchecked versions, damaged files."""
     sizes = {blob.key: blob.size for blob in stored}
     unchecked, damaged = [], []
     for row in rows:

@@ -28,7 +28,7 @@ NICENESS = 10
 
 
 def taken_bytes() -> int:
-    """Return the current size in bytes counted for RLIMIT_DATA."""
+    """Return this process's current data size in bytes, as counted for RLIMIT_DATA."""
     fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":" in line)
     return int(fields["VmData"].split()[0]) * 1024
 

@@ -38,7 +38,7 @@ from services.registry.versions import add_version, check_by, check_name
 
 DATABASE_FILE = "registry.sqlite"
 CHECKER = "registry"
-"""`changed_by` value for states set by a check."""
+"""Value of `changed_by` for a version whose state was set by the check, not by a caller."""
 RECOVERY_WAIT_S = 5.0
 
 
@@ -323,7 +323,7 @@ class ModelRegistry:
         return record
 
     def _after_check(self, name: str, version: int, state: State, verdict: Verdict) -> VersionRecord:
-        """Store the result of a check unless a concurrent check of the version was faster."""
+        """Store the verdict of a check, unless a concurrent check of the version has stored its verdict first."""
         with self._database.writing() as connection:
             if State(version_row(connection, name, version)["state"]) in UNCHECKED:
                 found = {"reason": verdict.reason, "description": verdict.description}

@@ -53,7 +53,7 @@ class VersionRecord:
     uploaded_by: str
     uploaded_at: datetime
     changed_by: str
-    """Caller that caused the present state."""
+    """Caller that caused the current state."""
     changed_at: datetime
     description: dict[str, Any] = field(default_factory=dict)
     """Results of the check: gaussians, parameters, field, width_px, height_px, time_window_s,
@@ -111,7 +111,7 @@ class Recovery:
     damaged: tuple[tuple[str, int, str], ...] = ()
     """Versions whose stored file is missing or has another size, with a message."""
     skipped: str | None = None
-    """Reason if nothing was removed."""
+    """Reason why no leftovers were removed; None if the cleanup ran."""
 
 
 METADATA = sa.MetaData(

@@ -45,7 +45,7 @@ def check_name(name: str) -> None:
 
 
 def check_by(by: str) -> None:
-    """Check the name of the acting caller.
+    """Check the caller's name, which is stored with a change.
 
     Raises:
         Rejected: if the name is empty, too long or not printable.
@@ -60,7 +60,7 @@ def add_version(
     """Insert the row of a stored upload, and the model's row for its first version.
 
     Args:
-        wanted: required version number; None takes the next one.
+        wanted: required version number; None takes the next number.
 
     Raises:
         Conflict: if the number was already used.

@@ -51,7 +51,7 @@ from services.version import product_version
 
 
 def live_facts(outcome: RunOutcome) -> LiveFacts | None:
-    """Collect the results of a live run's operators; None for other runs."""
+    """Convert the results of a live run's operators to report facts; None for other runs."""
     screen, scores = outcome.find(LiveDisplayResult), outcome.find(OnScreenResult)
     training = outcome.find(TrainingCounts)
     if screen is None or scores is None or training is None:
@@ -263,7 +263,7 @@ def _quality(tracker: QualityTracker) -> Quality:
 
 
 def _ms(value: float) -> float:
-    """Round milliseconds to microseconds, the resolution of the clock."""
+    """Round a time in milliseconds to microseconds, the resolution of the clock."""
     return round(value, 3)
 
 
@@ -285,7 +285,7 @@ def require_shown(outcome: RunOutcome) -> None:
     An interrupted run without withheld frames is accepted, because it may have ended before its first picture.
 
     Raises:
-        NothingShown: if not; the message has the frame counts, the reasons and the remedy.
+        NothingShown: if no frame was displayed. The message has the frame counts, the reasons and the remedy.
     """
     if displayed(outcome):
         return
@@ -329,7 +329,7 @@ def withheld_frames(outcome: RunOutcome) -> Counter[str]:
 
 
 def _named(outcome: RunOutcome, reason: str) -> str:
-    """Return a reason, extended by the main evidence for the out-of-body gate."""
+    """Return the reason why frames were withheld. For the out-of-body gate, its most frequent evidence is appended."""
     gate = outcome.find(OutOfBodyFrames)
     if reason != OUT_OF_BODY or gate is None or not gate.withheld:
         return reason

@@ -10,7 +10,8 @@ from html import escape
 
 HEIGHT = 290
 WIDE, NARROW = 1068, 500
-"""Widths of the chart slots in CSS pixels. Matching widths keep the chart text at the page's text size."""
+"""Widths of a full and a half chart column of the page, in CSS pixels. A chart of this width is not scaled, so that
+its text has the page's text size."""
 LEFT, RIGHT, TOP, BOTTOM = 56, 16, 14, 44
 
 
@@ -24,7 +25,7 @@ class Line:
     style: str
     """CSS class: `main`, `base`, `second`, `third`."""
     marks: bool = False
-    """Draw points only, without a connecting line."""
+    """True to draw points without a connecting line."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,8 @@ class _Axis:
 
 
 def _axis(low: float, high: float, wanted: int, tight: bool) -> _Axis:
-    """Create an axis with ticks at 1, 2 or 5 times a power of ten. A loose axis ends at ticks, a
-    tight one at the data."""
+    """Create an axis with ticks at multiples of 1, 2 or 5 times a power of ten. A `tight` axis ends at `low` and
+    `high`, otherwise at ticks."""
     if high - low < 1e-9 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
     rough = (high - low) / max(1, wanted)

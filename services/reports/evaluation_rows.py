@@ -12,7 +12,7 @@ from services.reports.evaluation_schema import BaselineFacts, EndPointFacts, Eva
 
 @dataclass(frozen=True)
 class Measured:
-    """Scores of one protocol and its baselines, primary baseline first."""
+    """Scores of one evaluation protocol and of its trivial baselines, the primary baseline first."""
 
     key: str
     name: str
@@ -23,7 +23,7 @@ class Measured:
 
     @property
     def versus(self) -> tuple[float, BaselineFacts] | None:
-        """Return the gain in decibels over the first measured baseline, and that baseline."""
+        """Return the gain in dB over the first baseline that has a score, and that baseline; None without a score."""
         for baseline in self.baselines:
             if baseline.psnr_tissue_db is not None and self.score.psnr_tissue_db is not None:
                 return self.score.psnr_tissue_db - baseline.psnr_tissue_db, baseline
@@ -31,7 +31,7 @@ class Measured:
 
 
 def measured(report: EvaluationReport) -> list[Measured]:
-    """Return the measured protocols, in page order."""
+    """Return the protocols that have scores, in the order of the page."""
 
     def named(frames_of: str, *names: str) -> tuple[BaselineFacts, ...]:
         by_name = {each.name: each for each in report.baselines if each.frames_of == frames_of}
@@ -70,12 +70,12 @@ def measured(report: EvaluationReport) -> list[Measured]:
 
 
 def future(baseline: BaselineFacts) -> str:
-    """Return the baseline's label, marked if it uses future frames."""
+    """Return the baseline's label, with a mark if the baseline uses future frames."""
     return f"{baseline.label} (sees the future)" if baseline.sees_future else baseline.label
 
 
 def decibels(value: float | None) -> str:
-    """Format with two decimals; a dash for None."""
+    """Format a PSNR in dB with two decimals; a dash for None."""
     return "–" if value is None else f"{value:.2f}"
 
 
@@ -97,12 +97,12 @@ def at_age(report: EvaluationReport, age_frames: float) -> float | None:
 
 
 RELATIVE_FROM = 0.05
-"""Scale error above which a model is reported as having no scale."""
+"""Deviation of the length scale from 1 above which the model is reported as uncalibrated."""
 
 
 @dataclass(frozen=True)
 class GeometryRow:
-    """Formatted measurement."""
+    """Measurement of 3D accuracy as text: description, value and baselines."""
 
     what: str
     value: str
@@ -113,7 +113,7 @@ class GeometryRow:
 
 
 def geometry_rows(geometry: GeometryFacts) -> list[GeometryRow]:
-    """Return all measured rows, in page order."""
+    """Return a row for each available measurement of 3D accuracy, in the order of the page."""
     motion = [*_tracking(geometry), *_flow(geometry), *_trajectory(geometry)]
     return [*_depth(geometry), *_views(geometry), *motion, *_parts(geometry)]
 

@@ -26,7 +26,7 @@ def _tile(name: str, value: str, unit: str, more: str) -> str:
 
 
 def against(psnr_db: float | None, baseline_db: float | None) -> str:
-    """Return HTML with the gain over the previous frame, and the previous frame's score."""
+    """Return HTML with the gain of a PSNR over the previous-frame baseline, and the baseline, in dB."""
     if psnr_db is None or baseline_db is None:
         return "no baseline"
     gain = psnr_db - baseline_db
@@ -45,7 +45,7 @@ def _quality_tiles(report: RunReport) -> list[str]:
     if (heldout := quality.heldout) is not None:
         more = against(heldout.psnr_tissue_db, baselines.heldout_previous_frame_db)
         tiles.append(_tile("Held-out frames", _decibels(heldout.psnr_tissue_db), "dB", more))
-    # a live run has its own tile, without the first second
+    # `tiles_section` adds the tile of a live run, whose score excludes the first second.
     if (live := quality.live) is not None and report.live is None:
         more = f"training error; {against(live.psnr_tissue_db, baselines.previous_frame_db)}"
         tiles.append(_tile("Displayed frame", _decibels(live.psnr_tissue_db), "dB", more))
@@ -91,12 +91,12 @@ def tiles_section(report: RunReport) -> str:
 
 
 def _display_path(report: RunReport) -> str:
-    """Return the path that ends at the display."""
+    """Return the name of the graph path that ends at the video sink, or the first path without a video."""
     return next((path for path in report.latency_ms if path.endswith("video")), next(iter(report.latency_ms)))
 
 
 def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | None, report: RunReport) -> str:
-    """Return raw picture, reconstruction, error and depth of the keyframes."""
+    """Return the picture table: raw picture, reconstruction, error and depth of each key frame."""
     if not keyframes:
         return ""
     cells = ["".join(f'<div class="head">{name}</div>' for name in ("Raw", "Reconstruction", "Error", "Depth"))]
@@ -517,7 +517,7 @@ def _quality_over_age(report: RunReport) -> Chart | None:
 
 
 def _by_age(entries: list[FrameEntry]) -> list[list[FrameEntry]]:
-    """Split frames by age into groups of about equal size, youngest first."""
+    """Sort frames by the age of their picture and split them into groups of about equal size, youngest first."""
     ordered = sorted(entries, key=lambda entry: entry.age_ms or 0.0)
     count = min(AGE_GROUPS, len(ordered))
     edges = [round(k * len(ordered) / count) for k in range(count + 1)]

@@ -35,9 +35,9 @@ class KeyframePictures:
     reconstruction: str
     error: str
     depth: str
-    """Depth map, like the other pictures a `data:` URI."""
+    """Depth map in false colours, as a `data:` URI."""
     depth_range: tuple[float, float] | None
-    """Depths drawn brightest and darkest."""
+    """Depths at the bright and the dark end of the depth map's colours; None if no depth is known."""
 
 
 def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
@@ -93,7 +93,7 @@ def hidden_pictures(scored: ScoredFrame, model: Model) -> HiddenPictures | None:
 
 
 def _outlined(picture: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-    """Outline the area hidden by tools."""
+    """Return the picture with the border of the tool mask outlined."""
     if mask is None:
         return picture
     drawn = np.ascontiguousarray(picture.copy())

@@ -1,7 +1,7 @@
 """Loading of settings from a YAML file, the environment and flags.
 
-An error names the place of the value: the line of the file, the variable or the flag. Limits on size, nesting and aliases are checked before a file is
-parsed.
+An error message names the origin of the value: line of the file, environment variable or flag. Limits on size, nesting
+and aliases are checked before a file is parsed.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class YamlFile:
         return cls(values or {}, lines, path.name)
 
     def line_of(self, location: tuple[int | str, ...]) -> int | None:
-        """Return the line of a key or of the nearest enclosing section."""
+        """Return the line number of a key, or of the nearest enclosing section that is in the file."""
         for length in range(len(location), 0, -1):
             line = self.lines.get(tuple(str(part) for part in location[:length]))
             if line is not None:
@@ -226,7 +226,7 @@ def _sentence(location: Location, error: Any, document: YamlFile, flags: Mapping
 
 
 def _place(location: Location, document: YamlFile, flags: Mapping[str, str]) -> str:
-    """Return the place of a value for an error message: flag, variable or line of the file."""
+    """Return the origin of a value as a prefix for an error message: flag, environment variable or line of the file."""
     dotted = _dotted(location)
     for name in flags:
         if dotted == name or dotted.startswith(f"{name}.") or name.startswith(f"{dotted}."):
@@ -264,7 +264,7 @@ def _keys(location: Location) -> list[str]:
 
 
 def _without_none(kind: Any) -> Any:
-    """Return the section type of an optional section."""
+    """Return the type without None of a section that may be None."""
     kinds = [each for each in get_args(kind) if each is not type(None)]
     return kinds[0] if len(kinds) == 1 and type(None) in get_args(kind) else kind
 
