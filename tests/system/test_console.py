@@ -214,7 +214,7 @@ def test_the_audit_log_is_filtered_and_saved(page, client, tmp_path):
     assert row["event"] == entry["event"] == "key.create" and row["at"] == entry["at"]
     page.fill("#audit-since", "2099-01-01T00:00:00")
     page.click("#audit-filter >> text=Filter")
-    page.wait_for_selector("#audit-said >> text=no entry fits")
+    page.wait_for_selector("#audit-said >> text=no matching entries")
     page.click("#audit-filter >> text=Clear")
     until(page, f"document.querySelectorAll('#entries tr').length >= {everything}")
 
@@ -232,7 +232,7 @@ def test_health_shows_what_readyz_says(page, client):
     answer = {"status": "not ready", "checks": {"disk": {"ok": False, "detail": "3 MiB free", "needed": True}}}
     page.route("**/readyz?verbose", lambda route: route.fulfill(status=503, json=answer))
     opened(page, "health")
-    page.wait_for_selector("#health-checks >> text=not well, and needed")
+    page.wait_for_selector("#health-checks >> text=failed, required")
     assert page.inner_text("#health-status") == "not ready" and "3 MiB free" in page.inner_text("#health-checks")
     page.unroute("**/readyz?verbose")
 

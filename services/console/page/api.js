@@ -81,7 +81,7 @@ async function ask(method, path, body, headers = {}) {
     if (answer.ok) return answer;
     const document = await documentOf(answer);
     if (answer.status !== 401) throw new Problem(answer.status, document);
-    if (used === key) await newKey(document?.detail ?? "The key was refused.");
+    if (used === key) await newKey(document?.detail ?? "The server rejected the key.");
   }
 }
 

@@ -34,7 +34,7 @@ export function auditPage(report) {
       before = page.next_before;
     } while (found === 0 && before !== null);
     at("older").hidden = before === null;
-    at("audit-said").value = at("entries").childElementCount ? "" : "no entry fits";
+    at("audit-said").value = at("entries").childElementCount ? "" : "no matching entries";
   }
 
   at("older").addEventListener("click", () => report(older));

@@ -27,9 +27,9 @@ export function exportControls(path, name, report) {
 export function snapshotsOf(place, report) {
   let stream = "";
   const name = document.createElement("input");
-  Object.assign(name, { id: "snapshot-model", placeholder: "no: keep as a file", pattern: "[a-z0-9][a-z0-9\\-]{0,39}", autocomplete: "off" });
+  Object.assign(name, { id: "snapshot-model", placeholder: "none: store as a file", pattern: "[a-z0-9][a-z0-9\\-]{0,39}", autocomplete: "off" });
   const label = document.createElement("label");
-  label.append("Make it a version of model ", name);
+  label.append("Store as a version of model ", name);
   const said = document.createElement("p");
   said.className = "said";
   said.setAttribute("role", "status");
@@ -41,8 +41,8 @@ export function snapshotsOf(place, report) {
     if (!name.reportValidity()) return;
     const key = crypto.randomUUID?.() ?? String(performance.now());
     const taken = await call("POST", `/v1/streams/${stream}/snapshots`, name.value ? { model: name.value } : {}, { "Idempotency-Key": key });
-    const what = taken.version ? `version ${taken.version.version} of ${taken.version.name}` : "a file below";
-    said.textContent = `Frame ${taken.seq}, ${taken.gaussians} Gaussians: ${what}. Training stood still for ${taken.pause_ms.toFixed(1)} ms.`;
+    const what = taken.version ? `version ${taken.version.version} of ${taken.version.name}` : "stored as a file, listed below";
+    said.textContent = `Frame ${taken.seq}, ${taken.gaussians} Gaussians: ${what}. Training paused for ${taken.pause_ms.toFixed(1)} ms.`;
     if (taken.version) said.textContent += ` It is ${await checked(taken.version)}.`;
     await renew();
     kept.open = !taken.version;
@@ -64,7 +64,7 @@ export function snapshotsOf(place, report) {
 
   async function renew() {
     const found = stream ? await call("GET", `/v1/streams/${stream}/snapshots`) : [];
-    title.textContent = `Snapshots that are kept: ${found.length}`;
+    title.textContent = `Stored snapshots: ${found.length}`;
     kept.hidden = found.length === 0;
     list.replaceChildren(...found.slice(0, 5).map((snapshot) => {
       const line = document.createElement("li");

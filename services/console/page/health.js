@@ -30,7 +30,7 @@ async function readiness() {
 }
 
 function check([name, { ok, detail, needed }]) {
-  const state = element("span", ok ? "well" : needed ? "not well, and needed" : "not well");
+  const state = element("span", ok ? "ok" : needed ? "failed, required" : "failed");
   state.className = `check ${ok ? "well" : needed ? "failed" : "degraded"}`;
   return row(name.replaceAll("_", " "), [state], detail ?? "");
 }

@@ -20,8 +20,8 @@ export function keysPage(report, mine) {
     const revoke = button("Revoke", async () => {
       const sure = await confirmed({
         title: `Revoke the key ${key.name}?`,
-        what: `ID ${key.id}, ${key.role}, streams: ${streams}${own ? ". It is the key that this page uses." : ""}`,
-        consequence: "Whoever uses it is refused from the next request on. This cannot be undone: a new key has to be made.",
+        what: `ID ${key.id}, ${key.role}, streams: ${streams}${own ? ". This page uses this key." : ""}`,
+        consequence: "The server rejects all further requests with this key. This cannot be undone; create a new key if needed.",
         verb: "Revoke",
       });
       if (!sure) return;

@@ -11,7 +11,7 @@ const LAYERS = {
   confidence: { title: "Confidence", label: "Confidence in the reconstruction in false colours" },
   orbit: {
     title: "Orbit", note: "not the live view",
-    label: "View of the virtual camera. Arrow keys turn it, plus and minus come closer and go back, Home resets it.",
+    label: "View of the virtual camera. Arrow keys turn it, plus and minus zoom, Home resets it.",
   },
 };
 

@@ -33,7 +33,7 @@ export function modelsPage(report) {
       const sure = await confirmed({
         title: `Delete version ${version.version} of the model ${model.name}?`,
         what: `Version ${model.name}/${version.version}, ${version.state}, ${size(version.size_bytes)}, SHA-256 ${version.digest.slice(0, 12)}…, uploaded by ${version.uploaded_by}`,
-        consequence: "Its file is removed, and no stream can show it or roll back to it. This cannot be undone.",
+        consequence: "Its file is deleted, and no stream can show it or roll back to it. This cannot be undone.",
       });
       if (sure) await then(() => call("DELETE", `${path}/versions/${version.version}`))();
     }, report, `Delete version ${version.version} of the model ${model.name}`));

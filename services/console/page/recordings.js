@@ -20,7 +20,7 @@ export function recordingsPage(report, replay) {
       const sure = await confirmed({
         title: `Delete the recording ${recording.name}?`,
         what: [`Recording ${recording.name}`, found(recording.description), size(recording.kept_bytes), `uploaded by ${recording.uploaded_by}`].filter(Boolean).join(", "),
-        consequence: "The server's copy of it is removed. Replays that were made of it stay. This cannot be undone.",
+        consequence: "The server's copy is deleted. Replays of the recording are kept. This cannot be undone.",
       });
       if (!sure) return;
       await call("DELETE", `/v1/recordings/${recording.name}`);

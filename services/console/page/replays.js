@@ -75,7 +75,7 @@ export function replaysPage(report) {
         const sure = await confirmed({
           title: `Delete the replay ${replay.id}?`,
           what: `Replay ${replay.id} of the recording ${replay.recording}, ${replay.state}, with ${replay.results.join(", ") || "no results"}`,
-          consequence: "Its report, video and model are removed; the recording, and a model that was kept, stay. This cannot be undone.",
+          consequence: "Its report, video and model are deleted. The recording, and a model stored in the registry, are kept. This cannot be undone.",
         });
         if (sure) await then(() => call("DELETE", path))();
       }, report, `Delete the replay ${replay.id}`));
@@ -97,7 +97,7 @@ export function replaysPage(report) {
     const player = at("replay-video");
     URL.revokeObjectURL(player.src);
     player.src = URL.createObjectURL(await (await fetched(`/v1/replays/${replay.id}/results/reconstruction.mp4`)).blob());
-    at("replay-player-name").textContent = `${replay.recording}: camera beside reconstruction`;
+    at("replay-player-name").textContent = `${replay.recording}: camera and reconstruction`;
     at("replay-player").hidden = false;
     player.focus();
   }

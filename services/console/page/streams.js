@@ -21,14 +21,14 @@ export function streamsPage(report, onStreams) {
     const path = `/v1/streams/${stream.name}`;
     const then = (act) => async () => { await act(); await renew(); };
     const asked = (question, act) => async () => { if (await confirmed(question)) await then(act)(); };
-    const what = `Stream ${stream.name}, source ${stream.source}, ${stream.state}, ${watching(stream) || "nobody"} watching`;
+    const what = `Stream ${stream.name}, source ${stream.source}, ${stream.state}, viewers: ${watching(stream) || "none"}`;
     const stop = {
       title: `Stop the stream ${stream.name}?`, what, verb: "Stop",
-      consequence: "Its pictures end for everybody, the camera's too. The live reconstruction is lost unless a snapshot was taken.",
+      consequence: "All viewers lose its images, including the camera image. The live reconstruction is lost unless a snapshot was taken.",
     };
     const remove = {
       title: `Delete the stream ${stream.name}?`, what,
-      consequence: "It is stopped and forgotten. The live reconstruction is lost unless a snapshot was taken. This cannot be undone.",
+      consequence: "The stream is stopped and its settings are deleted. The live reconstruction is lost unless a snapshot was taken. This cannot be undone.",
     };
     const runs = stream.state !== "stopped";
     const actions = [
