@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {
-        # the better field according to benchmarks/results/replay.md
+        # `auto` names the field with the better results in benchmarks/results/replay.md
         "auto": "gsplat_core.deformation.basis:KIND",
         "basis": "gsplat_core.deformation.basis:KIND",
         "hexplane": "gsplat_core.deformation.hexplane:KIND",
@@ -57,7 +57,7 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
         "learned": "gsplat_core.experimental.learned_prior:LearnedPrior",
     },
 )
-"""Motion priors by name: factories that take a `ReconstructorConfig`. `bumps` uses no prior, only the field's own extrapolation."""
+"""Factories of motion priors by name; each takes a `ReconstructorConfig`. `bumps` uses the field's extrapolation alone."""
 
 Eyes = Literal["left", "both"]
 """Eyes of a stereo scope whose pictures are trained on."""

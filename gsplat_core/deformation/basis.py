@@ -229,7 +229,7 @@ class BasisField(BumpTensors):
         return self.count * self.bumps * (2 + BASIS_CHANNELS)
 
     def slot(self, rows: int) -> FieldSlot:
-        """Create a slot for `rows` Gaussians."""
+        """Create a snapshot slot with capacity for `rows` Gaussians."""
         return BasisSlot(self, rows)
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:

@@ -357,7 +357,8 @@ class BumpTensors(ContinuedField):
         deltas = self.deltas(time_s).detach()
         if self._fading_s == math.inf or self._moments is None:
             return deltas
-        # The newest column covers the time since its creation, one spacing ago.
+        # Decay only where the newest column was trained since its creation, one spacing ago. Gaussians hidden since then
+        # keep their deltas.
         trained = self._moments.steps[: self.count, self._columns.newest_place] > 0
         return torch.where(trained[:, None], deltas * math.exp(-self.spacing_s / self._fading_s), deltas)
 
@@ -369,7 +370,7 @@ class BumpTensors(ContinuedField):
             self._add_places((end if self.weights.is_cpu else bump_capacity(end)) - before.places)
         self._columns, passed = self._columns.moved_on(added)
         if passed:
-            self.centers.data[: self.count] -= passed  # exact: whole numbers of spacings, and the centres decrease
+            self.centers.data[: self.count] -= passed  # exact for whole numbers of decreasing magnitude
         for places, numbers in self._columns.newest_places(min(added, self.bumps)):
             self._lay_out(places, numbers, held)
         return passed

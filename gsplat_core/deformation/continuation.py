@@ -100,7 +100,7 @@ class Continuation(torch.nn.Module):
 
 
 class ContinuedField(DeformationField):
-    """Base class of fields that apply a `Continuation`. Subclasses define how one is set."""
+    """Base class of fields that apply a `Continuation`. Subclasses define how the continuation is set."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__(time_window_s)

@@ -353,5 +353,5 @@ class WholeFieldSlot:
         return True
 
     def exact_copy(self) -> DeformationField:
-        """Return a separate copy."""
+        """Return a copy of the field in separate memory."""
         return self.field.detached_copy()

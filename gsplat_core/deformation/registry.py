@@ -31,7 +31,7 @@ OTHER_FIELD_BYTES = 256 * 2**20
 
 @dataclass(frozen=True)
 class FieldRates:
-    """Base of frozen dataclasses with the Adam learning rates of one kind of field.
+    """Base class of frozen dataclasses that hold the Adam learning rates of one kind of field.
 
     A rate with a name ending in `_px` applies to positions and is in pixels of the training image.
     Other rates are in the units of their parameters.

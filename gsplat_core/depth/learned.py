@@ -144,7 +144,7 @@ GIVEN = "the depth network's output was scaled to the frames' own depth"
 
 
 class DepthSettings(PictureSettings):
-    """Settings of a depth network that its tensor shapes do not reveal."""
+    """Settings of a depth network that cannot be derived from its tensor shapes."""
 
     mean: tuple[Finite, Finite, Finite] = (0.485, 0.456, 0.406)
     std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
@@ -155,7 +155,7 @@ class DepthSettings(PictureSettings):
 def _stamp(path: Path) -> tuple[int, int] | None:
     try:
         about = path.stat()
-    except OSError:  # a missing file is reported by the loader
+    except OSError:  # the loader reports a missing file
         return None
     return about.st_mtime_ns, about.st_size
 
@@ -267,7 +267,7 @@ class LearnedDepth(Estimator):
         return 1 / values if self._inverse else values
 
     def _by_given(self, grid: NDArray[np.float64], seen: NDArray[np.bool_], frame: Frame) -> Affine | str | None:
-        """Align to the frame's own depth. Returns None if it covers too little, or a rejection
+        """Align to the frame's own depth. Returns None if the depth covers too little, or a rejection
         reason if the two do not correlate.
         """
         if frame.depth is None:

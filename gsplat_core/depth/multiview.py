@@ -117,7 +117,7 @@ def _whole_patches(tissue: NDArray[np.uint8]) -> NDArray[np.float32]:
 def _cost(
     grey: NDArray[np.float32], mean: NDArray[np.float32], variance: NDArray[np.float32], other: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return (1 - ZNCC) / 2 [H, W]."""
+    """Return the matching cost (1 - ZNCC) / 2 of each pixel, [H, W]."""
     sums = _mean(np.dstack([other, other * other, grey * other]))
     other_mean = sums[..., 0]
     other_variance = np.maximum(sums[..., 1] - other_mean * other_mean, 0) + np.float32(NOISE_GREY**2)
@@ -160,7 +160,7 @@ def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
 
 
 def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Select the best labels.
+    """Select the distance label with the lowest cost for each pixel.
 
     Args:
         total: aggregated costs float32 [H, W, D].

@@ -60,7 +60,7 @@ AUTO_WITH_TIME: dict[str, Callable[[Frame], bool]] = {**AUTO, "parallax": _has_p
 
 
 def check_depth(choice: str) -> None:
-    """Check a depth source name, and the address if there is one.
+    """Check the name of a depth source, and its address if the name has one.
 
     Raises:
         InvalidSetting: for an unknown name, a missing address, or an address that the estimator rejects.
@@ -126,7 +126,7 @@ def new_estimator(choice: str) -> Estimator:
 
 
 class Sentences:
-    """Counter of messages about frames. Messages with the same text before the first colon count as one kind."""
+    """Counter of messages about frames. Messages with equal text before the first colon count as one kind."""
 
     def __init__(self) -> None:
         self._first: dict[str, str] = {}
@@ -184,7 +184,10 @@ class DepthFinder:
             shown_only: the frame is displayed but not used for training, so only its own depth is returned.
         """
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
-        if (camera.width_px, camera.height_px) != (frame.width_px, frame.height_px):  # a stream may change its size
+        if (camera.width_px, camera.height_px) != (
+            frame.width_px,
+            frame.height_px,
+        ):  # the stream may have changed its picture size
             camera = camera.resized(frame.width_px, frame.height_px)
         # Frames that are not trained on need no estimated depth; their own depth is free.
         shown_only = shown_only or frame.status is FrameStatus.DAMAGED or frame.withheld is not None

@@ -365,7 +365,7 @@ class StereoDepth(Estimator):
         if why is not None:
             return doubted(shape, STEREO, why)
         left, right = grey(frame.image), grey(frame.right_image)
-        # Disparity of points at infinity, since principal points may differ.
+        # Disparity of points at infinity. It is not 0 if the principal points differ.
         parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
         if self._look_in == 0:
             why = self._look(left, right, frame, parallel_px)

@@ -46,7 +46,7 @@ class Likeness:
 
 
 class View:
-    """Picture prepared for comparisons."""
+    """Reduced picture with the features that `likeness` compares."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
         """Prepare an RGB uint8 picture [H, W, 3] of any size."""

@@ -73,7 +73,7 @@ def ratio(sample: Sample, reference: Sample, channel: int) -> tuple[float, float
     shift = median_of(difference)
     away = np.abs(difference - shift)
     spread = median_of(away)
-    # Average values near the median. Moving parts and tools deviate to one side.
+    # Average only values near the median, because moving parts and tools deviate to one side.
     for _ in range(2):
         near = difference[away <= max(2 * spread, 0.02)]
         shift = float(near.mean()) if len(near) else shift
@@ -214,7 +214,8 @@ class ExposureEstimator:
         change = np.abs(measured - self._log_gain).max()
         if change <= max(zone, clear * spread):
             return False
-        # A tool that covers half of the picture shifts the mean but not the tissue next to it.
+        # Compare the numbers of pixels that agree with the change and with no change. A tool that covers half of the
+        # picture shifts the mean, but the visible tissue still agrees with no change.
         same = share_with(sample, best.sample, self._log_gain - best.log_gain)
         if share_with(sample, best.sample, measured - best.log_gain) < MORE_PIXELS * same:
             return False

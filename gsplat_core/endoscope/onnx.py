@@ -130,7 +130,7 @@ ClassIndex = Annotated[int, Field(ge=0, lt=4096)]
 
 
 class PictureSettings(BaseModel):
-    """Settings of any picture network that its tensor shapes do not reveal."""
+    """Settings of a picture network that cannot be derived from its tensor shapes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 

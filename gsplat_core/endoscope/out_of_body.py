@@ -95,7 +95,7 @@ class Evidence:
 
 
 def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
-    """Measure a picture.
+    """Compute the colour and light measures of a picture.
 
     Args:
         image: RGB uint8 [H, W, 3].

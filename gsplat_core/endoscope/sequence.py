@@ -122,12 +122,12 @@ class SequenceCheck:
         moving = np.flatnonzero(self._row_moves >= MOVING_SHARE)
         level = 2 * ONE_COLOUR_LEVELS
         if not len(moving) or (changed[moving[-1]] and np.ptp(small[moving[-1], ::4], axis=0).max() > level):
-            # The lowest changing row is new and has content, so no row above is stale.
+            # The lowest row that usually changes is new and has content, so the picture is not torn.
             return False
         flat = np.ptp(small[:, ::4], axis=1).max(axis=1) <= level
         least = max(3, round(TORN_SHARE * len(small)))
         for stale in (~changed, flat & changed):
-            # Count upwards from the lowest changing row; all changing rows must be stale.
+            # Count stale rows upwards from the lowest row that usually changes.
             rows = moving[::-1]
             fresh = np.flatnonzero(~stale[rows])
             below = len(rows) if len(fresh) == 0 else int(fresh[0])

@@ -116,7 +116,7 @@ class _Band:
         return np.rot90(plane, self._turns)[-self._depth_px :]
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Add a frame to the means."""
+        """Update the temporal means of the band's gradients with a frame."""
         grey = luma(np.ascontiguousarray(self._of(image))).astype(np.float32)
         gradient = np.zeros((2, *grey.shape), np.float32)
         gradient[0, 1:] = grey[1:] - grey[:-1]

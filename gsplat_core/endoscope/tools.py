@@ -328,8 +328,8 @@ def view_of(image: NDArray[np.uint8]) -> View:
     levels = cv2.calcHist([brightness], [0], inside, [256], [0, 256]).ravel().astype(np.float64)
     # The ratio of channels is noise in dark regions. This offset pulls it to 0.
     floor = max(3.0, 0.06 * mean_level(levels))
-    # Halfway between the mean of the other channels, which is less noisy, and the smaller one,
-    # which separates yellow from grey.
+    # Red is compared with a level halfway between two values of green and blue: their mean, which is
+    # less noisy, and their minimum, which separates yellow from grey.
     values = cv2.merge([red, green, blue, cv2.min(green, blue, dst=other)])
     logs = cv2.LUT(values, np.log(LEVELS + np.float32(floor)))
     redness = np.empty(red.shape, np.float32)
@@ -358,8 +358,8 @@ def valley(histogram: NDArray[np.float64] | None) -> tuple[float, bool]:
         return NO_VALLEY, False
     density = cv2.GaussianBlur(histogram[None], (21, 1), 2.5, borderType=cv2.BORDER_REPLICATE)[0]
     left, right = np.maximum.accumulate(density), np.maximum.accumulate(density[::-1])[::-1]
-    # Cap the peaks, so that a high peak makes no valley clearer; the constant is a pixel or two of
-    # noise.
+    # Cap the peaks, so that a high peak does not make its valley clearer. The added constant
+    # corresponds to a noise of one or two pixels.
     clear = np.minimum(np.minimum(left, right), 0.02) / (density + 4e-4)
     clear[(np.cumsum(histogram) < SMALLEST_SHARE) | (BIN_CENTRES > HIGHEST_VALLEY)] = 0
     best = int(np.argmax(clear * EXPECTATION))

@@ -331,7 +331,7 @@ class _TrainMean:
         self._count += 1
 
     def image(self) -> NDArray[np.float32] | None:
-        """Mean in 0..1; None without any image."""
+        """Mean of the added images, RGB in 0..1; None without any image."""
         if self._sum is None:
             return None
         return (self._sum / (255.0 * self._count)).astype(np.float32)

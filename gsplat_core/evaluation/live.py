@@ -50,7 +50,7 @@ class AgeHistogram:
         self._counts[min(place, _BUCKETS - 1)] += 1
 
     def ages(self) -> Ages | None:
-        """Distribution so far; None without any age."""
+        """Distribution of the ages added so far; None without any age."""
         count = sum(self._counts)
         if not count:
             return None

@@ -312,7 +312,7 @@ def _distances(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     centres = -np.einsum("kij,ki->kj", rotations, translations)
     between = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     largest = float(between.max())
-    axes = rotations[:, 2]  # the third row is the viewing direction in the world
+    axes = rotations[:, 2]  # the third row of a world-to-camera rotation is the viewing direction in the world
     degrees = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
     position = between / (NEAR_SHARE * largest) if largest > 0 else np.zeros_like(between)
     return np.maximum(position, degrees / NEAR_DEGREES)

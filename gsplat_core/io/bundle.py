@@ -83,7 +83,7 @@ def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor],
         size += len(piece)
     manifest = manifest_bytes(model, size, digest.hexdigest())
     try:
-        # refuse to write a manifest that could not be read again
+        # Validate the manifest, so that no bundle is written that `load_bundle` would reject.
         parse_manifest(manifest, MANIFEST)
     except BundleCorrupt as error:
         raise BundleError(
@@ -177,7 +177,7 @@ def _read_manifest(folder: Path, name: str) -> Manifest:
 def _skeleton(path: Path, manifest: Manifest) -> tuple[Gaussians, DeformationField | None]:
     try:
         return manifest.skeleton()
-    # torch raises for more elements than it can count
+    # torch raises RuntimeError for a shape with more elements than it supports
     except (InvalidInput, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise BundleCorrupt(f"the manifest of {path} describes no valid model: {reason}") from error

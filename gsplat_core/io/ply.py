@@ -110,7 +110,7 @@ def load_ply(path: str | Path) -> Gaussians:
 def _columns(rows: NDArray[np.void], names: tuple[str, ...] | list[str], path: Path) -> NDArray[np.float32]:
     columns = np.empty((len(rows), len(names)), dtype=np.float32)
     for i, name in enumerate(names):
-        # a double beyond float32 becomes infinite and is rejected below
+        # A double beyond the range of float32 becomes infinite. The check below rejects it.
         with np.errstate(over="ignore"):
             columns[:, i] = rows[name]
         bad = int(np.count_nonzero(~np.isfinite(columns[:, i])))

@@ -80,7 +80,7 @@ def _ellipse_touches(
         return 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
 
     least = torch.full_like(a, math.inf)
-    for dx in (low[:, 0], high[:, 0]):  # along a vertical edge sigma is least where its derivative in y is zero
+    for dx in (low[:, 0], high[:, 0]):  # along a vertical edge, sigma is smallest where its derivative by y is 0
         least = torch.minimum(least, sigma(dx, torch.minimum(torch.maximum(-b * dx / c, low[:, 1]), high[:, 1])))
     for dy in (low[:, 1], high[:, 1]):
         least = torch.minimum(least, sigma(torch.minimum(torch.maximum(-b * dy / a, low[:, 0]), high[:, 0]), dy))

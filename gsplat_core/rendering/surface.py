@@ -109,8 +109,8 @@ def _jacobian(local: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
         return torch.stack([fx, zero, zero, zero, fy, zero], -1).unflatten(-1, (2, 3))
     if camera.model == "pinhole":
         return torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).unflatten(-1, (2, 3))
-    # Near the edge of a fisheye picture z does not measure distance. Use the depth of the centre
-    # there.
+    # For a fisheye camera return a zero derivative, so that a splat has its centre's depth. Near the edge of the
+    # picture z does not measure distance.
     return local.new_zeros(len(local), 2, 3)
 
 

@@ -69,7 +69,7 @@ def inert_gaussians(like: Gaussians, rows: int) -> Gaussians:
 
 
 class GaussianRows:
-    """Gaussians of a scene in tensors of fixed size."""
+    """Gaussians of a scene in the first rows of tensors of fixed size."""
 
     def __init__(self, gaussians: Gaussians, capacity: int) -> None:
         if gaussians.count > capacity:

@@ -195,7 +195,7 @@ class ScoredMean:
         self._parts: list[float] = []
 
     def add(self, value: float) -> None:
-        """Add a value; non-finite ones are ignored."""
+        """Add a value to the mean; non-finite values are ignored."""
         if not math.isfinite(value):
             return
         self.count += 1

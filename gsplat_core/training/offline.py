@@ -133,7 +133,7 @@ def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observat
 
 
 class ToFit(NamedTuple):
-    """Input of offline training."""
+    """Frames and observations prepared for offline training."""
 
     frames: list[Frame]
     """Frames from which the scene is created and grown."""

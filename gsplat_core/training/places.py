@@ -128,7 +128,7 @@ class LeftScenes:
         return self._recognised[1].gaussians if self._recognised and self._recognised[0] == seq else None
 
     def keep_memory(self, step: TrainingStep | None) -> None:
-        """Keep the memory of a scene for the next one. None keeps that of an earlier scene."""
+        """Keep the tensors of a scene, to be reused by the next scene. With None, the tensors kept before stay."""
         self._kept = step or self._kept
 
     def restarted(self, gaussians: Gaussians, observation: Observation) -> TrainingStep | None:

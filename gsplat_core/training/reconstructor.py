@@ -357,7 +357,7 @@ class Reconstructor:
         return dict(version=self._version, camera=self.camera, unseen_s=unseen_s, **known)
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        """Create the scene from its first frame; `end_s` is the time of the last frame offline."""
+        """Create the scene from its first frame. Offline, `end_s` is the time of the last frame in seconds."""
         if self._growth is not None:
             self._growth.begin(observation.camera)
         gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
@@ -367,7 +367,7 @@ class Reconstructor:
                 self._motion.restart()
                 return
         wanted = NewField(gaussians, observation.time_s, end_s, self.config.motion_spacing_s, self.config.history_s)
-        with torch.random.fork_rng(devices=[]):  # planes and layers are initialised randomly
+        with torch.random.fork_rng(devices=[]):  # fields initialise planes and layers randomly
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)

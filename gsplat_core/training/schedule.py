@@ -21,7 +21,7 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
 JUMP_RATIO = 1.8
-"""Ratio of a new frame's loss to the usual loss from which it counts as a jump (a cut or sudden motion) and gets extra steps."""
+"""Ratio of a new frame's loss to the usual loss from which the frame counts as a jump (cut or sudden motion)."""
 JUMP_EXTRA = 4
 """Extra steps for a jump, in multiples of the frame's own steps."""
 USUAL_DECAY = 0.1

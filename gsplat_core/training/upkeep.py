@@ -57,7 +57,7 @@ is reached after about 7,000 steps without visibility.
 
 @dataclass(frozen=True)
 class Seen:
-    """Projection of a scene in a frame."""
+    """Scene projected to the picture of a frame."""
 
     now: Gaussians
     """Scene at the frame's time."""

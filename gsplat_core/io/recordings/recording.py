@@ -91,7 +91,7 @@ class FileRecording:
         Raises:
             RecordingInvalid: at the first frame that cannot be read.
         """
-        # Python 3.12 closes an inner generator only when the outer one is collected, unless asked to.
+        # Close the inner generator explicitly. Python 3.12 would close it only when the outer generator is collected.
         with closing(self._contents.frames(Findings(strict=True), self.frame_count)) as frames:
             for frame in frames:
                 assert frame is not None  # a strict collector has raised
@@ -138,7 +138,7 @@ def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_fram
 def _check_scaled_size(width_px: int, height_px: int, scale: float) -> None:
     if scale == 1:
         return
-    # Python floats overflow to infinity, never to a small value.
+    # No overflow check is needed, because Python floats overflow to infinity, which the range check rejects.
     width, height = width_px * scale, height_px * scale
     if width * height > MAX_PIXELS or min(width, height) < MIN_SCALED_SIDE_PX:
         least = MIN_SCALED_SIDE_PX / min(width_px, height_px)

@@ -150,7 +150,7 @@ class VideoFrames:
         """
         try:
             yield from self._frames(findings)
-        # the container was complete when it was opened
+        # The file was changed or became unreadable, because its container was complete when it was opened.
         except (UnreadableFile, OSError, av.FFmpegError) as error:
             findings.problem(
                 self.path, f"the video cannot be read any more: {error}", "Leave it alone while it is read"

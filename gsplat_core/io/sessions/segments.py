@@ -192,7 +192,7 @@ class SegmentReader:
         self.ends = last if isinstance(last, SegmentEnds) else None
         for name in sorted(named)[:MOST_OPEN]:
             try:
-                # The writer verified a complete segment. In an incomplete one, no byte is reliable.
+                # Check the sums only of an incomplete segment. A complete segment was synced to disk before its last line.
                 self._indices[name] = TrackIndex(self.folder / name, check_sums=self.ends is None)
             except (UnreadableFile, OSError):
                 self._indices[name] = None

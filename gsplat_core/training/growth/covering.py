@@ -206,7 +206,7 @@ class Covering:
         self._under_way.clear()
 
     def join(self, step: TrainingStep) -> None:
-        """Add the Gaussians created since the last search; waits for them."""
+        """Add the Gaussians whose creation was started by the last search; waits until they are created."""
         under_way, self._under_way = self._under_way, []
         for each in under_way:
             self._append(step, each.result())

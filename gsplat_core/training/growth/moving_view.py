@@ -1,6 +1,7 @@
 """Tissue that enters and leaves the view of a moving camera.
 
-Gaussians that have been out of view are archived, to free capacity in a scene of fixed size. Tissue that comes into view is filled before training.
+Gaussians that have been out of view are archived, to free capacity in a scene of fixed size. Tissue that comes into view
+is filled before training.
 """
 
 from __future__ import annotations

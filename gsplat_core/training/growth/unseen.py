@@ -1,4 +1,4 @@
-"""Visibility times of Gaussians, the archive of those removed from the scene, and the density and depth of Gaussians around the cells of a picture grid."""
+"""Visibility times of Gaussians, the archive of Gaussians removed from the scene, and their density on a picture grid."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class LastSeen:
         return self._times[: self._count]
 
     def join(self, count: int, time_s: float) -> None:
-        """Set the number of Gaussians; added ones count as visible at `time_s`."""
+        """Set the number of Gaussians. Added Gaussians count as visible at `time_s`."""
         self._times[self._count : count] = time_s
         self._count = count
 

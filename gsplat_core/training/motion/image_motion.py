@@ -89,7 +89,7 @@ class ImageMotion:
         return flow if grey.shape[1] == width else flow * (width / grey.shape[1])
 
     def forget(self) -> None:
-        """Restart with the next picture."""
+        """Discard the last picture, so that the next one has no flow."""
         self._before = self._mask_before = None
 
 

@@ -33,7 +33,7 @@ ROWS_AT_ONCE = 1 << 14
 
 
 class SurfaceTracks:
-    """Surface motion shown by the frames of a recording, if they show it."""
+    """Trajectories of surface points through the frames of a recording, if depth and pictures show the motion."""
 
     def __init__(
         self,
@@ -205,7 +205,7 @@ def steady_course(values: Tensor, times: Tensor) -> Tensor:
     span = times[2:] - times[:-2]
     share = torch.where(span > 0, (times[1:-1] - times[:-2]) / span.clamp(min=1e-9), 0.5)
     off = values[:, 1:-1] - torch.lerp(values[:, :-2], values[:, 2:], share)
-    # The variances of a value and of the interpolation of two others add up.
+    # The variances of a value and of the interpolation between its two temporal neighbours add up.
     noise = (off.square() / (1 + share.square() + (1 - share).square())).mean(dim=1, keepdim=True)
     found = (values - middle).square().mean(dim=1, keepdim=True)
     return middle + (1 - noise / found.clamp(min=torch.finfo(found.dtype).tiny)).clamp(0, 1) * (values - middle)

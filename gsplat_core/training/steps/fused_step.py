@@ -173,7 +173,7 @@ class FusedStep:
         """Return True if any tensor has another address or size than at the capture."""
         in_use = self._gaussians, self._adam.first_moments["means"], self._field.tensors()
         if all(now is before for now, before in zip(in_use, self._in_use, strict=True)):
-            return False  # the same objects need no comparison of addresses
+            return False  # identical objects, so their addresses need no comparison
         self._in_use = in_use
         moments = (*self._adam.first_moments.values(), *self._adam.second_moments.values())
         before = self._addresses
@@ -242,7 +242,7 @@ class FusedStep:
 
     def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
         """Apply Adam to the positions with the complete gradient."""
-        # NaN if the frame overflowed its tile lists: Adam skips such rows and their moments.
+        # The quotient is NaN if the frame overflowed its tile lists. Adam then skips all rows and their moments.
         complete = gradient[:, :3] / fits
         first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
         adam_step_at_(

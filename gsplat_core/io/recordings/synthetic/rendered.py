@@ -153,7 +153,7 @@ def kept_recording(
     path = folder / f"{_digest(settings)}{SUFFIX}"
     if _is_own(folder) and (found := _read(path, settings)) is not None:
         with contextlib.suppress(OSError):
-            os.utime(path)  # it was used
+            os.utime(path)  # mark the file as recently used
         return found
     recording = render_recording(settings, progress)
     try:

@@ -220,7 +220,7 @@ def cast_tissue(
     u, v = tissue.first_guess(camera.position.astype(np.float32), directions)
     for _ in range(NEWTON_STEPS):
         points = tissue.points(u, v, time_s, tug)
-        # Camera rotation rows minus the ray: Jacobian of the two residuals by displacement.
+        # Jacobian of the two residuals by a displacement of the surface point: rows of the camera's rotation minus the ray.
         residual_x, residual_y, xu, xv, yu, yv = (
             _dot(r[axis], vector) - ray * _dot(r[2], vector)
             for vector_axis in (

@@ -342,10 +342,10 @@ def synthesize(
     threads = threads_that_fit(width_px, height_px)
     target.parent.mkdir(parents=True, exist_ok=True)
     with PartialFolder(target) as partial:
-        # The flow of the last frame points to a frame that is not written.
+        # The scene extends to the time of one more frame, because the flow of the last frame needs it.
         scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving", extras)
         _write_frames(FrameFiles(scene, partial.path, fps, seed, stereo, extras), frames, progress, threads)
-        check_target(target)  # another process may have created files meanwhile
+        check_target(target)  # check again, because another process may have created files
         earlier = partial.finish()
         if earlier is not None:
             shutil.rmtree(earlier)

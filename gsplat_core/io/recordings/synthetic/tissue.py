@@ -65,7 +65,7 @@ def unequal(phase: float, ratio: float) -> float:
 Array = NDArray[np.floating]
 
 HALF_EXTENT_MM = 84.0
-# Linear RGB reflectances.
+# Linear RGB reflectances of tissue, fat and vessels.
 _PINK = np.array([0.62, 0.175, 0.115], np.float32)
 _PALE = np.array([0.76, 0.315, 0.215], np.float32)
 _DEEP = np.array([0.40, 0.072, 0.055], np.float32)
@@ -257,7 +257,7 @@ class Tissue:
         rest = self._at_rest(u, v)
         (x, y, z), (x_u, y_u, z_u), (x_v, y_v, z_v) = rest.position, rest.along_u, rest.along_v
 
-        # Breathing: a long wave that lifts and shears; pulse: a short one that runs across.
+        # Breathing is a long wave that lifts and shears the sheet. The pulse is a short wave that runs across it.
         breath = self.breathing.phase(time_s)
         pulse = 2 * np.pi * time_s / PULSE_PERIOD_S
         direction = (np.cos(self._breath_angle), np.sin(self._breath_angle))
@@ -274,7 +274,7 @@ class Tissue:
                 else:
                     y, y_u, y_v = y + part * cosine, y_u - part * wave_u * sine, y_v - part * wave_v * sine
 
-        # The tug.
+        # Add the tool's pull with its Gaussian falloff around the grasp point.
         inverse = np.float32(1 / TUG_RADIUS_MM**2)
         d_u, d_v = u - np.float32(tug.grasp[0]), v - np.float32(tug.grasp[1])
         weight = np.exp(np.float32(-0.5) * inverse * (d_u * d_u + d_v * d_v))
