@@ -44,7 +44,7 @@ class FoundDepth:
 
 
 class DepthCounts:
-    """Running totals of the depth origins in a stream; the source of `FoundDepth`."""
+    """Running totals of depth origins in a stream, from which `FoundDepth` is computed."""
 
     def __init__(self) -> None:
         self.passed_over = 0
@@ -188,7 +188,8 @@ class BackgroundDepth:
         self.raise_failure()
 
     def offer(self, frame: Frame) -> None:
-        """Queue a frame for depth estimation if it has no depth and the estimator accepts it."""
+        """Put a frame into the queue for depth estimation if it has no depth and the estimator accepts it. Never
+        blocks."""
         if frame.depth is not None or self.finder is None or not self.finder.seeks_in(frame):
             return
         with self._changed:
@@ -197,13 +198,15 @@ class BackgroundDepth:
             self._changed.notify_all()
 
     def take(self) -> tuple[Frame, LateDepth] | None:
-        """Return and clear the newest result: the frame with its depth, and the training data made from it."""
+        """Remove and return the newest estimate: the frame with its depth, and the training data computed from
+        both; None without a new estimate."""
         with self._changed:
             found, self._found = self._found, None
         return found
 
     def _run(self, finder: DepthFinder) -> None:
-        """Estimate depth of pending frames until `stop`, sleeping between frames to keep the time share."""
+        """Main function of the background thread: estimate depth of pending frames until `stop`. Sleep between
+        frames to stay within the CPU time share."""
         step_back()
         if self._share < 1:
             use_one_thread()
@@ -212,7 +215,7 @@ class BackgroundDepth:
         try:
             while (frame := self._next()) is not None:
                 began_s = time.thread_time()
-                # The first frame of the scene may have been dropped.
+                # The frame with `new_scene` may have been dropped from the queue, so the scene number is compared.
                 is_new = frame.scene != scene and frame.new_scene is None
                 scene = frame.scene
                 found = finder.find(frame.with_fields(new_scene="passed over") if is_new else frame)

@@ -19,9 +19,9 @@ from operators.remembered import RememberedTissue
 from operators.sources.source import SourceState
 
 LOOK_NS = 50_000_000
-"""Period of the state check while no picture arrives, in nanoseconds."""
+"""Period in nanoseconds at which the display's state is checked while no picture arrives."""
 REPEAT_NS = 200_000_000
-"""Period after which a picture that is not live is emitted again with its current age, in nanoseconds."""
+"""Period in nanoseconds at which a stale, frozen or lost picture is emitted again with its current age."""
 LEAST_LABELLED_PX = 160
 """Minimum height in pixels of a live picture that is labelled with its state and age; a picture that is not live always is.
 The label has a minimum size to be legible, and would cover much of a smaller picture.
@@ -62,7 +62,7 @@ def picture_state(age_ns: float, interval_ns: float, source: SourceState) -> Pic
 
 @dataclass(frozen=True)
 class LiveDisplayResult:
-    """Statistics of the pictures displayed during a run."""
+    """Statistics of the live display during a run."""
 
     pictures: int
     """Number of new pictures; repetitions are not counted."""

@@ -178,7 +178,7 @@ class FrameClock:
         return not keeps_up or waited_ns > (self.settings.catch_up_intervals or CATCH_UP_INTERVALS) * self.interval_ns
 
     def published(self, taken_ns: int, published_ns: int, steps: int = 0, step_ns: float = 0.0) -> None:
-        """Record a published model, to update the training time.
+        """Record the publication of a model, to update the average training time.
 
         Args:
             taken_ns: time at which training dequeued the frame.

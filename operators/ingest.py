@@ -27,7 +27,7 @@ PATIENCE_S = 1.0
 
 @dataclass(frozen=True)
 class SourceResult:
-    """Summary of the frames that a run read from its source."""
+    """Counts of the frames that a run read from its source, and the source's states."""
 
     description: SourceDescription
     frames: int
@@ -77,7 +77,7 @@ class SourceOp(Operator):
         self.emitted = 0
         self.reached_end = False
         self.damaged = DamagedFrames()
-        """Damaged frames among the emitted ones."""
+        """Counter of damaged frames among the emitted frames."""
         self.withheld: Counter[str] = Counter()
         self._last_seq: int | None = None
         self._states = _TimeInStates()
@@ -173,7 +173,7 @@ class _TimeInStates:
         self._since_s = 0.0
 
     def saw(self, source: FrameSource, frame_came: bool) -> None:
-        """Update the times after a read; `frame_came` is True if the read returned a frame."""
+        """Add the time since the last read to the source's state; `frame_came` is True if the read returned a frame."""
         state = SourceState.LIVE if frame_came else source.state
         if state is self._state is SourceState.LIVE:
             return

@@ -1,4 +1,5 @@
-"""Messages on the edges of the graph other than `Frame`. Each one carries its frame and adds a result."""
+"""Messages on the edges of the graph other than `Frame`. Each message carries its frame and adds the result of an
+operator."""
 
 from __future__ import annotations
 

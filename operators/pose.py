@@ -23,11 +23,12 @@ class EstimatedPoses:
 
     frames: int
     not_placed: int
-    """Frames that kept the previous pose, because they were withheld or had too few matched features."""
+    """Number of frames that got the pose of the previous frame, because they were withheld or had too few matched
+    features."""
     begun: int
     """Number of map initialisations; 1 if tracking was never lost."""
     returned: int
-    """Number of loop closures: recognised earlier key frames, which correct the poses."""
+    """Number of loop closures: recognitions of an earlier key frame, which correct the following poses."""
     explained: float
     """Share of the squared image motion that the poses explain, at most 1."""
     measured: bool

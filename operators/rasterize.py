@@ -165,7 +165,7 @@ class RasterizeOp(Operator):
         self._before, self._drawn = None, 0
 
     def stop(self) -> None:
-        # Both reference a model and GPU memory.
+        # Release the model and the GPU memory that both reference.
         self._rasterizer = self._before = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:

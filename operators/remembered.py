@@ -58,7 +58,7 @@ class RememberedTissue:
                 return None
             self._found = layer, box
             hidden, alpha = (plane[top : top + high, left : left + wide] for plane in (layer, rendered.alpha))
-            # Fast path: the picture is usually opaque there. NaN fails the comparison.
+            # Fast path: the masked area is usually opaque everywhere. NaN fails the comparison.
             if alpha.min() >= COVERED:
                 return layer
             cv2.bitwise_and(hidden, cv2.inRange(alpha, COVERED, np.inf), dst=hidden)

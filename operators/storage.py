@@ -22,7 +22,7 @@ def mebibytes(count: float) -> str:
 
 
 def shown(folder: Path) -> Path:
-    """Return the folder that the user gave, also for its staging folder."""
+    """Return the output folder that the user named. `folder` is that folder, or its staging folder."""
     return folder.parent if folder.name.startswith(STAGING_PREFIX) else folder
 
 

@@ -56,13 +56,13 @@ class FoundMasks:
     method: str
     """Name in `TOOL_MASKS`."""
     found: int
-    """Frames with a detected mask."""
+    """Number of frames whose mask was detected."""
     recorded: int
-    """Frames with a recorded mask, which was kept."""
+    """Number of frames with a recorded mask, which the detector does not replace."""
     tool_share: float
     """Share of tool pixels, 0..1; mean over frames with a detected mask."""
     disbelieved: int = 0
-    """Frames whose all-tool mask was rejected, so that all pixels counted as tissue."""
+    """Number of frames whose all-tool mask was rejected, so that all their pixels count as tissue."""
 
 
 class RecordedToolMaskOp(Operator):
@@ -169,7 +169,7 @@ class FoundToolMaskOp(Operator):
         """Return the detected mask, or an all-tissue mask if no tissue was detected for too many frames."""
         if frame.withheld is not None or not self.doubts:
             return mask
-        # A mask with less tissue marks the whole picture as tool.
+        # A mask with less than this share of tissue counts as an all-tool mask.
         if cv2.countNonZero(mask) >= LEAST_TISSUE * mask.size:
             self._since_tissue = 0
             return mask

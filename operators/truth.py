@@ -44,7 +44,7 @@ class BehindTools:
 
 @dataclass(frozen=True)
 class TruthResult:
-    """Scores against ground truth; a field is None if it was not scored."""
+    """Scores against ground truth. A field is None if the recording lacks its ground truth."""
 
     behind_tools: BehindTools | None
     depth: DepthShare | None

@@ -1,4 +1,4 @@
-"""Errors of the services, one tree per part. Each message states what happened, the value and the remedy.
+"""Exceptions of the services, one class tree per package. Each message states what happened, the value and the remedy.
 
 Errors of HTTP requests, with their status, are in `services.api.problems`.
 """

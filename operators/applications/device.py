@@ -35,7 +35,7 @@ def check_device(device: str) -> None:
 
 
 def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThreadScheduler:
-    """Return the scheduler for an application that processes every frame.
+    """Return the scheduler for an application that processes every frame, such as a replay.
 
     The results do not depend on the scheduler.
 

@@ -73,7 +73,7 @@ class EvaluationSettings:
     motion_prior: str | None = None
     """Motion prior of the causal protocol, a name in `MOTION_PRIORS`; None for the default."""
     places: tuple[Visits, ...] | None = None
-    """Visits to places for the retention protocol; None detects them from the poses."""
+    """Time ranges of visits to the same tissue, for the retention protocol; None to detect them from the poses."""
     poses: Path | None = None
     """File `poses.npy` with the poses that the model was made with, for the geometry protocol; None
     for the recording's.
@@ -121,7 +121,7 @@ class Evaluation:
     geometry: Geometry | None = None
     second_eye: SecondEye | None = None
     returns: Mapping[str, tuple[Return, ...]] = field(default_factory=dict)
-    """Recovery of each place after a return to it, by protocol."""
+    """Score recovery after each return of the endoscope to a place seen before, by protocol."""
     logs: Mapping[str, Path] = field(default_factory=dict)
     """Files with per-frame scores, by protocol."""
 
@@ -206,7 +206,7 @@ def evaluate(
 
 
 class _Work:
-    """State of one evaluation in progress."""
+    """One evaluation in progress: its inputs, its renderers and the results so far."""
 
     def __init__(
         self,
@@ -257,7 +257,8 @@ class _Work:
         )
 
     def _is_wanted(self, name: str) -> bool:
-        """Return True if a protocol is to be measured. Raise InvalidSetting if a requested one cannot be."""
+        """Return True if a protocol is to be measured. Raise InvalidSetting if the user requested it and it cannot
+        be measured."""
         asked = name in self.settings.protocols
         if not asked and (self.settings.protocols or name not in WITHOUT_LEARNING):
             return False
@@ -413,8 +414,8 @@ class _Work:
             require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
 
     def _frames(self, stage: str, from_s: float = -math.inf) -> SeenFrames:
-        """Return the frames within the model's time window; of a looped recording the first round,
-        or all from `from_s` on.
+        """Return the recording's frames within the model's time window: the first round of a looped recording, or all
+        frames from `from_s` seconds on.
         """
         until_s = self.window_s[1]
         if math.isinf(from_s):

@@ -68,7 +68,7 @@ class Playback:
 
 @dataclass(frozen=True)
 class SeenFrames:
-    """Frames of a source within a time range; each iteration reads from the beginning."""
+    """Iterable of a source's frames within a time range. Each iteration reads the source from its beginning."""
 
     source: FrameSource
     from_s: float
@@ -99,7 +99,7 @@ class SeenFrames:
 def frame_tolerance_s(fps: float) -> float:
     """Return the tolerance of a model's time window in seconds, slightly more than one frame interval.
 
-    The frame after the last trained one counts as inside, because the held-out split of some recordings includes the
+    The frame after the last trained frame counts as inside, because the held-out split of some recordings includes the
     last frame.
     """
     return 1.01 / fps

@@ -76,7 +76,7 @@ class LiveParts:
 
 
 def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
-    """Create the components for a source. Their first use is slow (see `warm_up`)."""
+    """Create reconstructor and rasterizer of a live session. Their first use is slow (see `warm_up`)."""
     return LiveParts(new_live_reconstructor(settings, source), Rasterizer(settings.renderer))
 
 

@@ -75,7 +75,7 @@ class LiveSettings(LiveOptions):
     Disable for endless runs, because the log grows.
     """
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
-    """Display deadlines and step limits; `budget_ms` has precedence over its own."""
+    """Display deadlines and step limits. The option `budget_ms` overrides `clock.budget_ms`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -61,7 +61,7 @@ class FittedModel:
 
 
 class _StopFitting(Exception):
-    """Raised between two steps to leave `fit` after a stop request."""
+    """Raised by the progress callback of `Reconstructor.fit` to end training after a stop request."""
 
 
 def reconstruct(

@@ -53,7 +53,7 @@ AZIMUTH_DEG, ELEVATION_DEG = 25.0, 15.0
 EYES_APART = 0.06
 """Default stereo baseline divided by the scene's distance: 4.4 mm at 74 mm."""
 COVERED = 0.5
-"""Minimum opacity of a pixel whose depth is used."""
+"""Minimum opacity of a pixel that counts for `typical_depth`."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def render_model(
 ) -> int:
     """Render the model to a video file or a folder of PNG images.
 
-    All views but the recorded one hatch unobserved areas. An existing video is replaced only with `overwrite`, an
+    All views except `recorded` hatch unobserved areas. An existing video is replaced only with `overwrite`, an
     existing folder only if an earlier run made it. Either stays unchanged until the new one is complete.
 
     Args:
@@ -279,7 +279,7 @@ def _images(
 
 
 def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
-    """Write the video atomically. After an error the partial video is kept only if no earlier one exists."""
+    """Write the video atomically. After an error the partial video is kept only if no earlier video exists at `out`."""
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
     with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
@@ -300,7 +300,8 @@ def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int],
 
 
 def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) -> int:
-    """Write numbered PNG files. After an error the images so far are kept only if the folder was empty."""
+    """Write numbered PNG files. After an error the images written so far are kept only if the folder was empty
+    before."""
     written = 0
     with OutputFolder(out, "render", inputs) as output:
         reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)

@@ -207,8 +207,7 @@ def replay(
             inside.stated(online=True),
             command="replay",
             engine=inside.engine,
-            # A session drops frames, so the displayed frames are not simply the first ones of the
-            # recording.
+            # A session may drop frames, so the baselines would read other frames than those displayed.
             finish=[saves_model(inside.out), *([] if followed else [measures_baselines(source)])],
             notes=notes,
             stop_requested=stop_requested,
@@ -281,7 +280,8 @@ class FollowedSession:
     device: str
 
     def new_reconstructor(self) -> Reconstructor:
-        """Create a reconstructor with the session's settings, warmed up identically."""
+        """Create a reconstructor with the session's settings and the session's warm-up, so that its results are
+        identical."""
         with seeded(self.made.seed, self.device):
             reconstructor = Reconstructor(
                 self.config,

@@ -33,7 +33,7 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings stated in the report. With the source they determine the result of a deterministic run."""
+    """Settings that the report states. Together with the source they determine the result of a deterministic run."""
 
     device: str
     engine: str
@@ -61,9 +61,9 @@ class RunOutcome:
     """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the error message."""
     interrupted: bool
     dropped: int
-    """Number of messages dropped by the edges of the graph."""
+    """Total number of messages dropped by full queues between operators."""
     dropped_by_edge: dict[str, int]
-    """Dropped messages by edge, for edges that dropped any."""
+    """Number of dropped messages by graph edge; edges without drops are left out."""
     latency: dict[str, DurationSummary]
     """Latency by path through the graph."""
     latency_quantiles_ms: dict[str, list[float]]
@@ -94,7 +94,7 @@ class Start:
 
     at: datetime
     s: float
-    """Seconds by `perf_counter`."""
+    """Start time in seconds, by `time.perf_counter`."""
 
     @staticmethod
     def now() -> Start:
@@ -303,7 +303,7 @@ class HasFolders(Protocol):
 
     @property
     def inputs(self) -> Sequence[Path]:
-        """Paths that the run reads."""
+        """Return the files and folders that the run reads."""
 
 
 Settings = TypeVar("Settings", bound=HasFolders)

@@ -95,10 +95,10 @@ MIN_SIDE_PX = 64
 FIRST_PIXELS = 320 * 256
 """Number of pixels of the first measurement, for larger streams."""
 SHARE_OF_INTERVAL = 0.9
-"""Largest share of the frame interval that a frame may take."""
+"""Largest share of the frame interval that the latency of a frame may take."""
 MOST_MEASUREMENTS = 4
 STARTING_FRAMES, TIMED_FRAMES = 3, 9
-"""Frames per measurement: first those that initialise the model, which are not counted, then those timed."""
+"""Number of frames per measurement: frames that initialise the model and are not timed, then timed frames."""
 GIVEN_UP_S = 2.0
 """Timeout of a frame in seconds. It ends the measurement and counts as the frame's latency."""
 
@@ -180,7 +180,8 @@ def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
 
 
 class PacedTissue(ThreadedSource):
-    """Source of synthetic pictures, each emitted after the display of the previous one. Measures their latency."""
+    """Source of synthetic pictures that emits a picture after the previous picture was displayed, and measures the
+    latency."""
 
     def __init__(self, like: SourceDescription) -> None:
         super().__init__(ahead=1)

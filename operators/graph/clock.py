@@ -39,7 +39,7 @@ class RealtimeClock:
 
 
 class ManualClock:
-    """Simulated time, which advances only when no operator can compute, to the time of the next one due.
+    """Simulated time. It advances only while no operator can compute, to the due time of the next operator.
 
     A replay therefore takes only as long as its operators compute, and its result is deterministic.
     """

@@ -27,7 +27,8 @@ class FaultAction(Enum):
 
 @dataclass(frozen=True)
 class FaultPolicy:
-    """Reaction of an operator to its own exceptions. Messages in work at that time are lost and counted as a fault."""
+    """Reaction of the graph to an operator's exceptions. Messages that the operator was processing are lost and
+    counted as a fault."""
 
     action: FaultAction = FaultAction.STOP_GRAPH
     restarts: int = 0
@@ -105,7 +106,8 @@ def merge_metadata(into: dict[str, Any], received: dict[str, Any], policy: Metad
 
 
 def _same_scalar(one: Any, other: Any) -> bool:
-    """Compare plain values. Arrays compare by identity, which the caller has already checked."""
+    """Return True if both are equal scalars or strings. False for arrays, whose identity the caller has already
+    compared."""
     plain = (str, bytes, int, float, bool, tuple)
     return isinstance(one, plain) and isinstance(other, plain) and one == other
 

@@ -127,7 +127,8 @@ class CarriedEdge(LockedEdge):
     """Edge whose messages another engine transports, from `sender.emit` to `receiver.receive`.
 
     The queue mirrors the engine's queue, counts and applies the policy. When `drop_oldest` replaces a message, nothing
-    is sent: the message in flight represents the then oldest one. The engine's queue therefore never overflows.
+    is sent, and the engine's message in flight stands for the message that has become the oldest. The engine's queue
+    therefore never overflows.
     """
 
     port = ""

@@ -90,7 +90,7 @@ class KeyframesOp(Operator):
 
 
 def _without_inputs(scored: ScoredFrame) -> ScoredFrame:
-    """Return the frame without raw planes that the report does not show, which are half of its memory."""
+    """Return the scored frame without `right_image` and `depth` of the raw frame, which the report does not show."""
     frame = scored.rendered.frame.with_fields(right_image=None, depth=None)
     return replace(scored, rendered=replace(scored.rendered, frame=frame))
 

@@ -40,7 +40,7 @@ from operators.storage import StorageReserve, mebibytes, storage_errors
 
 @dataclass(frozen=True)
 class Recorded:
-    """State of a session recording."""
+    """Counts and state of a session recording."""
 
     folder: Path
     frames: int = 0
@@ -54,7 +54,7 @@ class Recorded:
     deleted_segments: int = 0
     """Number of older segments deleted to stay within the size and duration limits."""
     deleted_sessions: int = 0
-    """Number of earlier sessions deleted for the same reason."""
+    """Number of recordings of earlier sessions deleted to stay within the limits."""
     ended: str | None = None
     """Reason for an early end of the recording; None if there was none."""
 
@@ -194,7 +194,7 @@ class SessionRecorder:
             arrived = self._arrived.get(frame.seq)
             while self._arrived and next(iter(self._arrived)) <= frame.seq:
                 self._arrived.popitem(last=False)
-            # Without `arrived` the item is counted as lost and never written.
+            # A prepared frame without its queued input frame (`arrived`) cannot be written and is counted as lost.
             part = _Part(
                 lambda writer: writer.prepared(frame, arrived or frame), "prepared", frame.seq, _bytes(frame, arrived)
             )

@@ -124,7 +124,7 @@ class SplitSource(DerivedSource):
         )
 
     def _half(self, width_px: int, height_px: int) -> tuple[int, int]:
-        # A picture of one pixel cannot be halved and serves both eyes.
+        # A side of one pixel cannot be halved; both eyes then get the whole picture.
         if self._layout == "side_by_side":
             return max(1, width_px // 2), height_px
         return width_px, max(1, height_px // 2)
@@ -254,7 +254,7 @@ class JoinedSource(LiveSource):
             self.count("right_of_another_size")
             return frame
         if frame.damage is None and best.damage is not None:
-            # A damaged eye invalidates what is derived from both.
+            # Stereo depth from one damaged picture is invalid, so the whole frame counts as damaged.
             return replace(frame, right_image=best.image, damage=f"right eye: {best.damage}", status=best.status)
         return replace(frame, right_image=best.image)
 

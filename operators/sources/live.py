@@ -31,7 +31,7 @@ MOST_S = 2.0
 
 
 class Backoff:
-    """Counts consecutive failures and computes the delay before the next attempt."""
+    """Back-off of connection attempts: counts consecutive failures and computes the delay before the next attempt."""
 
     def __init__(self, first_s: float = FIRST_S, most_s: float = MOST_S) -> None:
         self._first_s, self._most_s = first_s, most_s
@@ -218,7 +218,8 @@ class LiveSource(ThreadedSource):
                 self._counts[reason] += times
 
     def lost(self, sentence: str) -> None:
-        """Report a lost connection. The state holds until the next frame, which continues numbers and timestamps."""
+        """Set the state `RECONNECTING` with a message until the next frame. That frame continues numbers and
+        timestamps."""
         with self._changed:
             if self._my_stop().is_set():
                 return

@@ -101,7 +101,7 @@ class RealtimeSource(LiveSource):
             pts_ns = end_ns
 
     def _rounds(self) -> Iterator[Iterator[Frame]]:
-        """Yield the rounds; from the second one on from memory if the frames fit."""
+        """Yield an iterator of frames per round. From the second round on the frames come from memory, if they fit."""
         if not self.options.loop:
             yield iter(self.recording)
             return
@@ -119,7 +119,8 @@ class RealtimeSource(LiveSource):
             yield iter(remembered or self.recording)
 
     def _backwards(self, forwards: list[Frame]) -> list[Frame]:
-        """Return the frames between the last and the first in reverse, with increasing timestamps."""
+        """Return a backward round: the frames between the first and the last in reverse order, with increasing
+        timestamps."""
         last_ns = forwards[-1].pts_ns
         return [replace(frame, pts_ns=last_ns - frame.pts_ns) for frame in reversed(forwards[1:-1])]
 

@@ -43,7 +43,7 @@ _BLOCKING = frozenset({*_URLS, "v4l2"})
 """Schemes of sources that block in a library or driver and are therefore read in a separate process."""
 
 _ON_DISK = frozenset({"recording", "realtime"})
-"""Schemes of files, which do not return once they are missing."""
+"""Schemes of files. Unlike a camera, a missing file does not become available again."""
 _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
 """Opening timeouts of slow sources in seconds; `synthetic` renders before it plays."""

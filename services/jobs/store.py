@@ -342,7 +342,8 @@ class Claims:
 
         Args:
             job_id: the job.
-            counts: count the attempt. An attempt that was stopped with its pool does not count.
+            counts: True if the attempt counts towards `most_attempts`. An attempt that was stopped with its pool does
+                not.
         """
         values = {"state": str(JobState.QUEUED), "owner": None, "lease_until_ms": None, "frames_done": 0}
         return self._write(job_id, values if counts else {**values, "attempts": JOBS.c.attempts - 1})

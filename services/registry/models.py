@@ -108,7 +108,7 @@ class ModelRegistry:
             file: path of the upload; the file stays in place.
             digest: SHA-256 stated by the sender, in hex, or None.
             by: the caller, for the record.
-            version: required version number; None takes the next one.
+            version: required version number; None takes the next number.
 
         Raises:
             Rejected: if name, size, digest or format is invalid.
@@ -165,7 +165,7 @@ class ModelRegistry:
 
         Raises:
             NotFound: if the version does not exist.
-            Conflict: if another version is active or this one is not ready.
+            Conflict: if another version than `expected_current` is active, or `version` is not ready.
             BlobDamaged: if its file is missing or altered.
         """
         check_by(by)

@@ -47,9 +47,10 @@ class BaselineFacts(Part):
     psnr_frame_db: Decibels
     frames: Count
     age_frames: int | None = None
-    """Age of copies in frames."""
+    """For the frame-hold baselines: age in frames of the raw frame that is displayed again; null for other
+    baselines."""
     psnr_both_db: Decibels = None
-    """Score of copies over pixels that are tissue in both frames."""
+    """For the frame-hold baselines: PSNR in dB over pixels that are tissue in both the old and the current frame."""
     sees_future: bool = False
     """True if the baseline uses the next frame, which a live system does not have."""
 

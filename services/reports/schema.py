@@ -141,9 +141,10 @@ class TruthFacts(Part):
     """Scores of content hidden from the camera, against the ground truth of a synthetic recording."""
 
     behind_tools_psnr_db: float | None
-    """Score over pixels behind a tool whose place was seen earlier, against the picture without the tool."""
+    """PSNR over pixels that are behind a tool and were visible in an earlier frame, against the true picture
+    without the tool."""
     last_seen_psnr_db: float | None
-    """Trivial baseline: each of these pixels as last seen."""
+    """Trivial baseline: each of these pixels with its last visible value."""
     inpainted_psnr_db: float | None
     """Trivial baseline: the frame's own picture, inpainted from the tool's surroundings."""
     frames: Count
@@ -181,13 +182,13 @@ class LiveFacts(Part):
     settled_psnr_tissue_db: float | None
     """Training error: mean after the first second, of the displayed picture when the next frame arrived."""
     worst_psnr_tissue_db: float | None
-    """Lowest of these values."""
+    """Lowest score of a frame after the first second, in dB."""
     previous_frame_db: float | None
     """Baseline: mean after the first second of the previous raw frame."""
     pictures: Count
     """Number of new pictures displayed."""
     age_p50_ms: float
-    """Time from a frame's arrival to its picture."""
+    """Median age of new pictures at display, in milliseconds."""
     age_p95_ms: float
     age_p99_ms: float
     age_max_ms: float
@@ -195,7 +196,7 @@ class LiveFacts(Part):
     states: dict[str, Count]
     """Number of transitions into each display state."""
     dropped: dict[str, Count]
-    """Frames, pictures and figures replaced by newer ones, by edge of the graph or operator."""
+    """Number of frames, pictures and scores dropped in favour of newer ones, by graph edge or operator."""
     withheld: dict[str, Count]
     """Frames displayed without training, by reason."""
     scenes: dict[str, Count]
@@ -224,7 +225,7 @@ class FrameEntry(Part):
     psnr_frame_db: float | None
     ssim: float | None
     previous_frame_db: float | None
-    """Baseline: previous raw frame."""
+    """Trivial baseline: tissue PSNR in dB of the previous raw frame."""
     next_frame_db: float | None = None
     """Score of the model's prediction of this frame before training on it; null without a prediction."""
     age_ms: float | None = None
@@ -240,7 +241,7 @@ class BinEntry(FrameEntry):
     frames: Count
     """Number of summarised frames."""
     psnr_tissue_min_db: float | None
-    """Lowest of their values."""
+    """Lowest `psnr_tissue_db` of the summarised frames."""
 
 
 class RunReport(Part):

@@ -213,7 +213,7 @@ LOOK_S = 0.05
 
 
 def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
-    """Return settings for an endless live session; no output that grows with time is written.
+    """Return the settings of a live session without end, with every output disabled that grows with time.
 
     Args:
         spec: engine part of the stream specification.

@@ -140,7 +140,7 @@ class Start(Protocol):
 
 
 class Direct:
-    """Start in a new interpreter and a new session, so the process outlives this one."""
+    """Starts a process in a new interpreter and a new session, so that it survives the end of the supervisor."""
 
     async def start(
         self,
@@ -172,7 +172,7 @@ class Direct:
 
 
 class ByLauncher:
-    """Start through the launcher, which this class starts and restarts if it dies.
+    """Starts processes by forks of the launcher, which this class starts, and restarts if it dies.
 
     While the launcher is loading, engines wait for it and quickly loading modules are started
     directly. Streams of a runtime folder share one instance.
@@ -330,12 +330,12 @@ LOADED = (
     "operators.sources.synthetic",
     "operators.sources.zeromq",
 )
-"""Source modules that capture processes are likely to import."""
+"""Modules of frame sources that the launcher imports in advance, because capture processes are likely to use them."""
 LAUNCHER_LOOK_S = 0.2
 REQUEST_S = 1.0
 """Timeout in seconds for reading a request and sending its answer."""
 MOST_REMEMBERED = 256
-"""Exit statuses kept for processes whose status was not queried yet."""
+"""Maximum number of exit statuses that the launcher keeps until they are queried."""
 
 
 class Launcher:

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 SOURCE_STATES = ("starting", "opening", "live", "stalled", "reconnecting", "lost", "ended", "failed", "down", "stopped")
 LOST_BY_SOURCES = ("too_late", "bad_messages")
-"""Source counters that mean lost frames. The other counters are repaired or bridged defects."""
+"""Counters of a source that count lost frames. Its other counters count defects that the source has repaired."""
 
 
 class GraphFamilies:
-    """Metric families of one collection; `add` adds a stream's values."""
+    """Prometheus metric families of one scrape, filled by `add` stream by stream."""
 
     def __init__(self) -> None:
         of_stream = ["stream"]
@@ -113,7 +113,7 @@ class GraphFamilies:
 
 
 def _items(value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the items of a heartbeat object; nothing if the value is no mapping."""
+    """Yield the items of a mapping in a heartbeat; nothing if a malformed heartbeat has another type."""
     if isinstance(value, Mapping):
         yield from value.items()
 

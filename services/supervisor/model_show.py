@@ -1,4 +1,5 @@
-"""Display of finished models in place of the live reconstruction, by the commands `prepare_model`, `show_model` and `show_live`."""
+"""Display of finished models in place of the live reconstruction, by the commands `show_model`, `show_live` and
+`show_previous`."""
 
 from __future__ import annotations
 
@@ -58,7 +59,7 @@ class FinishedModel:
             raise CommandRefused(str(error)) from None
 
     def at(self, stream_s: float) -> float:
-        """Map a stream time to the model's time window, looping.
+        """Map a stream time to a time in the model's time window, which repeats after its end.
 
         Args:
             stream_s: time of the stream in seconds.
@@ -101,7 +102,8 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 REPEAT_NS = 200_000_000
 LATE_IN_A_ROW = 5
-"""Consecutive late pictures that count as a missed time limit. A single one may be caused by the machine."""
+"""Consecutive late pictures that count as a missed time limit. A single late picture may be caused by other load on
+the machine."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +120,11 @@ class Showing:
 
 
 class ModelShow:
-    """Display of one finished model at the time of each arriving frame. Keeps the previous model for rollback.
+    """Display thread for finished models. For each arriving frame it renders the selected model at the frame's time.
 
-    Models are swapped between two pictures. A model with non-finite pictures, or with repeatedly more than `most_ms`
-    per picture, is replaced by the previous model or the live reconstruction. The selection is stored in a file, so the
-    next engine process restores it.
+    A new selection takes effect between two pictures, and the previous model is kept for a rollback. A model with
+    non-finite pictures, or with repeatedly more than `most_ms` per picture, is replaced by the previous model or the
+    live reconstruction. The selection is stored in a file, so the next engine process restores it.
     """
 
     def __init__(self, worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers | None = None) -> None:
@@ -295,7 +297,7 @@ class ModelShow:
             taken_back = {"name": showing.model.name, "version": showing.model.version, "reason": why}
             self._gave_way = [*self._gave_way[-7:], taken_back]
             if self._current is not showing:
-                return True  # another model was selected meanwhile
+                return True  # a command has selected another model since the failed picture
             before, self._previous = self._previous, None
             if before is not None:
                 self._put(before)

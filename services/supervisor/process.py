@@ -45,7 +45,7 @@ class Restarts:
         """Set the delays, all in seconds.
 
         Args:
-            first_s: delay before the second restart in a row; doubles with each further one.
+            first_s: delay before the second restart in a row; doubles with each further restart.
             most_s: cap for processes that never worked.
             settled_s: time in a good state after which the next end counts as the first in a row.
             most_worked_s: cap for processes that worked.
@@ -272,8 +272,8 @@ class ManagedProcess:
             await asyncio.sleep(wait_s)
 
     async def _running(self) -> ProcessIdentity | None:
-        """Return the process for this role: the running one if its settings match, otherwise a new
-        one. None if the start failed."""
+        """Return the process for this role: adopt the running process if its settings match, otherwise start a new
+        process. None if the start failed."""
         record = self._folder.record(self._role)
         digest = self._spec.digest
         if record is not None and record.spec_digest != digest:

@@ -43,8 +43,8 @@ from services.errors import BadMessage
 
 Shows = Literal["live", "model"]
 SCORES = ("psnr_db", "previous_frame_db", "next_frame_db")
-"""Score names. Tissue PSNR of the last scored frame: of the displayed picture (a training error),
-of the previous raw frame as a baseline, and of the newest predicted frame before training on it."""
+"""Names of the scores in picture headers, tissue PSNR in dB: of the displayed picture (training error), of the
+previous raw frame (trivial baseline), and of the newest prediction before training on its frame."""
 
 
 class Screen:
@@ -60,11 +60,11 @@ class Screen:
         self._wanted: Shows = "live"
         self._shown: Shows = "live"
         self.pictures = 0
-        """Number of new pictures."""
+        """Number of published new pictures, without repetitions."""
         self.published = 0
         """Number of publications, including repeats of a picture with another state or age."""
         self.ages = Durations()
-        """Ages of new pictures at publication."""
+        """Histogram of the age of new pictures at publication."""
         self._last: dict[str, Any] = {}
         self._scores: dict[str, float | None] = dict.fromkeys(SCORES)
 

@@ -64,7 +64,7 @@ class Stream:
         self.hub: DisplayHub | None = None
         """Pictures for viewers; None while the stream is stopped."""
         self.changing = asyncio.Lock()
-        """Serialises start, stop and changes of the stream."""
+        """Held during start, stop and configuration changes, so that they do not overlap."""
 
     @property
     def engine(self) -> ManagedProcess:
@@ -156,7 +156,8 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
 
 
 def _withheld(engine: ProcessState) -> str | None:
-    """Explain why a running engine has shown no picture although frames arrived; None if no frame was withheld."""
+    """Return the reason why a running engine has displayed no picture: frames arrived and all were withheld; None
+    otherwise."""
     frames, withheld = engine.figures.get("frames"), engine.figures.get("withheld")
     if not frames or not isinstance(withheld, Mapping) or not withheld:
         return None

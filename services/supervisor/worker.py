@@ -36,7 +36,7 @@ NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 @dataclass(frozen=True, kw_only=True)
 class SourceSpec(CallerCaptureOptions):
-    """Source of a stream and the processing in the capture process."""
+    """Settings of a stream's capture process: the source and the size of its frames."""
 
     address: Annotated[str, Option("Source address in the format of `intrasplat live`", commands=(), least_length=1)]
 
@@ -61,16 +61,16 @@ class ProcessLimits(_Strict):
     """Time limits of stream processes, in seconds."""
 
     orphan_after_s: float = Field(default=0.0, ge=0)
-    """Time for which a process continues after its supervisor has died, so that the next one adopts it."""
+    """Time for which a process continues after its supervisor has died, so that the next supervisor can adopt it."""
     drain_s: float = Field(default=10.0, gt=0)
-    """Time from a stop request to the kill."""
+    """Time from a stop request until a process that still runs is killed."""
     start_s: float = Field(default=120.0, gt=0)
-    """Time from the process start to the first heartbeat."""
+    """Time allowed from the start of a process to its first heartbeat."""
     heartbeat_s: float = Field(default=3.0, gt=0)
     """Time without heartbeats after which a process counts as hung."""
     hung_s: float = Field(default=10.0, gt=0)
-    """Time without publications after which an engine counts as hung, once it has shown a picture.
-    A working engine at least repeats its last picture."""
+    """Time without a published picture after which an engine counts as hung, once it has published its first
+    picture. A working engine at least repeats its last picture."""
 
 
 class ProcessSpec(_Strict):
@@ -99,7 +99,7 @@ class ProcessSpec(_Strict):
 
     @property
     def digest(self) -> str:
-        """Return a digest that changes if the process has to be restarted."""
+        """Return a digest of the settings. A running process with another digest has to be restarted."""
         return hashlib.sha256(repr(self._content()).encode()).hexdigest()
 
     def _content(self) -> dict[str, Any]:
