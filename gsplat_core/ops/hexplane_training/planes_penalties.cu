@@ -133,7 +133,7 @@ __global__ void __launch_bounds__(kThreads)
   const float bend = rows > 2 ? 2.0f * smoothness / (float(rows - 2) * float(size)) : 0.0f;
   const float away = sparsity / (float(rows) * float(size));
   const auto old = [&](int v) { return Channels<kLane>::load(plane.values + (v < rows ? v : rows - 1) * size + column); };
-  // ^bends[i]: second difference at rows v - 2 + i; 0 where it would extend beyond the plane
+  // bends[i]: second difference at rows v - 2 + i; 0 where it would extend beyond the plane
   Channels<kLane> bends[3] = {Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f)};
   Channels<kLane> window[3] = {old(0), old(1), old(2)};  // old values of rows v, v + 1, v + 2
 #pragma unroll 2
