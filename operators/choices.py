@@ -41,7 +41,7 @@ A factory takes the fragment, the operator's name and `SinkOptions`. The input o
 """
 
 Device = Literal["cpu", "cuda"]
-"""Processors that train and render."""
+"""Devices for training and rendering."""
 Poses = Literal["given", "estimated"]
 """Camera poses: recorded with the frames, or estimated from the pictures."""
 Policy = Literal["withhold", "off"]

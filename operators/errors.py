@@ -95,7 +95,7 @@ class GraphBusy(GraphError):
 
 
 class EngineError(OperatorsError, UserError):
-    """An engine cannot run the graph."""
+    """Base class: the selected graph engine (embedded or Holoscan) cannot run the graph."""
 
 
 class EngineMissing(EngineError):

@@ -131,7 +131,7 @@ class Prediction:
 
 
 class PictureState(Enum):
-    """Freshness of a displayed picture."""
+    """State of a displayed picture, by the age of its content and the state of the source."""
 
     LIVE = "live"
     """The picture shows a frame that has just arrived."""

@@ -27,7 +27,7 @@ from operators.outcome import OutcomeBuilder
 
 @dataclass(frozen=True)
 class ScoredFrame:
-    """A displayed frame and its quality."""
+    """A displayed frame with its rendered picture and its scores."""
 
     rendered: RenderedFrame
     quality: FrameQuality
@@ -73,7 +73,7 @@ class NextFrameResult:
     previous_frame_db: float | None
     """Mean tissue PSNR in dB of the previous raw frame over the same frames (trivial baseline)."""
     frames: int
-    """Number of frames with both values."""
+    """Number of frames that have both a prediction score and a baseline score."""
 
 
 class NextFrameScores:
@@ -157,7 +157,7 @@ class OnScreenResult:
     baseline).
     """
     frames: int
-    """Number of scored frames."""
+    """Number of frames scored against a displayed picture."""
     not_on_screen: int
     """Number of frames scored against an older picture, because their own was not on display when the next frame
     arrived."""
@@ -329,7 +329,7 @@ class MetricsOp(Operator):
         self.trained, self.held_out = QualityTracker(), QualityTracker()
         """Scores of frames trained on before display, and of frames never trained on."""
         self.frames = 0
-        """Number of frames so far."""
+        """Number of displayed frames so far, scored or not."""
         self.next_frame = NextFrameScores()
         self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
         self.worst: tuple[float, int] | None = None

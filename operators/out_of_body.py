@@ -43,9 +43,9 @@ class OutOfBodyFrames:
 
     policy: Policy
     passed: int
-    """Frames passed unchanged."""
+    """Number of frames that the gate passed unchanged."""
     withheld: Mapping[str, int] = field(default_factory=dict)
-    """Frames whose picture was replaced, by reason."""
+    """Number of frames whose picture the gate replaced by black, by reason."""
 
 
 class OutOfBodyGateOp(Operator):

@@ -136,7 +136,7 @@ class Pace:
     """Predict one in this many frames before training on it; 0 for a finished model."""
 
     def scheduler(self, device: str, graph: Application) -> GreedyScheduler | MultiThreadScheduler:
-        """Return the scheduler of the graph."""
+        """Return the scheduler: one thread per operator for a live stream, otherwise that of `scheduler_for`."""
         return scheduler_for(device, graph) if self.clock is None else MultiThreadScheduler(graph)
 
     def queue(self, capacity: int) -> dict[str, Any]:
@@ -159,11 +159,11 @@ class Outputs:
     """Consumers of a run's pictures and scores."""
 
     sinks: Sequence[str] = ()
-    """Names in `SINKS`."""
+    """Names of the sinks that write the run's output, as in `SINKS`."""
     report: bool = True
     """Collect data for a report: per-frame log, SSIM and a digest of the pictures."""
     on_scored: Callable[[ScoredFrame], None] | None = None
-    """Called with each score."""
+    """Called with each scored frame; None for no call."""
     behind: TissueBehindTools | None = None
     """Ground truth of the tissue behind the tools; replays only."""
     on_shown: Callable[[ShownPicture], None] | None = None
@@ -173,7 +173,7 @@ class Outputs:
 
 
 class Pipeline(Application):
-    """Graph of a run."""
+    """Application that composes the operators of a replay or a live run, from the source to the sinks."""
 
     def __init__(
         self,

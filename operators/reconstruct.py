@@ -71,7 +71,7 @@ class ModelRequest:
 
 @dataclass(frozen=True)
 class ModelResult:
-    """Final model of a run."""
+    """Outcome part with the final model of a run."""
 
     model: Model
     """Newest version, as an independent copy."""

@@ -54,7 +54,7 @@ class SideBySideOp(Operator):
 
     @property
     def parts(self) -> tuple[Operator, ...]:
-        """Operators of all chains."""
+        """Return the operators of all chains."""
         return (*self.gate, *self.first, *chain.from_iterable(self.beside), *self.then)
 
     def setup(self, spec: OperatorSpec) -> None:

@@ -54,7 +54,7 @@ class FoundMasks:
     """Statistics of a tool detector."""
 
     method: str
-    """Name in `TOOL_MASKS`."""
+    """Name of the detector in `TOOL_MASKS`."""
     found: int
     """Number of frames whose mask was detected."""
     recorded: int

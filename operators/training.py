@@ -58,7 +58,7 @@ class TrainingCounts:
     withheld: dict[str, int] = field(default_factory=dict)
     """Number of frames excluded from training (withheld or damaged), by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
-    """Number of scene restarts, by reason."""
+    """Number of times that the model was restarted for a new scene, by reason."""
     places_found: int = 0
     """Number of new scenes recognised as a place that the stream had shown before."""
 

@@ -20,7 +20,7 @@ from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
 
 SCORED_EVERY = 4
-"""One in this many frames is scored."""
+"""One in this many frames is scored against the ground truth."""
 MOST_SCORED = 64
 """Maximum number of scored frames; longer recordings are sampled evenly."""
 FEWEST_PIXELS = 64
@@ -39,7 +39,7 @@ class BehindTools:
     inpainted_db: float
     """Trivial baseline in dB: the frame's own picture inpainted from around the tool (Telea 2004)."""
     frames: int
-    """Number of scored frames."""
+    """Number of frames scored behind their tools."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class MissingFile:
     """Row of the database whose file is missing."""
 
     kind: str
-    """`model`, `recording` or `replay`."""
+    """Kind of the row: `model`, `recording` or `replay`."""
     name: str
     """Name and version of a model, name of a recording, id of a replay."""
     path: Path

@@ -23,7 +23,7 @@ DISTANCE = 100.0
 """Distance from the camera to the scene's centre in viewer units. viser stores sizes in half
 precision, which is most accurate at this scale."""
 STEPS = 200
-"""Positions of the slider."""
+"""Number of positions of the time slider."""
 LOOK_S = 0.05
 
 

@@ -69,7 +69,7 @@ class LiveSettings(LiveOptions):
     record: Path | None = None
     """New folder for a recording of the session; None: no recording."""
     recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
-    """Options of the session recording."""
+    """Format and limits of the session recording that `record` requests."""
     report: bool = True
     """Collect data for the report: per-frame scores, key frames, SSIM and a digest of the pictures.
     Disable for endless runs, because the log grows.
@@ -102,12 +102,12 @@ class LiveSettings(LiveOptions):
 
     @property
     def chosen_training(self) -> LiveTraining:
-        """Training parameters of the device."""
+        """Defaults of the training parameters for the selected device."""
         return LIVE_TRAINING[self.device]
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """Paths that the run reads."""
+        """Files and folders that the run reads, which its output must not replace."""
         path = Path(self.source)
         return (*((path,) if path.exists() else ()), *depth_inputs(self.depth))
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of one stage of a run."""
+    """Report of a running application: how far its current stage is, with the newest frame's scores."""
 
     stage: str
-    """Name of the stage, one word."""
+    """Name of the current stage as one word, such as "train"."""
     done: int
     total: int
     unit: str = "frames"

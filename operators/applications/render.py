@@ -75,7 +75,7 @@ class ViewWish:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """Files that the view is read from."""
+        """Return the camera path file of the view; empty for the built-in views."""
         return () if self.name in VIEWS else (Path(self.name),)
 
 
@@ -93,7 +93,7 @@ class View:
     is_virtual: bool
     """True if no camera recorded this view, so that unobserved areas are marked."""
     across: int = 1
-    """Number of pictures side by side."""
+    """Number of pictures side by side in a video frame: 2 for `stereo`, otherwise 1."""
 
 
 def view_of(model: Model, camera: Camera, wish: ViewWish) -> View:

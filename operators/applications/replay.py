@@ -69,7 +69,7 @@ class ReplaySettings(ReplayOptions):
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """Paths that the run reads."""
+        """Return the files and folders that the run reads, which its output must not replace."""
         return (Path(self.recording), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:

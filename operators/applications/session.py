@@ -65,7 +65,7 @@ class RunOutcome:
     dropped_by_edge: dict[str, int]
     """Number of dropped messages by graph edge; edges without drops are left out."""
     latency: dict[str, DurationSummary]
-    """Latency by path through the graph."""
+    """Latency by path of operators through the graph, such as `source,depth,display`."""
     latency_quantiles_ms: dict[str, list[float]]
     operators: dict[str, DurationSummary]
     parts: Mapping[type, object]
@@ -138,7 +138,7 @@ class Session:
         self.finish, self.stop_requested = tuple(finish), stop_requested
         self.notes = list(notes)
         self.reached = OutcomeBuilder()
-        """Outcome collected so far."""
+        """Parts, outputs and notes that operators and finish steps have contributed so far."""
         self.failure: Exception | None = None
         """First error of the run; None if there was none."""
         self.wall_s = 0.0

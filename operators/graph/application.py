@@ -186,7 +186,7 @@ class Fragment:
 
 
 class Application(Fragment):
-    """A graph that can be run on its own."""
+    """Complete operator graph, the base class of runnable graphs."""
 
 
 def run(app: Fragment, engine: Engine = "embedded") -> RunResult:

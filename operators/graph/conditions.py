@@ -16,13 +16,13 @@ class SchedulingStatus(IntEnum):
 
     READY = 0
     WAIT_TIME = 1
-    """Ready at a known time."""
+    """The operator becomes ready at a known time."""
     WAIT = 2
-    """Ready after another operator has changed an edge."""
+    """The operator becomes ready when another operator puts a message into one of its edges or takes one."""
     WAIT_EVENT = 3
-    """Ready after an event outside of the graph; keeps the graph alive."""
+    """The operator becomes ready after an event outside of the graph. The graph waits for it and does not end."""
     NEVER = 4
-    """Finished for this run."""
+    """The operator never computes again in this run."""
 
 
 Verdict = tuple[SchedulingStatus, int]
@@ -64,7 +64,7 @@ class CountCondition(Condition):
         self.count = count
 
     def check(self, timestamp: int) -> Verdict:
-        """Return READY while computes are left."""
+        """Return READY until `count` computes are done, then NEVER."""
         return _READY if self.count > 0 else _NEVER
 
     def on_execute(self, timestamp: int) -> None:

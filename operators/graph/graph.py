@@ -48,18 +48,18 @@ class StopReason(Enum):
     """Reason for the end of a run."""
 
     FINISHED = "finished"
-    """All operators finished."""
+    """Every operator has finished."""
     STOPPED = "stopped"
-    """`stop_execution` or an interrupt."""
+    """`stop_execution` was called, or the run was interrupted by Ctrl-C."""
     FAILED = "failed"
     """An operator raised an exception."""
     DEADLOCK = "deadlock"
-    """No operator could compute."""
+    """No operator could compute, although the graph was not finished."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """Ending and counts of a run."""
+    """Reason for the end of a run, with the counts of its operators and edges."""
 
     reason: StopReason
     wall_s: float
@@ -67,7 +67,7 @@ class RunResult:
     """Number of compute calls by operator."""
     edges: tuple[EdgeStats, ...]
     faults: tuple[Fault, ...]
-    """The last 1000 faults."""
+    """The last 1000 exceptions of operators, oldest first."""
     error: BaseException | None = None
 
 

@@ -18,7 +18,7 @@ from operators.graph.tracking import Trail
 
 
 class FaultAction(Enum):
-    """Reaction to one fault."""
+    """Reaction of the graph to an exception of an operator."""
 
     STOP_GRAPH = "stop_graph"
     RESTART = "restart"
@@ -34,7 +34,7 @@ class FaultPolicy:
     restarts: int = 0
     """Maximum number of restarts, each by `stop` and `start`."""
     afterwards: FaultAction = FaultAction.STOP_GRAPH
-    """Reaction after the last restart."""
+    """Reaction to an exception after `restarts` restarts."""
 
     def __post_init__(self) -> None:
         if self.restarts < 0 or (self.action is FaultAction.RESTART) != (self.restarts > 0):
@@ -77,9 +77,9 @@ class MetadataPolicy(Enum):
     """Treatment of a metadata key that is already present."""
 
     UPDATE = "update"
-    """The last received message wins (default)."""
+    """The value of the last received message replaces the earlier value (default)."""
     REJECT = "reject"
-    """The first received message wins."""
+    """The value of the first received message is kept."""
     RAISE = "raise"
     """Equal values are accepted and different ones raise MetadataConflict, to detect misaligned joins."""
     INPLACE_UPDATE = "update"  # noqa: PIE796 - alias of the Holoscan SDK

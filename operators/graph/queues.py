@@ -48,9 +48,9 @@ class Edge:
         self.received = 0
         self.dropped: dict[str, int] = {}
         self.ended = False
-        """True once the producer has finished."""
+        """True once the producing operator has finished, so that no further message arrives."""
         self.closed = False
-        """True once the consumer has finished."""
+        """True once the consuming operator has finished, so that further messages are dropped."""
 
     def __len__(self) -> int:
         return len(self.queue)

@@ -106,7 +106,7 @@ class IOSpec:
 
     @property
     def batched(self) -> bool:
-        """True if `receive` returns a tuple."""
+        """True if `receive` on this port returns a tuple of messages rather than one message."""
         return self.size != 1
 
 
@@ -116,7 +116,7 @@ class _Required:
 
 
 REQUIRED = _Required()
-"""Default of a required parameter."""
+"""Marker in place of a default value: the parameter must be given."""
 
 
 class OperatorSpec:

@@ -15,13 +15,13 @@ from operators.storage import StorageReserve
 
 @dataclass(frozen=True)
 class SinkOptions:
-    """Parameters of the run for creating a sink."""
+    """Parameters of a run that the factories in `SINKS` receive."""
 
     out: Path
     """Output folder of the run."""
     source: SourceDescription
     reserve: StorageReserve
-    """Free disk space to be kept."""
+    """Check that each write leaves enough free disk space to finish the run."""
 
 
 def input_of(sink: Operator) -> tuple[str, type]:

@@ -50,7 +50,7 @@ class Recorded:
     lost: Mapping[str, int] | None = None
     """Items that were not written, by kind and reason, for example `frame: the disk is too slow`."""
     bytes: int = 0
-    """Size on disk in bytes."""
+    """Size of the recording on disk, in bytes."""
     deleted_segments: int = 0
     """Number of older segments deleted to stay within the size and duration limits."""
     deleted_sessions: int = 0
@@ -98,7 +98,7 @@ What = Literal["frame", "prepared", "shown", "depth"]
 
 @dataclass(frozen=True)
 class _Part:
-    """An item in the queue."""
+    """Item in the recorder's queue: a picture or schedule line, with the function that writes it."""
 
     write: Callable[[SessionWriter], None]
     what: What | None = None
@@ -357,7 +357,7 @@ def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """Recording of a run."""
+    """Outcome part with the counts of the session recording."""
 
     recorded: Recorded
 

@@ -31,13 +31,13 @@ class SourceOptions:
     """User options of a source. Raises InvalidSetting for a value out of range."""
 
     scale: float = 1.0
-    """Scale of the frames."""
+    """Factor on width and height of the frames."""
     max_frames: int | None = None
-    """Maximum number of frames."""
+    """Maximum number of frames to read; None for all."""
     realtime: bool = False
     """Play a recording in real time; live sources do so anyway."""
     loop: bool = False
-    """Play a recording in a loop."""
+    """Restart a recording at its end, endlessly or until `max_frames`."""
     bounce: bool = False
     """Play every second round of a loop backwards, which avoids a jump between rounds."""
     speed: float = 1.0
@@ -89,7 +89,7 @@ class Address:
         return cls(scheme, place, options)
 
     def text(self, name: str, default: str | None = None) -> str | None:
-        """Return an option as text."""
+        """Return the text of an option of the address, or `default`."""
         self._asked.add(name)
         return self.options.get(name, default)
 
@@ -447,4 +447,4 @@ PARSERS: dict[str, Callable[[str, SourceOptions], object]] = {
     "zmq+tcp": lambda rest, options: ZeroMqAddress.parse("zmq+tcp", rest, options),
     "zmq+ipc": lambda rest, options: ZeroMqAddress.parse("zmq+ipc", rest, options),
 }
-"""Parsers of the text after a scheme."""
+"""Parsers of addresses by scheme. Each takes the text after the scheme and the source options."""

@@ -204,7 +204,7 @@ class JoinedSource(LiveSource):
 
     @property
     def state_sentence(self) -> str:
-        """State messages of both eyes."""
+        """State messages of the left and the right source, as one sentence."""
         eyes = [("left", self._left), ("right", self._right)]
         sentences = [f"{name} eye: {eye.state_sentence}" for name, eye in eyes if isinstance(eye, ReportingSource)]
         return "; ".join(sentences) or super().state_sentence

@@ -96,7 +96,7 @@ _RATE = re.compile(r"(\d{1,9}):(\d{1,9})")
 
 @dataclass(frozen=True)
 class Y4mHeader:
-    """Contents of the header line."""
+    """Frame size, frame rate and pixel format from the header line of a YUV4MPEG2 stream."""
 
     width_px: int
     height_px: int

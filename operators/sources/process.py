@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 
 SLOTS = 4
-"""Number of frames in flight."""
+"""Number of slots in shared memory, and so of frames in flight between child and parent process."""
 _ALIGNMENT = 64
 
 
@@ -321,7 +321,7 @@ class Opening:
 
 
 class ChildProcess:
-    """One capture process with one source."""
+    """Child process that reads one source, as seen by the parent."""
 
     def __init__(self, opening: Opening) -> None:
         """Start the process, which opens its source immediately."""
@@ -510,7 +510,7 @@ class ProcessSource(LiveSource):
         self._end()
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the frames of successive processes."""
+        """Yield the frames of the child process, and of its replacements after an exit, hang or failure."""
         backoff, crashes = Backoff(), 0
         try:
             while True:
@@ -625,7 +625,7 @@ class ProcessSource(LiveSource):
         raise ChildLost("it was no longer wanted")
 
     def _end(self, *, kill: bool = False) -> None:
-        """End the current process."""
+        """End the current child process: orderly, or by SIGKILL if `kill` is set."""
         child, self._child = self._child, None
         if child is None:
             return

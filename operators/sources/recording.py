@@ -62,7 +62,7 @@ class RealtimeSource(LiveSource):
         )
 
     def frames(self) -> Iterator[Frame]:
-        """Yield each frame at its time."""
+        """Yield each frame when the playback clock reaches its timestamp."""
         speed = self.options.speed
         start_ns: int | None = None
         with closing(read_ahead(self._numbered(), f"decode {self.description.name}", DECODED_AHEAD)) as decoded:

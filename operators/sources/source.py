@@ -123,7 +123,7 @@ class FrameSource(Protocol):
 
     @property
     def state(self) -> SourceState:
-        """Current state."""
+        """Current state of the source. Thread-safe."""
         ...
 
     def open(self) -> None:

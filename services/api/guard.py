@@ -120,7 +120,7 @@ class GuardedRoute(APIRoute):
 
 
 def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
-    """Create a router of guarded routes."""
+    """Create a router whose routes enforce their access rule (`GuardedRoute`)."""
     return APIRouter(prefix=prefix, tags=[tag], route_class=GuardedRoute)
 
 

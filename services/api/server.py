@@ -464,4 +464,4 @@ def _address(listener: socket.socket, settings: ServiceSettings) -> str:
 
 
 def _done(number: int, frame: FrameType | None) -> None:
-    """Ignore a signal that was already handled."""
+    """Signal handler that does nothing: uvicorn has already handled the signal by draining."""

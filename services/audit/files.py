@@ -20,7 +20,7 @@ from typing import Any, Literal
 from gsplat_core.io.files import open_regular, read_regular
 
 FIRST = 64 * "0"
-"""Predecessor digest of the first entry."""
+"""Digest that the first entry of a log states for its missing predecessor."""
 MOST_LINE_BYTES = 8192
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _PLAIN = re.compile(r"[\w .:@/+*=,;()'?&#%|-]{0,400}", re.ASCII)
@@ -232,7 +232,7 @@ class Keeping:
 
 @dataclass(frozen=True)
 class Segment:
-    """Closed file of the log."""
+    """Closed file of the log, named after the number of its first entry."""
 
     first_seq: int
     path: Path

@@ -25,7 +25,7 @@ MOST_READINGS = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """Detected inconsistency."""
+    """Inconsistency of the log, with the line at which it was detected."""
 
     line: int
     """Line number in its file, from 1; one past the last line for entries missing at the end."""

@@ -34,7 +34,7 @@ MOST_BYTES = 1 << 20
 
 
 class IssuerKeys:
-    """Public keys of one issuer by key id."""
+    """Public signing keys of one OpenID Connect issuer, fetched and cached by key id."""
 
     def __init__(
         self,

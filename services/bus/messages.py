@@ -21,7 +21,7 @@ from gsplat_core.errors import UserError
 from services.errors import BadMessage, BusError, CommandRefused, NoAnswer
 
 MOST_BYTES = 1 << 16
-"""Largest message in bytes."""
+"""Largest size of a JSON message between processes, in bytes."""
 
 
 def packed_json(content: Mapping[str, Any]) -> bytes:
@@ -138,7 +138,7 @@ class CommandServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop answering and remove the socket."""
+        """Stop answering commands and remove the socket."""
         self._stop.set()
         self._thread.join()
 

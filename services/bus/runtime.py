@@ -107,7 +107,7 @@ def _boot() -> str:
 Role = Literal["capture", "engine"]
 ROLES: tuple[Role, ...] = get_args(Role)
 PICTURES: Mapping[Role, str] = {"capture": "raw", "engine": "shown"}
-"""Picture socket of each process."""
+"""Name of the picture socket of each process, by role."""
 Layer = Literal["depth", "confidence", "orbit"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 """Additional pictures of the engine, one socket each, produced only while a reader is connected."""
@@ -118,11 +118,11 @@ _LONGEST_NAME = "capture.status"
 
 @dataclass(frozen=True)
 class ProcessRecord:
-    """Record that a process writes about itself."""
+    """Identity and settings digest of a running stream process, written by the process itself."""
 
     identity: ProcessIdentity
     spec_digest: str
-    """Digest of the specification in use."""
+    """Digest of the specification that the process was started with."""
 
 
 class RuntimeFolder:

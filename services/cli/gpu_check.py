@@ -16,7 +16,7 @@ DRIVER, DEVICE, WSL = Path("/proc/driver/nvidia/version"), Path("/dev/nvidiactl"
 
 @dataclass(frozen=True)
 class Graphics:
-    """Result of the detection."""
+    """Result of the GPU detection: what was found, whether it is usable, and the remedy."""
 
     usable: bool
     found: str

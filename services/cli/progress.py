@@ -61,7 +61,7 @@ class ProgressPrinter:
             self._bar.stop()
 
     def __call__(self, progress: Progress) -> None:
-        """Process one event."""
+        """Update the bar on a terminal. Otherwise print a line, at most one per `PLAIN_PERIOD_S` and stage."""
         if self._quiet:
             return
         now_s = time.monotonic()

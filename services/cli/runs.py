@@ -151,7 +151,7 @@ class LiveStatus:
             print(file=sys.stderr)  # noqa: T201 - ends the refreshed line
 
     def __call__(self, graph: Pipeline, scored: ScoredFrame) -> None:
-        """Process one scored frame."""
+        """Update the status line after a scored frame."""
         now_s = time.monotonic()
         if self._quiet or now_s - self._printed_s < self._period_s:
             return

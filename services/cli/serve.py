@@ -32,7 +32,7 @@ from services.settings.sections import NAME_PATTERN
 def serve_command(
     config: Path | None, host: str | None, port: int | None, data: Path | None, setting: Sequence[str]
 ) -> int:
-    """Serve until asked to stop."""
+    """Run the server until SIGTERM or SIGINT."""
     keep_files_private()
     named = {"server.host": host, "server.port": port, "paths.data": data}
     flags = {name: json.dumps(str(value)) for name, value in named.items() if value is not None}

@@ -18,7 +18,7 @@ audit = typer.Typer(help="The service's audit log.", no_args_is_help=True)
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add these commands to the program."""
+    """Add the service commands, such as `serve` and `keys`, to the command line program."""
     app.command()(serve)
     app.command()(schema)
     app.command()(backup)

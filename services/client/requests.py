@@ -28,7 +28,7 @@ MOST_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class Picture:
-    """Received picture."""
+    """Picture of a stream that the client received, as JPEG with its header."""
 
     header: dict[str, Any]
     """Sequence number, timestamps, age and state (docs/design/processes.md)."""

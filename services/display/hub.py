@@ -120,7 +120,7 @@ class Viewer(AsyncIterator[EncodedPicture]):
         self._changed.set()
 
     def close(self) -> None:
-        """End the iteration."""
+        """End the viewer's iteration and unsubscribe it."""
         if not self._closed:
             self._closed = True
             self._leave(self)

@@ -47,7 +47,7 @@ PASSED_ON = (
 
 
 class ExportPrograms:
-    """Running export programs. Thread-safe."""
+    """Starts export programs within limits, and kills the running programs on `end`. Thread-safe."""
 
     def __init__(self, program: tuple[str, ...] = PROGRAM, most_s: float = MOST_S) -> None:
         self._program, self._most_s = program, most_s
@@ -128,7 +128,7 @@ class Exported:
 
     file: BinaryIO
     sha256: str
-    """SHA-256 in hex."""
+    """SHA-256 of the file's bytes in hex."""
     size_bytes: int
 
 

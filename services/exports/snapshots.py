@@ -158,7 +158,7 @@ CHECKED = (State.READY, State.ACTIVE, State.RETIRED)
 
 
 class StreamSnapshots:
-    """Snapshots of live streams."""
+    """Takes snapshots of live streams by commands to their engines, and stores them as files or as model versions."""
 
     def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, store: SnapshotStore) -> None:
         self._streams, self._registry, self._store = streams, registry, store

@@ -33,11 +33,11 @@ AGAIN_S = 2.0
 
 @dataclass(frozen=True)
 class PoolSettings:
-    """Settings of a pool."""
+    """Concurrency, leases and resource settings of a job pool."""
 
     workers: int = 1
     threads: int = 1
-    """Threads per attempt."""
+    """Number of CPU threads per attempt."""
     lease_s: float = 15.0
     most_attempts: int = 5
     niceness: int = 0
@@ -192,7 +192,7 @@ class PoolProcess:
 
     @classmethod
     def of_line(cls, line: str) -> PoolProcess:
-        """Parse an input line."""
+        """Parse the configuration from a line of `line`."""
         values: dict[str, Any] = json.loads(line)
         return cls(**{**values, "pool": PoolSettings(**values["pool"])})
 

@@ -140,7 +140,7 @@ class Task:
     id: str
     source: str
     folder: str
-    """Folder of this attempt."""
+    """Path of the attempt's working folder."""
     options: Mapping[str, Any] = field(default_factory=dict)
     threads: int = 1
     niceness: int = 0

@@ -40,7 +40,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class RecordingRecord:
-    """Uploaded recording."""
+    """Record of an uploaded recording, from its database row."""
 
     name: str
     kind: str

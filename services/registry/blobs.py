@@ -23,7 +23,7 @@ from services.errors import Rejected, StoreUnavailable
 from services.registry.bundle_file import PIECE_BYTES, digest_of, members_of
 
 PART_SUFFIX = ".part"
-"""Suffix of incomplete files and folders."""
+"""Name suffix of files and folders that are still being written."""
 OTHERS_UPLOAD_S = 3600.0
 """Age in seconds below which unreferenced files of an object store are kept, because another machine may insert
 their database row soon."""

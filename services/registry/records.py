@@ -24,13 +24,13 @@ class State(StrEnum):
     VALIDATED = "validated"
     """Content valid; the warm-up picture is being rendered."""
     READY = "ready"
-    """Ready for activation."""
+    """Check passed; the version can be activated."""
     ACTIVE = "active"
-    """Currently served."""
+    """Version that streams display if their settings name this model."""
     RETIRED = "retired"
-    """Active earlier; can be activated again."""
+    """Version that was active earlier; it can be activated again."""
     REJECTED = "rejected"
-    """Unusable, with a reason."""
+    """Check failed; `reason` has the cause."""
 
 
 UNCHECKED = (State.UPLOADED, State.VALIDATED)
@@ -49,7 +49,7 @@ class VersionRecord:
     digest: str
     """SHA-256 of the uploaded file in hex."""
     size_bytes: int
-    """Size of the uploaded file."""
+    """Size of the uploaded file in bytes."""
     uploaded_by: str
     uploaded_at: datetime
     changed_by: str
@@ -67,7 +67,7 @@ class ModelRecord:
     name: str
     created_at: datetime
     active: int | None
-    """Active version number."""
+    """Number of the active version; None if no version is active."""
     last_version: int
     """Highest version number used so far, including deleted versions."""
 
@@ -210,7 +210,7 @@ def change_state(
 
 
 def set_active(connection: sa.Connection, name: str, version: int) -> None:
-    """Set the active version of a model."""
+    """Set the active version number in a model's row."""
     connection.execute(sa.update(MODELS).where(MODELS.c.name == name).values(active=version))
 
 
