@@ -12,7 +12,7 @@ constexpr float kLog2AlphaCutoff = -7.99435344f;
 constexpr float kMinTransmittance = 1e-4f;    // blending stops before the splat that would reduce transmittance below this
 constexpr float kCompensationFloor = 0.005f;  // lower bound of the opacity compensation for the 2D blur
 constexpr float kMaxExtentSigmas = 3.33f;     // at this distance alpha of an opaque Gaussian falls below kAlphaCutoff
-constexpr float kMaxRadiusPx = 1e9f;          // fits an int32
+constexpr float kMaxRadiusPx = 1e9f;          // fits in an int32
 constexpr float kFieldOfViewMargin = 0.3f;    // in half fields of view; the pinhole Jacobian is clamped outside
 constexpr int kTileSize = 16;                 // px
 

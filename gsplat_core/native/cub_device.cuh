@@ -1,4 +1,4 @@
-// CUB's sort and scan over device memory.
+// CUB radix sort and scan over device memory.
 #pragma once
 
 #include "without_iostreams.h"

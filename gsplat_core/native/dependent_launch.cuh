@@ -1,5 +1,5 @@
-// Programmatic dependent launch: the blocks of a kernel are scheduled while the last blocks of the preceding kernel still run,
-// and wait for its results on the device. Compute capability 9.0 and later; elsewhere an ordinary launch.
+// Programmatic dependent launch: blocks of a kernel are scheduled while the last blocks of the preceding kernel still
+// run, and wait for its results on the device. Needs compute capability 9.0; on earlier GPUs it is an ordinary launch.
 #pragma once
 
 #include <cuda_runtime.h>

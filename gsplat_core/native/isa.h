@@ -7,14 +7,14 @@ enum class Isa { baseline = 0, avx2 = 1, avx512 = 2 };
 // supports it.
 Isa active_isa();
 
-// An op's kernels for the CPU are functions in the table of each set. The op's header declares it once, outside of any namespace:
+// Declares the table of an op's CPU kernels for every instruction set. The op's header uses it once, outside of any namespace:
 //
 //   namespace gsplat::adam { struct Kernels { int64_t (*step)(...); }; }
 //   GSPLAT_KERNELS(adam, Kernels)
 //
-// The kernel file <op>_cpu.cpp is compiled once for each set with GSPLAT_ISA as its name, and defines
-// `const gsplat::adam::Kernels kernels` in the namespace GSPLAT_ISA::adam. Host files call gsplat::adam::kernels(): the active
-// set's.
+// The kernel file <op>_cpu.cpp is compiled once per set, with GSPLAT_ISA defined as the set's name. It defines
+// `const gsplat::adam::Kernels kernels` in the namespace GSPLAT_ISA::adam. Host files call gsplat::adam::kernels(), which
+// returns the table of the active set.
 #define GSPLAT_DECLARE_KERNELS_OF(isa, op, Type) \
   namespace isa::op {                            \
   extern const gsplat::op::Type kernels;         \

@@ -208,7 +208,7 @@ template <int kCount>
 GSPLAT_INLINE void sums(const vfloat* v, float* out) {
 #if defined(__AVX512F__)
   for (int first = 0; first < kCount; first += 16) {
-    const auto at = [&](int slot) {  // slot 4k + l ends up in lane 4l + k
+    const auto at = [&](int slot) {  // slot 4k + l is stored in lane 4l + k
       const int i = first + 4 * (slot & 3) + (slot >> 2);
       return i < kCount ? (__m512)v[i] : _mm512_setzero_ps();
     };

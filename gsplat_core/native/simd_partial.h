@@ -5,7 +5,7 @@
 
 namespace GSPLAT_ISA {
 
-// -1 in the first `count` lanes, 0 in the others.
+// Return -1 in the first `count` lanes, 0 in the others.
 GSPLAT_INLINE vint first_lanes(int64_t count) { return ramp() < float(count); }
 
 // Load the first `count` floats at p and zero the other lanes, without reading past them.

@@ -5,7 +5,7 @@
 // <iostream>. tests/gsplat_core/test_linkage.py fails if a new version of torch adds another one.
 #pragma once
 
-#define STRIP_ERROR_MESSAGES 1  // STD_TORCH_CHECK then throws the text of its condition
+#define STRIP_ERROR_MESSAGES 1  // makes STD_TORCH_CHECK throw the text of its condition only
 
 #include <dlfcn.h>
 

@@ -16,7 +16,7 @@ struct AdamStep {
   int64_t row_size;  // values per row; one non-finite gradient leaves the whole row unchanged
 };
 
-// AdamStep with rate and step in device memory.
+// AdamStep with learning rate and step in device memory.
 struct AdamAt {
   const float* rate;            // [1]: the learning rate
   const int64_t* step;          // [1]: counts from 1

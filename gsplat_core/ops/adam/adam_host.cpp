@@ -12,7 +12,7 @@ struct Options {
   int64_t row_size;
 };
 
-// Parameter, gradient and moments of one call, checked.
+// Checked parameter, gradient and moments of one call.
 struct Rows {
   Tensor gradient;
   float *p, *m, *v;

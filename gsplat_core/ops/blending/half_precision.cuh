@@ -140,8 +140,9 @@ __device__ inline __half2 opacity(float power0, float power1) {
 // quarter of the splats.
 struct HalfPixels {
   __half2 front;  // transmittance in front of the next splat; 0 once the pixel is closed
-  float sums[4];  // of the upper pixel and of the lower: lane 0 has red and green, 1 blue and depth, 2 the weights (in units of 1
-                  // / kMaxAlpha)
+  // Two sums of the upper and two of the lower pixel: lane 0 has red and green, lane 1 blue and depth, lane 2 the weights (in
+  // units of 1 / kMaxAlpha).
+  float sums[4];
 
   __device__ bool open() const { return bits_of(front) != 0; }
 };

@@ -29,7 +29,7 @@ constexpr int kRows = kWindow / kBlockHeight;
 constexpr int kBlocks = kColumns * kRows;
 constexpr int kPixels = kWindow * kWindow;
 
-// The index of pixel (x, y) of a window in arrays ordered block by block.
+// Return the index of pixel (x, y) of a window in arrays ordered block by block.
 GSPLAT_INLINE int place(int x, int y) {
   return (y / kBlockHeight * kColumns + x / kBlockWidth) * kLanes + y % kBlockHeight * kBlockWidth + x % kBlockWidth;
 }
@@ -65,7 +65,7 @@ GSPLAT_INLINE vfloat lane_y() {
   return v;
 }
 
-// log2(alpha) of one splat at the pixels (x, y), before the cut-offs.
+// log2(alpha) of one splat at the pixels (x, y), before clamping and cut-off.
 struct Falloff {
   vfloat dx, dy, power;
 };

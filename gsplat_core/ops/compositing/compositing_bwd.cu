@@ -173,7 +173,7 @@ __global__ void __launch_bounds__(kBlockThreads)
   }
 }
 
-// One block per image and channel.
+// Sum the partial gradients of the backgrounds, with one block per image and channel.
 __global__ void sum_backgrounds(const float* parts, int64_t parts_per_image, int channels, float* v_backgrounds) {
   __shared__ double sums[kThreads];
   const int64_t image = blockIdx.x / channels, d = blockIdx.x % channels;

@@ -1,4 +1,4 @@
-// Compositing front to back.
+// Front-to-back alpha compositing.
 #include "../blending/blend_forward.cuh"
 #include "composite_windows.cuh"
 

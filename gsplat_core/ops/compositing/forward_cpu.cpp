@@ -171,8 +171,8 @@ void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* rec
   }
 }
 
-// Colours (forward) or their gradients (backward) of a window, followed in the backward pass by a splat's sums per lane
-// and in total.
+// Layout: colours (forward) or their gradients (backward) of a window; in the backward pass followed by a splat's sums
+// per lane and in total.
 int64_t scratch_floats(int channels) { return int64_t(channels) * (kPixels + kLanes + 1); }
 
 void composite_tile(const Splats& in, int64_t tile, const Pixels& out, float* scratch) {

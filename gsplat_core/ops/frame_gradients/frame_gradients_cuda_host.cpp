@@ -79,7 +79,7 @@ struct Backward {
           " values for this frame, as render_frame returns it when training; got ", t.numel());
     return t;
   }
-  // The kernels read whole float4s.
+  // Return a tensor aligned to 16 bytes, because the kernels read whole float4s.
   static Tensor floats(const Inputs& inputs, const Tensor& t, int64_t count, const char* name) {
     const Tensor taken = inputs.call.floats(sized(t, count, name), name);
     return is_quad_aligned(taken) ? taken : torch::stable::clone(taken);

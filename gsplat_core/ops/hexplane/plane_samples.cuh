@@ -143,7 +143,7 @@ void with_team(bool wide, int64_t channels, const Run& run) {
 }
 
 constexpr int kDenseCell = 8;  // a cell with at least this many Gaussians is dense: a separate pass sums its rows
-constexpr int kDenseRun = 32;  // sorted rows that one team sums in that pass
+constexpr int kDenseRun = 32;  // sorted rows per team in that pass
 constexpr int kNodeBatch = 2;  // rows of a node in flight; few, because many nodes are processed concurrently
 
 // One plane's Gaussians sorted by cell = major coordinate * minor size + minor coordinate.

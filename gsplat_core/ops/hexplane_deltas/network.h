@@ -14,7 +14,7 @@
 namespace gsplat::hexplane {
 
 constexpr int kMaxFieldLevels = 16;
-constexpr int kMaxFieldLayers = 10;          // trunk and head
+constexpr int kMaxFieldLayers = 10;          // trunk layers plus the head
 constexpr int kMaxPackedBytes = 200 * 1024;  // maximum size of the weights in a block's shared memory
 
 struct FieldNetwork {

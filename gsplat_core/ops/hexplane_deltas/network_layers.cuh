@@ -6,7 +6,7 @@
 
 namespace gsplat::hexplane {
 
-// 16 bytes of features.
+// 16 bytes of features in registers.
 template <class T>
 struct Piece;
 

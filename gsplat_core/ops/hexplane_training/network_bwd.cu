@@ -42,7 +42,7 @@ __global__ void __launch_bounds__(kThreads) pack_weights(FieldNetwork net, float
   }
 }
 
-// 16 rows and 32 columns of a product.
+// Accumulators of a product of 16 rows and 32 columns.
 struct Columns {
   float sums[4][4];  // [t][2 r + half]: row group + 8 r, column 16 half + 4 quad + t
 

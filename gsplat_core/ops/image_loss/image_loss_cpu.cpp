@@ -130,7 +130,7 @@ static void count_depth_rows(const DepthTask& task, int64_t row_begin, int64_t r
   for (int64_t row = row_begin; row < row_end; ++row) {
     vint counts{};
     for_row(task, row, [&](int64_t, const float* depth, const float* target, const uint8_t* mask, int) {
-      counts -= valid_depth(depth, target, mask);  // a true lane is -1
+      counts -= valid_depth(depth, target, mask);  // a true lane is -1, so subtracting counts it
     });
     int64_t total = 0;
     for (int lane = 0; lane < kLanes; ++lane) total += counts[lane];

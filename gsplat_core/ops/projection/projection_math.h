@@ -140,7 +140,7 @@ struct CameraModelConstant {
   static constexpr CameraModel value = model_;
 };
 
-// Return run(constant) for the constant of a camera model.
+// Call run with the camera model as a constant, and return its result.
 template <class Run>
 GSPLAT_INLINE auto with_camera_model(int model, const Run& run) {
   switch (model) {

@@ -10,7 +10,7 @@ namespace {
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
 constexpr int kTile = 32;                   // pixels per side
 constexpr int kHalo = kTile + 2 * kRadius;  // including the filter's radius on both sides
-constexpr int kRows = kThreads / kTile;     // rows of a tile that are written at once
+constexpr int kRows = kThreads / kTile;     // rows of a tile written at once
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
 // Half of a Gaussian with a sigma of 1.5 pixels, from the centre outwards; the full filter sums to 1.

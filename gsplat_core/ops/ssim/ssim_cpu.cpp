@@ -20,7 +20,7 @@ struct Strip {
   const SsimTask& task;
   int64_t first_px;  // first pixel of the strip without its halo
   int64_t pixels;    // pixels of the strip without its halo
-  // Column 0 of every buffered row is pixel first_px - 2R.
+  // Column 0 of every buffered row is pixel first_px - 2R of the image.
   float* image;       // ring [T][S]
   float* target;      // ring
   float* tissue;      // ring, 0 or 1

@@ -1,4 +1,4 @@
-// The paths along rows and columns.
+// Aggregates the costs along the paths in rows and columns.
 #include "disparity_vectors.h"
 
 namespace GSPLAT_ISA::stereo_matching {

@@ -38,7 +38,7 @@ struct Kernels {
   // (gsplat's isect_ids).
   void (*emit)(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* cursors,
                int32_t* flatten_ids, int64_t* keys);
-  // Writes the tiles of one splat, row by row, from `at` on.
+  // Writes the tiles of one splat row by row, starting at position `at`.
   void (*emit_one)(const SplatBoxes& in, const TileSpan& span, int64_t splat, int64_t at, int32_t* flatten_ids, int64_t* keys);
 };
 

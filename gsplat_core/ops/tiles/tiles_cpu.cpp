@@ -34,7 +34,7 @@ GSPLAT_INLINE Ellipses make_ellipses(vfloat x, vfloat y, Conics q, vfloat k) {
   return {x, y, -q.b * inverse, k * inverse, det * inverse * inverse, top, proper};
 }
 
-// Columns [first, end) of a row of tiles.
+// The columns [first, end) of a row of tiles, for one splat per lane.
 struct Runs {
   vint first, end;
 };

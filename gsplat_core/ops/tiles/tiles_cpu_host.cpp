@@ -146,7 +146,7 @@ void offsets_of_ids(const Call&, const Tensor& sorted, int64_t images, int64_t t
   const int64_t* const ids = sorted.const_data_ptr<int64_t>();
   const int64_t count = sorted.numel();
   const int tile_bits = tiles > 0 ? 64 - __builtin_clzll(uint64_t(tiles)) : 1;
-  int64_t next = 0;  // first tile without an offset
+  int64_t next = 0;  // first tile whose offset is not yet written
   for (int64_t i = 0; i < count; ++i) {
     const int64_t key = ids[i] >> 32, image = key >> tile_bits, tile = key & ((int64_t(1) << tile_bits) - 1);
     check(image >= 0 && image < images && tile < tiles, "isect_offset_encode: isect_ids[", i, "] is for image ", image, ", tile ",
