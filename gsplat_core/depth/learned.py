@@ -188,7 +188,7 @@ class LearnedDepth(Estimator):
     evidence = "answers of the depth network"
 
     def __init__(self, address: str) -> None:
-        """Load the network.
+        """Load the depth network.
 
         Args:
             address: path of the model. A suffix `?values=depth` or `?values=inverse` overrides the model's own setting.

@@ -39,7 +39,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Reference:
-    """Earlier picture with its log gains."""
+    """Reduced earlier picture with the logarithms of its gains."""
 
     sample: Sample
     log_gain: NDArray[np.float64]

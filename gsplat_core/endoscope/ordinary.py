@@ -20,7 +20,7 @@ class Turns:
         self._last_ns = 0
 
     def all_looked(self, pts_ns: int) -> None:
-        """Record that all checks ran on the picture of this time."""
+        """Record that all checks ran on the picture at `pts_ns`, and schedule the next ones."""
         self._last_ns = pts_ns
         self._due_ns = [pts_ns + self._every_ns * (k + 1) // self._looks for k in range(self._looks)]
 

@@ -171,7 +171,7 @@ class DepthSums:
 
     @property
     def errors(self) -> DepthErrors | None:
-        """Means so far; None if no frame was comparable."""
+        """Depth errors averaged over the frames added so far; None if no frame was comparable."""
         means = {name: mean.mean for name, mean in self._means.items()}
         found = {name: value for name, value in means.items() if value is not None}
         return DepthErrors(**found, frames=self._frames) if len(found) == len(means) else None
@@ -227,7 +227,7 @@ class DepthShareSums:
 
     @property
     def errors(self) -> DepthShare | None:
-        """Depth errors of all frames so far; None if nothing was comparable."""
+        """Depth errors over all frames added so far; None if no pixel was comparable."""
         if not self._kept:
             return None
         true, shown, plane, level = np.concatenate(self._kept, axis=1)
@@ -309,7 +309,7 @@ class NormalSums:
 
     @property
     def errors(self) -> NormalErrors | None:
-        """Means so far; None if nothing was comparable."""
+        """Angular errors averaged over the frames added so far; None if no frame was comparable."""
         mean, median, plane, level = (each.mean for each in (self._mean, self._median, self._plane, self._level))
         if mean is None or median is None or plane is None or level is None:
             return None

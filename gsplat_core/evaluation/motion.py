@@ -79,7 +79,7 @@ def _neighbours(gaussians: Gaussians, points: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """Errors over all points and later frames that see them."""
+    """Errors over all tracked points and all later frames in which a point is visible."""
 
     median_mm: float
     mean_mm: float

@@ -240,7 +240,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Visits:
-    """Two stays at one place."""
+    """Two stays of the scope at the same place, with an absence between them."""
 
     first: Range
     again: Range
@@ -417,7 +417,7 @@ def find_places(frames: Iterable[Frame]) -> list[Visits]:
 
 @dataclass(frozen=True)
 class Return:
-    """Recovery of a revisited place, in the figures of another protocol."""
+    """Recovery of image quality after the return to a place, taken from the figures of a live or causal run."""
 
     visits: Visits
     first_db: tuple[float | None, ...]

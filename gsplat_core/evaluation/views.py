@@ -85,7 +85,7 @@ class NovelViewSums:
 
     @property
     def score(self) -> NovelView | None:
-        """Means so far; None if nothing was scored."""
+        """Scores averaged over the frames added so far; None if no frame was scored."""
         if not self._frames:
             return None
         scores = self._model.score, self._left.score, self._shifted.score
@@ -187,7 +187,7 @@ class ViewSums:
 
     @property
     def scores(self) -> tuple[NovelView, ...]:
-        """Means so far of all views."""
+        """Scores of all views, averaged over the frames added so far."""
         return tuple(found for each in self._sums.values() if (found := each.score) is not None)
 
 

@@ -51,7 +51,7 @@ LEAST_TOLD = 15.0
 
 @dataclass(frozen=True)
 class Pull:
-    """Common direction of moving tissue."""
+    """Common direction in which a tool pulls tissue."""
 
     direction: Array
     """Unit direction in camera coordinates, [3]."""
@@ -144,7 +144,7 @@ TOO_FEW = "too few points of the tissue can be tracked"
 
 @dataclass(frozen=True)
 class _Window:
-    """Result for one time window of a recording."""
+    """Tracks and fitted motion of one time window of a recording."""
 
     middle_s: float
     tracks: GridTracks

@@ -49,7 +49,7 @@ class LightWindow:
         self.solve()
 
     def add(self, look: Look) -> bool:
-        """Add a later look and estimate its relief.
+        """Add a look that is later than all others, and estimate its relief.
 
         Returns:
             True if it can be tracked; otherwise the window is unchanged.

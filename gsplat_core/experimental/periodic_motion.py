@@ -126,7 +126,7 @@ def fitted(
 
 
 class _Fit:
-    """State of one fit."""
+    """State of one Gauss-Newton fit of periodic motion."""
 
     def __init__(
         self, tracks: GridTracks, frequencies_hz: tuple[float, ...], begin: Array | None, nodes: tuple[int, int]

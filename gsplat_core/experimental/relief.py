@@ -213,7 +213,7 @@ DAMPING = 0.6
 
 @dataclass(frozen=True)
 class Reliefs:
-    """Fitted reliefs of all times."""
+    """Relief at the key time, and its change at all other times."""
 
     key: Array
     """Coefficients at the key time, [cosines]."""
@@ -255,7 +255,7 @@ class Brightness:
     """Brightness cue of several pictures with common pigment and light."""
 
     def __init__(self, grid: Grid, shadings: Sequence[Cells], times: Sequence[int], counts: float) -> None:
-        """Set up the cue.
+        """Set up the brightness cue.
 
         Args:
             grid: cell grid.

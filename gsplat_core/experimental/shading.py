@@ -74,7 +74,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class Shading(Cells):
-    """Shading of a picture; its brightness is from the mixture of channels."""
+    """Shading of a picture. The brightness is computed from a mixture of the colour channels."""
 
     glints: NDArray[np.float64]
     """Share of each cell's pixels in highlights of wet tissue, [h, w]."""

@@ -55,7 +55,7 @@ class TexturedPicture:
 
 @dataclass(frozen=True)
 class GridTracks:
-    """Tracks of N points in T pictures."""
+    """Tracks of N points through T pictures, with the pictures' poses."""
 
     rays: NDArray[np.float64]
     """Observed rays as x / z and y / z, float64 [T, N, 2]."""
@@ -70,7 +70,7 @@ class GridTracks:
     """Half the picture's width and height, as rays."""
 
     def of(self, points: NDArray[Any] | slice, times: NDArray[Any] | slice = slice(None)) -> GridTracks:
-        """Select points, and optionally times."""
+        """Return the tracks of selected points, optionally at selected times only."""
         return GridTracks(
             self.rays[times][:, points],
             self.seen[times][:, points],

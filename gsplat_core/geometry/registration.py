@@ -146,7 +146,7 @@ MOST_POINTS = 5000
 
 @dataclass(frozen=True)
 class Registration:
-    """Result of a registration."""
+    """Transform found by a registration, with its residual error."""
 
     transform: Array
     """Transform from the moved to the fixed surface's coordinates [4, 4]: rotation and translation,

@@ -127,7 +127,7 @@ class StreamTracks:
         self._next = 0
 
     def begin(self, picture: SmallPicture) -> None:
-        """Drop all points and continue from this picture."""
+        """Drop all points and use this picture as the last one."""
         self.picture = picture
         self.keep(np.zeros(len(self.numbers), np.bool_))
 

@@ -100,7 +100,7 @@ class FeatureTracks:
         self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
 
     def follow(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
-        """Track to the next picture.
+        """Track all points to the next picture and detect new corners.
 
         Args:
             image: RGB uint8 [H, W, 3].

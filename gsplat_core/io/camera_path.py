@@ -48,7 +48,7 @@ class Waypoint:
 
 
 class CameraPath:
-    """Poses over time.
+    """Camera poses over time, interpolated between waypoints.
 
     Raises:
         InvalidInput: if times do not increase, or only some waypoints have intrinsics.

@@ -35,7 +35,7 @@ class JsonObject:
         return JsonObject(values, name)
 
     def nested(self, key: str) -> JsonObject:
-        """Return a nested object."""
+        """Return the nested JSON object stored under a key."""
         return JsonObject(self.values.get(key), f"{self.name}: {key}")
 
     def integer(self, key: str, wanted: IntegerIn) -> int:
@@ -58,7 +58,7 @@ class JsonObject:
         return [self._matrix(f"{key}[{index}]", rows, size, wanted) for index, rows in enumerate(listed)]
 
     def numbers(self, key: str, wanted: NumberIn, most: int) -> list[float]:
-        """Return a list of 1 to `most` numbers."""
+        """Return the list of 1 to `most` numbers stored under a key."""
         return [float(value) for value in self._checked(key, ListOf(wanted, 1, most))]
 
     def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
@@ -78,7 +78,7 @@ class JsonObject:
         return value
 
     def boolean(self, key: str) -> bool:
-        """Return a boolean."""
+        """Return the boolean stored under a key."""
         value = self.values.get(key)
         if not isinstance(value, bool):
             raise BundleCorrupt(f"{self.name}: {key} must be true or false, got {shortened(value)}")

@@ -46,7 +46,7 @@ UNITS = {"length": ("mm",), "time": ("s",)}
 
 @dataclass(frozen=True)
 class Manifest:
-    """Validated manifest."""
+    """Validated manifest of a model bundle."""
 
     version: int
     count: int

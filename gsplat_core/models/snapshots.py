@@ -58,7 +58,7 @@ class SnapshotSlot:
 
     @property
     def field(self) -> DeformationField | None:
-        """Field for all rows."""
+        """Deformation field with capacity for all rows of the slot."""
         return None if self._field is None else self._field.field
 
     @property

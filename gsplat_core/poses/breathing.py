@@ -150,7 +150,7 @@ def _tried(
     spread: float = SPREAD,
     prior: TrajectoryPrior | None = None,
 ) -> _Try:
-    """Adjust a start bundle that already contains all of these frequencies, or all but the last one."""
+    """Adjust a bundle with the frequencies `hz`. The start bundle contains all of their waves, or all but the last."""
     return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, prior))
 
 

@@ -119,7 +119,7 @@ def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPri
 
 @dataclass(frozen=True)
 class _Smoothness:
-    """Kernel with its restricted likelihood for a trajectory."""
+    """Kernel of the trajectory's Gaussian process, with the restricted likelihood of a trajectory."""
 
     likelihood: float
     factor: Tensor
@@ -161,7 +161,7 @@ JITTER = 1e-6
 
 @dataclass(frozen=True)
 class SurfaceField:
-    """Nodes of a vector field with its prior."""
+    """Nodes on the tissue surface that carry a smooth vector field, and the prior of the field."""
 
     nodes: Tensor
     """Positions of the field's nodes, [M, 3]."""
@@ -260,7 +260,7 @@ def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
 def adjust(
     bundle: MovingBundle, spread: float, rounds: int, prior: TrajectoryPrior | None = None
 ) -> tuple[MovingBundle, float]:
-    """Minimise the robust cost.
+    """Adjust cameras, rest positions and motion vectors to minimise the robust cost.
 
     Args:
         bundle: start values.

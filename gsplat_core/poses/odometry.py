@@ -128,7 +128,7 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
 
 
 class _Odometry:
-    """State of one recording's estimate, float64 on the CPU. The same observations give the same bytes."""
+    """State of one recording's estimate, float64 on the CPU. Equal observations give bit-identical results."""
 
     def __init__(self, seen: Observations, camera: Camera, times_s: list[float]) -> None:
         K, count = camera.K, len(times_s)

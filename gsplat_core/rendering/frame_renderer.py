@@ -127,7 +127,7 @@ class TileListCapacity:
 
     @property
     def mode(self) -> FrameMode:
-        """Mode of `render_frame` for this capacity."""
+        """Frame mode that `render_frame` uses with this capacity."""
         return FrameMode.SEGMENTS if self.per_tile else FrameMode.SHARED
 
     @staticmethod
@@ -188,7 +188,7 @@ class FrameStatusCopy:
         self._arrived.record(torch.cuda.current_stream(device))
 
     def wait(self) -> FrameNeeds:
-        """Wait for the copy and return it."""
+        """Wait for the status copy and return its values."""
         self._arrived.synchronize()
         values = self._values.tolist()
         return FrameNeeds(values[STATUS_NEEDED], values[STATUS_LONGEST], values[STATUS_OVERFLOW])

@@ -55,12 +55,12 @@ class Frame:
     arrived_ns: int | None = None
     """Arrival time of a live frame in nanoseconds of `time.monotonic_ns`; None if not live."""
     loss_mask: NDArray[np.uint8] | None = None
-    """uint8 [H, W]; 0 excludes a pixel from the loss although it may be tissue.
+    """Loss mask uint8 [H, W]; 0 excludes a pixel from the loss although it may be tissue.
 
     Used outside the field of view and for a recorder's overlay. None excludes nothing.
     """
     rehearsal_mask: NDArray[np.uint8] | None = None
-    """uint8 [H, W]; 0 excludes a pixel from the rehearsal loss but not from display.
+    """Rehearsal mask uint8 [H, W]; 0 excludes a pixel from the rehearsal loss but not from display.
 
     Used for highlights, which move with the light instead of the tissue.
     """

@@ -142,7 +142,7 @@ class ObservationWindow:
 
     def __init__(self, capacity: int, seed: int) -> None:
         self._frames: deque[Observation] = deque(maxlen=capacity)
-        """Frames as they are trained on again later."""
+        """Frames of the window, with the rehearsal masks applied."""
         self._whole_newest: Observation | None = None
         """Newest frame before its display."""
         self._random = np.random.default_rng(seed)
@@ -163,7 +163,7 @@ class ObservationWindow:
         return next((each for each in newest if each.seq == seq), None)
 
     def replace(self, observation: Observation) -> None:
-        """Replace the frame with the same number.
+        """Replace the observation of the frame with the same number.
 
         Raises:
             InvalidInput: if there is none.

@@ -208,7 +208,7 @@ class PostponedGrowth:
         return None if self._out_of_view is None else self._out_of_view.unseen_s(count)
 
     def begin(self, camera: Camera) -> None:
-        """Start a scene that `camera` sees first."""
+        """Start a scene whose first frame is observed by `camera`."""
         if self._out_of_view is not None:
             self._out_of_view.restart()
         self._upkeep = None if self._config.history_s is None else Upkeep(camera, self._config)

@@ -36,7 +36,7 @@ LONG_AGO = (1980, 1, 1, 0, 0, 0)
 
 
 def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool = False) -> int:
-    """Export a model to a file, written atomically. The same model and wish give the same bytes.
+    """Export a model to a file, written atomically. Equal models and wishes give bit-identical files.
 
     Args:
         model: model to export.

@@ -41,7 +41,7 @@ FORMATS: Mapping[str, ExportFormat] = {
 
 
 def format_named(name: str) -> ExportFormat:
-    """Return the format of this name.
+    """Return the export format with a name.
 
     Raises:
         InvalidSetting: if the format does not exist.

@@ -46,7 +46,7 @@ class _Made(Generic[T]):
         self._error: BaseException | None = None
 
     def fill(self, items: Generator[T, None, None]) -> None:
-        """Run the producing thread."""
+        """Produce the items in the background thread until the iterator ends or `stop` is called."""
         error: BaseException | None = None
         try:
             try:

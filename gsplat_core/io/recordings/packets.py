@@ -54,7 +54,7 @@ def check_matroska(stream: BinaryIO, size: int) -> tuple[int | None, list[tuple[
 
 
 class Cluster(NamedTuple):
-    """Cluster that is complete in the file."""
+    """Matroska cluster that is completely contained in the file."""
 
     end: int
     """Byte position after the cluster."""
@@ -164,7 +164,7 @@ class UnusableContainer(Exception):
 
 @dataclass(frozen=True)
 class Container:
-    """Complete container."""
+    """Video container whose structure is complete."""
 
     demuxer: str
     """Name of the only FFmpeg demuxer permitted to read the file."""

@@ -117,7 +117,7 @@ class ArrayHeader:
 
 
 def read_header(path: Path) -> ArrayHeader:
-    """Read the header alone.
+    """Read only the header of a `.npy` file.
 
     Raises:
         UnreadableFile: if the file is not a complete plain array of numbers.

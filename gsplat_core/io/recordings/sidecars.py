@@ -51,7 +51,7 @@ class Beside:
         self._findings = findings
 
     def files(self) -> tuple[Path, ...]:
-        """Existing single-file sidecars."""
+        """Existing sidecars that consist of a single file."""
         found = (self._file(name) for name in _FILES)
         return tuple(path for path in found if path is not None)
 

@@ -175,7 +175,7 @@ class TrueMotion:
 
 @dataclass(frozen=True)
 class MotionFiles:
-    """Motion files of all frames, in order."""
+    """Optical-flow and scene-flow files of a recording, in frame order."""
 
     flow: tuple[Path, ...]
     scene_flow: tuple[Path, ...]
@@ -199,7 +199,7 @@ class MotionFiles:
 
 
 def open_motion(folder: Path, frame_count: int) -> MotionFiles | None:
-    """Open the motion files of a recording; None without any.
+    """Open the motion files of a recording. Returns None if it has none.
 
     Raises:
         RecordingInvalid: if there are too few files.

@@ -62,13 +62,13 @@ class _PictureLine(Record):
 
 
 class FrameLine(FrameFields, _PictureLine):
-    """Frame as received, after the out-of-body gate and the concurrent image checks."""
+    """Log line of a frame as received, after the out-of-body gate and the concurrent image checks."""
 
     event: Literal["frame"] = "frame"
 
 
 class PreparedLine(FrameFields, _PictureLine):
-    """Frame as passed to training.
+    """Log line of a frame as passed to training.
 
     A plane without a track here, but listed in `same`, equals that of the received frame.
     """
@@ -78,7 +78,7 @@ class PreparedLine(FrameFields, _PictureLine):
 
 
 class ShownLine(Record):
-    """Displayed picture."""
+    """Log line of a displayed picture."""
 
     event: Literal["shown"] = "shown"
     seq: Count
@@ -112,7 +112,7 @@ class LostLine(Record):
 
 
 class DeletedLine(Record):
-    """Older segment that was deleted to keep the recording within its limits."""
+    """Log line for an older segment that was deleted to keep the recording within its limits."""
 
     event: Literal["deleted"] = "deleted"
     segment: Count
@@ -120,7 +120,7 @@ class DeletedLine(Record):
 
 
 class NoteLine(Record):
-    """Human-readable remark."""
+    """Log line with a human-readable remark."""
 
     event: Literal["note"] = "note"
     text: Text
@@ -159,7 +159,7 @@ class ReconstructorMade(Record):
 
 
 class SceneBegun(Record):
-    """Call of `Reconstructor.begin_scene`."""
+    """Schedule line of a call of `Reconstructor.begin_scene`."""
 
     event: Literal["begin_scene"] = "begin_scene"
     seq: Count
@@ -194,7 +194,7 @@ class Grown(Record):
 
 
 class Rehearsed(Record):
-    """Call of `Reconstructor.rehearse`."""
+    """Schedule line of a call of `Reconstructor.rehearse`."""
 
     event: Literal["rehearse"] = "rehearse"
     steps: Steps

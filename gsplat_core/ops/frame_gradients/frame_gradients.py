@@ -157,7 +157,7 @@ def render_frame_backward_adam_(
 def _check(
     op: str, gaussians: Sequence[Tensor], deltas: Tensor | None, view: View, v_image: Tensor, v_alphas: Tensor | None
 ) -> None:
-    """Check arguments; the compiled ops check the forward results against these sizes."""
+    """Check the arguments. The compiled ops check the forward results against the sizes of the arguments."""
     check_inputs(op, gaussians, deltas, view, v_image=v_image, v_alphas=v_alphas)
     require_shape("v_image", v_image, (view.height, view.width, 4), "[H, W, 4]")
     if v_alphas is not None:

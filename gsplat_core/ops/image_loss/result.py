@@ -18,6 +18,6 @@ class ImageLoss(NamedTuple):
     Not differentiable.
     """
     grad_image: Tensor
-    """dL/dimage [H, W, C]. Not differentiable."""
+    """Gradient of the loss by the image, dL/dimage [H, W, C]. Not differentiable."""
     grad_depth: Tensor | None
     """dL/ddepth [H, W]; None without depth. Not differentiable."""

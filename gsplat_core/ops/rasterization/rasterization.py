@@ -110,7 +110,7 @@ class Saved(NamedTuple):
 
 
 class Rasterized(NamedTuple):
-    """Results of the forward pass.
+    """Rendered pictures and intermediate results of the forward pass.
 
     `opacities` is empty unless antialiased or packed. The ids are None unless packed.
     """

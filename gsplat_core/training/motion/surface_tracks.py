@@ -115,12 +115,12 @@ class SurfaceTracks:
 
     @cached_property
     def _ahead(self) -> list[SurfaceMotion]:
-        """Motion from each frame to the next."""
+        """Surface motion from each frame to the next one."""
         return self._motions(_flows(self._frames), self._seen)
 
     @cached_property
     def _back(self) -> list[SurfaceMotion]:
-        """Motion from each frame but the first to the previous one."""
+        """Surface motion from each frame except the first to the previous frame."""
         return self._motions(_flows(self._frames[::-1]), self._seen[::-1])[::-1]
 
     def _motions(self, flows: Sequence[Flow], seen: Sequence[Observation]) -> list[SurfaceMotion]:
@@ -142,7 +142,7 @@ class SurfaceTracks:
 
 @dataclass(frozen=True)
 class SurfaceDepth:
-    """Depth of one frame for reading at tracked points."""
+    """Depth of one frame, prepared for sampling at tracked points."""
 
     planes: Tensor
     """Planes [3, H, W]: depth away from edges, 0 elsewhere; validity of it; surface extrapolated everywhere."""

@@ -73,7 +73,7 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
 
 
 class TrainingStep:
-    """Scene being learned with its optimiser.
+    """Scene in training: its Gaussians, deformation field and optimiser.
 
     On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it. Otherwise the gradient is
     computed at the deformed Gaussians, and the field's training propagates it to the field and the canonical Gaussians.

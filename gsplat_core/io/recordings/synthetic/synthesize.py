@@ -138,7 +138,7 @@ class FrameFiles:
     extras: Extras
 
     def make_folders(self) -> None:
-        """Create the folders of the files."""
+        """Create the folders that `write` writes to."""
         names = ["images", "masks", "depth"]
         names += ["images_right"] if self.stereo else []
         names += [f"views/third/{name}" for name in ("images", "masks", "depth")] if self.extras.third else []
@@ -192,7 +192,7 @@ class FrameFiles:
         save_depth(folder / "depth" / _name(index, "depth"), eye.depth)
 
     def _noisy(self, depth: NDArray[Any], index: int) -> NDArray[Any]:
-        """Add noise to the depth as from a stereo matcher: it grows with the squared distance."""
+        """Add noise to the depth that grows with the squared distance, like that of a stereo matcher."""
         random = np.random.default_rng((self.seed, index, 3))
         spread = self.extras.depth_noise_mm * np.square(depth / np.float32(TISSUE_DISTANCE_MM))
         return np.maximum(depth + spread * random.standard_normal(depth.shape, np.float32), np.float32(DEPTH_UNIT_MM))
