@@ -1,6 +1,6 @@
 """Write LICENSES.md: name, version and licence of every package that `requirements-service.lock` pins for this platform.
 
-The versions are those of the lock file, the licences those that the installed packages state, as `pip-licenses` reads them.
+Versions come from the lock file. Licences come from the metadata of the installed packages, read by `pip-licenses`.
 
 Usage: python deploy/third_party_licences.py [--out LICENSES.md]
 """
@@ -19,18 +19,18 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 UNSTATED = {"cuda-toolkit": "no code of its own: requires NVIDIA's CUDA packages"}
-"""Packages whose metadata have no licence, and why that is no gap."""
+"""Packages without a licence in their metadata, and the reason why none is needed."""
 HEADER = """# Third-party licences
-The packages that `requirements-service.lock` installs on Linux with Python {python}, those of `requirements.lock` among them, and the licence
-that each states. Written by `deploy/third_party_licences.py`. None of them is part of this repository.
+The packages that `requirements-service.lock` installs on Linux with Python {python}, including those of `requirements.lock`, with the licence
+of their metadata. Written by `deploy/third_party_licences.py`. None of them is part of this repository.
 
-OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. PyAV (`av`) is under the BSD licence; its wheel carries
-FFmpeg's libraries, which state LGPL 3 or later, and beside them x264 and x265, which are under the GPL 2 or later. IntraSplat uses
-of them FFmpeg's demuxers, muxers, decoders and FFV1 encoder, libvpx and dav1d (both BSD). It does not use x264 and x265 (its tests do), but whoever
-passes the wheel on, in a container image for example, passes them on too. Without them: build PyAV against an FFmpeg of your own.
+OpenCV's wheel contains FFmpeg's libraries, which are under the LGPL 2.1. PyAV (`av`) is under the BSD licence. Its wheel contains
+FFmpeg's libraries, which state LGPL 3 or later, and x264 and x265, which are under the GPL 2 or later. Of these, IntraSplat uses
+FFmpeg's demuxers, muxers, decoders and FFV1 encoder, libvpx and dav1d (both BSD). Only its tests use x264 and x265, but redistributing
+the wheel, for example in a container image, also redistributes them. To avoid this, build PyAV against a separate FFmpeg.
 
-NVIDIA's packages come with torch. `make cuda` also installs NVIDIA's compiler (`requirements-cuda.lock`), under NVIDIA's own licence;
-the kernels that it builds contain CUDA's static runtime.
+NVIDIA's packages come with torch. `make cuda` also installs NVIDIA's compiler (`requirements-cuda.lock`), under NVIDIA's own licence.
+The compiled kernels contain CUDA's static runtime.
 
 | package | version | licence |
 |---|---|---|
@@ -53,12 +53,12 @@ def locked(path: Path) -> tuple[dict[str, Requirement], list[str]]:
 
 
 def version_of(requirement: Requirement) -> str:
-    """The pinned version."""
+    """Return the pinned version of a requirement."""
     return str(requirement.specifier).removeprefix("==")
 
 
 def stated_licences() -> dict[str, str]:
-    """Licence of each installed package, by canonical name; long texts are cut to their first line."""
+    """Return the licence of each installed package by canonical name; long texts are cut to their first line."""
     command = [sys.executable, "-m", "piplicenses", "--python", sys.executable, "--with-system", "--format=json"]
     listed = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     return {canonicalize_name(entry["Name"]): entry["License"].splitlines()[0] for entry in listed}

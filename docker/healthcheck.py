@@ -1,7 +1,7 @@
-"""Whether the server of this container answers: exit code 0 when /livez says 200, else 1 and a line that says what came instead.
+"""Health check of a container: exit code 0 if /livez returns status 200, otherwise 1 and one line with the status or error.
 
-The address is HEALTHCHECK_URL, by default that of the probe listener, which answers while the server's own port is full. A certificate is not
-checked: it names the server as others call it, and this asks at 127.0.0.1.
+The address is HEALTHCHECK_URL. Its default is the probe listener, which answers even if the server's port has reached its connection limit.
+The certificate is not verified, because the check connects to 127.0.0.1 and the certificate has the server's public name.
 """
 
 from __future__ import annotations

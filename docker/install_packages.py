@@ -1,11 +1,11 @@
-"""Installs the packages of a lock file into the environment of the Python that runs this; with CPU-only torch where an index for it is given.
+"""Install the packages of a lock file into the current Python environment, optionally with CPU-only torch.
 
     python install_packages.py requirements.lock
     python install_packages.py requirements.lock --torch-index-url URL [--torch-sha256 HEX]
 
-Without an index everything comes from the lock, checked by its hashes: torch from PyPI, with CUDA's libraries. With one, torch, Triton and
-NVIDIA's libraries are left out, and the same version of torch comes from that index as `VERSION+cpu`. The lock has no hash of it: give the
-wheel's SHA-256 to have it checked.
+Without an index all packages come from the lock and are checked by its hashes, including torch with CUDA's libraries. With an index, torch,
+Triton and NVIDIA's libraries of the lock are not installed, and the same version of torch comes from the index as `VERSION+cpu`. The lock has
+no hash of that wheel; --torch-sha256 checks it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def requirements(lock: str) -> Iterator[tuple[str, str, str]]:
 
 
 def without_cuda(lock: str) -> tuple[str, str]:
-    """Return a lock file without torch, Triton and NVIDIA's libraries, and the version of torch that it had. Raises ValueError without torch."""
+    """Return the lock file without torch, Triton and NVIDIA's libraries, and its version of torch. Raises ValueError without torch."""
     kept, version = [], None
     for name, number, text in requirements(lock):
         if name == "torch":
@@ -44,13 +44,13 @@ def without_cuda(lock: str) -> tuple[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Install; returns pip's exit code."""
+    """Install the packages and return pip's exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("lock", type=Path)
     parser.add_argument(
         "--torch-index-url", default="", help="index with CPU builds of torch; empty: torch of the lock"
     )
-    parser.add_argument("--torch-sha256", default="", help="digest that torch's wheel must have; empty: not checked")
+    parser.add_argument("--torch-sha256", default="", help="required SHA-256 of the torch wheel; empty: not checked")
     given = parser.parse_args(arguments)
     if not given.torch_index_url:
         return pip("install", "--require-hashes", "-r", str(given.lock))
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def pip(*arguments: str) -> int:
-    """Run pip of this environment; returns its exit code."""
+    """Run pip of the current environment and return its exit code."""
     return subprocess.run([sys.executable, "-m", "pip", *arguments], check=False).returncode
 
 
