@@ -1,7 +1,7 @@
 """Registries of the implementations that a user selects by name.
 
-Importing this module imports no implementation, and neither torch nor NumPy. The command line and the service list the names
-from here. A new implementation is a module and one line in this file.
+Importing this module imports no implementation, and neither torch nor NumPy. The command line and the service read the
+names from these registries. A new implementation is a module and one line in this file.
 """
 
 from __future__ import annotations

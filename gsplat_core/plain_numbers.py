@@ -1,6 +1,7 @@
-"""Numbers in text that a user wrote.
+"""Parsing of numbers in text written by a user.
 
-`int` and `float` also accept `1_0` and the digits of other scripts. In a command line or an address such text is a typing error.
+`int` and `float` also accept `1_0` and the digits of other scripts. In a command line or an address, such text is a
+typing error.
 """
 
 from __future__ import annotations

@@ -1,19 +1,13 @@
 """Relief of tissue from the shading of a single static camera at several times (shape from shading).
 
-The model is a relief lit by the scope's own lamp: brightness and highlights with derivatives. The fit is a least-squares problem over several pictures.
-
-Shading model of a relief lit by the scope's own lamp: brightness and highlights with derivatives.
-
 The logarithm of depth is a sum of cosines along the picture's sides: u = Σ c_k cos_k, z = exp(u). A surface lit by a
-small lamp at the camera's centre has the brightness cos θ / r², where θ is the angle between its normal and the ray
-and r the distance along the ray. With x = X / z, y = Y / z and partial derivatives ∂x, ∂y this is exactly
+small lamp at the camera's centre has the brightness cos θ / r². Here θ is the angle between the surface normal and the
+ray, and r the distance along the ray. With x = X / z, y = Y / z and partial derivatives ∂x, ∂y this is exactly
 
     r² = z² (1 + x² + y²),   cos θ = 1 / (√(1 + x² + y²) |N|),   N = (-∂x u, -∂y u, 1 + x ∂x u + y
         ∂y u)
 
 (Prados and Faugeras 2005). Wet tissue shows highlights where its normal points to the lamp, that is where θ is small.
-
-Relief of tissue from the shading of a single static camera at several times (shape from shading with further cues).
 
 The unknowns are the relief at a key time and its change at every other time. Three cues are used:
 
@@ -25,9 +19,9 @@ The total light may change.
 * **Highlights** on wet tissue. Their frequency falls exponentially with the surface's angle to the
 lamp, at an unknown rate.
 
-All unknowns have Gaussian priors. The widths for relief and changes are estimated by evidence maximisation (MacKay
-1992). The maximum a posteriori is found by Gauss-Newton. Unknowns of a single cue are eliminated from the equations
-of the relief.
+The fit is a least-squares problem over all pictures. All unknowns have Gaussian priors. The widths for relief and
+changes are estimated by evidence maximisation (MacKay 1992). The maximum a posteriori is found by Gauss-Newton.
+Unknowns of a single cue are eliminated from the equations of the relief.
 """
 
 from __future__ import annotations

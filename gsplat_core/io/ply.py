@@ -1,8 +1,8 @@
 """Gaussians as `.ply`, in the layout of the INRIA trainer that viewers and editors read.
 
-One `vertex` element, binary little endian, all `float`: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. Opacity
-is a logit, scales are logarithms, rotations wxyz. `f_rest_*` is channel-major: all higher coefficients of red, then of green,
-then of blue. Normals are written as zero and ignored when read.
+The file has one `vertex` element, binary little endian, with `float` properties: x y z nx ny nz f_dc_0..2 f_rest_*
+opacity scale_0..2 rot_0..3. Opacity is a logit, scales are logarithms, rotations are wxyz. `f_rest_*` is channel-major:
+all higher coefficients of red, then of green, then of blue. Normals are written as zero and ignored when read.
 """
 
 from __future__ import annotations

@@ -272,15 +272,15 @@ class Operations(StepOperations):
     ) -> tuple[Tensor, Tensor, Meta]:
         """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments, in its order, and its results.
 
-        Shapes; `...` are any batch dimensions, the same everywhere:
+        Shapes, where `...` are any batch dimensions, common to all arguments:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
             colors [..., N, D] or [..., C, N, D] when `sh_degree` is None, else coefficients [..., N, K, 3] or
-            [..., C, N, K, 3] with K >= (sh_degree + 1)², shown as max(0, 0.5 + sum);
+            [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as max(0, 0.5 + sum);
             viewmats [..., C, 4, 4] world to camera, OpenCV axes; Ks [..., C, 3, 3] in pixels.
 
         Args:
             width, height: image size in pixels; the first pixel's centre is at (0.5, 0.5).
-            near_plane, far_plane: Gaussians whose centre has a z outside of these are culled.
+            near_plane, far_plane: range of z in the scene's unit; Gaussians with a centre outside it are culled.
             radius_clip: Gaussians with both radii at or below this many pixels are culled.
             eps2d: blur in pixels² added to the diagonal of the 2D covariance.
             packed: `meta` holds one row per visible Gaussian and camera; the image is the same.
@@ -292,13 +292,14 @@ class Operations(StepOperations):
             rasterize_mode: "antialiased" scales the opacity by sqrt(det Σ / det (Σ + blur)) (Yu et al. 2024).
             camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
             covars: [..., N, 3, 3] in place of quats and scales.
-            constants: the version of gsplat whose constants hold. "1.6": alpha is at most 0.99, and the factor of "antialiased"
-                at least 0.005. "1.5.3": 0.999 and 0. A value at its limit has no gradient. The other constants are the same.
-            channel_chunk, segmented: accepted and without effect; neither changes the result.
+            constants: gsplat version whose constants are used. "1.6" limits alpha to at most 0.99, and the factor of
+                "antialiased" to at least 0.005. "1.5.3" limits them to 0.999 and 0. A value at its limit has no gradient.
+                All other constants are equal.
+            channel_chunk, segmented: accepted for compatibility with gsplat; without effect.
 
-        On CUDA one native call per pass renders tiles of 16 px and spherical harmonics or up to 3 plain colours with the
-        constants of 1.6; the rest goes through the chain of operations. Either way the host waits once, for the length of the
-        tiles' lists.
+        On CUDA, one native call per pass renders pictures with tiles of 16 px, the constants of 1.6, and spherical harmonics
+        or at most 3 plain colour channels. Other arguments use the chain of operations. In both cases the host synchronises
+        once, for the length of the tile lists.
 
         Returns:
             render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and
@@ -306,12 +307,12 @@ class Operations(StepOperations):
             conics, opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets, width,
             height, tile_size, n_batches and n_cameras.
 
-        A Gaussian with a NaN or an infinity in any input, or a rotation of length zero, is culled: it has radii 0, gets
-        zero gradients and does not touch the others.
+        A Gaussian with a NaN or an infinity in any input, or a rotation of length zero, is culled. It has radii 0,
+        gets zero gradients and does not affect other Gaussians.
 
         Raises:
-            InvalidInput: a shape, dtype, device or mode that does not fit, with what was seen.
-            NotImplementedError: an argument of gsplat's that is not supported, with its value.
+            InvalidInput: if a shape, dtype, device or mode does not fit; the message states the observed value.
+            NotImplementedError: if an argument of gsplat is not supported; the message states its value.
         """
         asked_for = (
             sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,

@@ -36,7 +36,7 @@ def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Ras
     """Render with the native call; one host synchronisation, for the length of the tile lists.
 
     Returns:
-        The same result as the chain of operations, or None for unsupported or invalid arguments.
+        Result equal to that of the chain of operations, or None for unsupported or invalid arguments.
             The chain then renders them or raises the error.
     """
     return _rasterize(arguments, settings) if _takes(arguments, settings) else None

@@ -36,7 +36,7 @@ RELAXING_STEPS = 3600
 training does not hold them.
 """
 THINNEST_PX = 0.2
-"""Smallest standard deviation in pixels; smaller ones look alike because of the renderer's blur of 0.55 px."""
+"""Smallest standard deviation in pixels; smaller ones give equal pictures because of the renderer's blur of 0.55 px."""
 WIDEST = 8.0
 """Largest size, in multiples of the default size."""
 MOST_SPLIT = 0.02

@@ -1,7 +1,7 @@
 """Encoders of exported files: Gaussians and meshes as `.splat`, `.ply` and binary glTF 2.0.
 
-`.splat` is the layout of antimatter15's viewer, 32 bytes for each Gaussian. Gaussians in glTF use the extension KHR_gaussian_splatting (kernel
-`ellipse`, as ratified by Khronos). Meshes are written with vertex colours and without lighting.
+`.splat` is the layout of antimatter15's viewer, with 32 bytes per Gaussian. Gaussians in glTF use the extension
+KHR_gaussian_splatting (kernel `ellipse`, as ratified by Khronos). Meshes have vertex colours and no lighting.
 """
 
 from __future__ import annotations

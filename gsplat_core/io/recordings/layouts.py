@@ -9,8 +9,8 @@
 | images or videos named for the left and right eye | `images`, `video` | a stereo pair                                  |
 | `session.json`                                    | `session`  | the frames of a live session, with their own times    |
 
-The sidecars mean the same in every layout and each is optional. `recording.json`, which `synthesize` writes, adds frame rate, camera, unit of depth and
-stereo baseline.
+Sidecars have equal meaning in every layout, and each is optional. `recording.json`, which `synthesize` writes, adds
+frame rate, camera, unit of depth and stereo baseline.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Records of a session's recording: the lines of its log, the schedule of training calls, and `session.json`.
 
-A log is JSON lines, one object each with its kind under `event`. Each line is written by one system call, so only the last one can be cut. The schedule
-lists the training calls of a live session so that replay can repeat them.
+A log consists of JSON lines. Each line is one object with its kind under `event`. Each line is written by one system
+call, so only the last line can be truncated. The schedule lists the training calls of a live session, so that replay can
+repeat them.
 """
 
 from __future__ import annotations

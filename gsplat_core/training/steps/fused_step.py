@@ -1,6 +1,6 @@
-"""Training step on an NVIDIA GPU as one CUDA graph without host synchronisation: deformation, rendering, loss, backward pass and update.
+"""Training step on an NVIDIA GPU as one CUDA graph without host synchronisation.
 
-Its inputs are held at fixed addresses.
+The graph contains deformation, rendering, loss, backward pass and update. Its inputs are held at fixed addresses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Optimiser step of a scene: deformation, rendering, loss, backward pass and update. Any deformation field is trained through autograd."""
+"""Optimiser step of a scene: deformation, rendering, loss, backward pass and update.
+
+`AutogradTraining` trains any deformation field.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Deforming tissue: a smooth sheet of material points (u, v) with motion, breathing and colour.
 
-The texture has multi-octave noise, islands of fat, branching vessels, fine relief and wetness. It is looked up by (u, v),
-the point's position on the undeformed sheet in millimetres, so it moves with the tissue, and finer texels show the same
-tissue in more detail. Times are in seconds. World axes are those of the camera at rest (x right, y down, z away).
+The texture has multi-octave noise, islands of fat, branching vessels, fine relief and wetness. It is sampled at (u, v),
+the point's position on the undeformed sheet in millimetres. It therefore moves with the tissue, and finer texels show
+equal tissue in more detail. Times are in seconds. World axes are those of the camera at rest (x right, y down, z away).
 """
 
 from __future__ import annotations
