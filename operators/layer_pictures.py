@@ -19,7 +19,7 @@ RANGE_FOLLOWS = 0.3
 """Weight of the newest picture in the moving average of the depth range, to avoid flicker."""
 HATCH_PX = 12
 UNOBSERVED, UNOBSERVED_LINE = (24, 18, 32), (150, 60, 170)
-"""RGB colours of unobserved pixels and of their hatch lines; neither occurs in the colour maps."""
+"""RGB colours of unobserved pixels and of the hatch lines across them. Neither colour occurs in the colour maps."""
 VIRTUAL = (190, 110, 255)
 """RGB colour of the border around a picture from a virtual camera."""
 

@@ -162,7 +162,7 @@ class OnScreenResult:
     """Number of frames scored against an older picture, because their own was not on display when the next frame
     arrived."""
     unscored: int
-    """Frames that arrived too fast to be scored."""
+    """Number of frames dropped unscored, because frames arrived faster than they could be scored."""
 
 
 class PictureDigest:
@@ -214,7 +214,7 @@ class OnScreen:
         self._current: ShownPicture | None = None
         self._last_seq: int | None = None
         self.unscored = 0
-        """Frames that arrived too fast to be scored."""
+        """Number of frames dropped unscored, because frames arrived faster than they could be scored."""
 
     def add_picture(self, shown: ShownPicture) -> None:
         """Add a picture in the order of display. Repetitions are ignored."""

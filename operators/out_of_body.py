@@ -26,7 +26,7 @@ NOT_EXAMINED = "could not be examined"
 
 
 class Gate(Protocol):
-    """Classifier of a stream's pictures: inside or outside of the body."""
+    """Classifier that judges each picture of a stream as taken inside or outside of the body."""
 
     def judge(self, image: NDArray[np.uint8]) -> str | None:
         """Return None for a picture taken inside of the body, otherwise the reason. image: uint8 RGB [H, W, 3]."""

@@ -79,7 +79,7 @@ class ModelResult:
 
 @dataclass(frozen=True)
 class TrainedEyes:
-    """Cameras of a stereo scope whose pictures the model was trained on."""
+    """Outcome part: the eyes of a stereo endoscope whose pictures the model was trained on."""
 
     eyes: Eyes
 
@@ -203,7 +203,7 @@ class ReconstructOp(Operator):
             request, newest = self._requests.popleft(), learner.newest
             try:
                 model = newest if isinstance(newest, Snapshot) else learner.reconstructor.whole_model(newest)
-            except Exception as error:  # reported to the requester; the stream continues
+            except Exception as error:  # refuse the request; the stream must continue
                 log.exception("the whole model was not copied")
                 request.refuse(f"{type(error).__name__}: {error}")
                 continue

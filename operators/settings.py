@@ -51,7 +51,7 @@ class SourceSection(Section):
 
     @property
     def given_scale(self) -> float:
-        """Requested scale; 1 if none was given."""
+        """Return the requested scale of the frames; 1 if the option `scale` is None."""
         return 1.0 if self.scale is None else self.scale
 
 

@@ -256,7 +256,7 @@ no_tool_mask = _plain(NoToolMaskOp, "none")
 
 
 def onnx_tool_mask(fragment: Any, name: str, argument: str) -> Operator:
-    """Create an `OnnxToolMaskOp`. Raises InvalidSetting without the path of a model."""
+    """Create an `OnnxToolMaskOp` for the model file `argument`. Raises InvalidSetting if `argument` is empty."""
     if not argument:
         raise InvalidSetting("tool mask 'onnx' needs the path of a model: onnx:PATH")
     return OnnxToolMaskOp(fragment, name=name, path=Path(argument))

@@ -40,7 +40,8 @@ from services.version import product_version
 MANIFEST = "backup.json"
 DATA = "data"
 STAGE = ".restore-"
-"""Name prefix of the folder in a target that holds the files of a running restore, and marks an unfinished one."""
+"""Name prefix of a restore's staging folder inside the target folder. After a crash it marks the restore as
+unfinished."""
 FORMAT = 1
 TRIES = 5
 """Attempts to copy data that a running service may change meanwhile."""

@@ -30,8 +30,8 @@ from services.schemas.service import CheckResult
 
 @dataclass(frozen=True)
 class StoredFiles:
-    """Folders of a service or a backup. None means that the files are in external storage and not
-    checked."""
+    """Folders in which a service or a backup has its files. `blobs` is None if the files are in an object store,
+    which is not checked."""
 
     recordings: Path
     replays: Path

@@ -90,7 +90,7 @@ PERCENTILES = tuple(k / 100 for k in range(101))
 
 @dataclass(frozen=True)
 class Start:
-    """Start time of a run, as a date and for measuring durations."""
+    """Start time of a run, as a date and as a `perf_counter` value."""
 
     at: datetime
     s: float

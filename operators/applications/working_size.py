@@ -32,7 +32,7 @@ TRIAL_INTERVAL_S = 0.02
 
 
 class MadeUpTissue(ThreadedSource):
-    """A few moving synthetic tissue pictures, of the size of `like`."""
+    """Source of a few synthetic tissue pictures with motion, with the properties of the source description `like`."""
 
     def __init__(self, like: SourceDescription) -> None:
         super().__init__(ahead=1)

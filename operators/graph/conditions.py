@@ -73,7 +73,7 @@ class CountCondition(Condition):
 
 
 class PeriodicConditionPolicy(Enum):
-    """Treatment of missed ticks. The examples use a period of 100 ms."""
+    """Rule for the due times after a late compute. The examples have a period of 100 ms; a tick is one compute."""
 
     CATCH_UP_MISSED_TICKS = 0
     """After ticks at 0 and 250 ms, the next are due at 200 and 300 ms, so missed ticks are made up for."""
@@ -141,7 +141,7 @@ class BooleanCondition(Condition):
 
 
 class AsynchronousEventState(Enum):
-    """State of an external event."""
+    """State of an event outside of the graph, such as a network request, that an operator waits for."""
 
     READY = 0
     """No event pending: the operator may compute."""

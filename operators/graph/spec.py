@@ -49,7 +49,8 @@ class IOSpec:
     """One port. `condition` and `connector` return the port for chaining."""
 
     ANY_SIZE: ClassVar[int] = -1
-    """Size of an input with any number of connections; `receive` returns a tuple with one entry per connection."""
+    """Value of `size` for an input with any number of connections. Its `receive` returns a tuple with one entry per
+    connection."""
     ConnectorType = ConnectorType
     QueuePolicy = QueuePolicy
 

@@ -170,7 +170,7 @@ class VideoFile:
         try:
             self._wait_for_frames(0)
             if self._broken:
-                return  # the caller has already received the error; finishing would fail for the same reason
+                return  # `write` has already raised this error; finishing the file would fail for the same reason
             if self.frames:
                 self._write(None)
             with self._writing():

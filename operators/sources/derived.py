@@ -198,7 +198,7 @@ class JoinedSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """State of the left eye while this source is open."""
+        """State of the left source while this source is open; `LIVE` while frames wait for `read`."""
         state = super().state
         return self._left.state if state is SourceState.LIVE and not self._ready else state
 

@@ -212,7 +212,7 @@ class LiveSource(ThreadedSource):
         return self._my_stop().wait(seconds)
 
     def count(self, reason: str, times: int = 1) -> None:
-        """Count dropped or repaired items."""
+        """Add `times` to the number of items dropped or repaired for `reason`."""
         with self._changed:
             if not self._my_stop().is_set():
                 self._counts[reason] += times

@@ -140,7 +140,7 @@ PIPE_BYTES = 1 << 20
 
 
 class Ended(Exception):
-    """The writer closed the pipe, or the source is being closed."""
+    """Raised by reads when the writer has closed the pipe, or while the source is being closed."""
 
 
 class PipeSource(StreamSource):

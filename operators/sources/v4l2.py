@@ -36,7 +36,8 @@ def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
 
 
 def device_of(path: str) -> str:
-    """Resolve `/dev/video0`, or a link to it as in `/dev/v4l/by-id/`. Raises InvalidSetting and SourceUnavailable."""
+    """Return the device path of a camera: `path` itself, such as `/dev/video0`, or the target of a link in
+    `/dev/v4l/by-id/`. Raises InvalidSetting and SourceUnavailable."""
     device = os.path.realpath(path) if path.startswith("/dev/") and "\0" not in path else path
     # Opening a device can have side effects, so only camera devices are accepted.
     if not _DEVICE.fullmatch(device):

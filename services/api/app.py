@@ -58,7 +58,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
         version=product_version(),
         summary="Live, deforming 3D reconstruction from endoscopic video.",
         description=ABOUT,
-        openapi_url=None, docs_url=None, redoc_url=None,  # documents.py serves its own, without external resources
+        openapi_url=None, docs_url=None, redoc_url=None,  # `pages.py` serves them, without external resources
         redirect_slashes=False,
         generate_unique_id_function=_operation_id,
         lifespan=_lifespan,

@@ -87,7 +87,8 @@ def rule_of(endpoint: Callable[..., Any]) -> Rule:
 
 
 class GuardedRoute(APIRoute):
-    """Route that enforces its rule before the body is read. FastAPI's dependencies run after that."""
+    """Route that enforces its access rule before the body is read. FastAPI would run dependencies only after
+    reading it."""
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         rule = rule_of(endpoint)

@@ -254,7 +254,7 @@ class TokenBuckets:
 
 
 class AddressRate:
-    """Middleware that answers 429 to an address above its request rate."""
+    """Middleware that answers 429 to a client whose IP address (/64 network for IPv6) exceeds its request rate."""
 
     def __init__(self, app: ASGIApp, buckets: TokenBuckets, measures: Measures) -> None:
         self._app = app

@@ -23,7 +23,7 @@ PROBLEM_JSON = "application/problem+json"
 
 
 class Problem(Exception):
-    """Error answer of the API.
+    """Exception that the API answers with a problem document (RFC 9457).
 
     `detail` is sent to the caller. It states what happened, the value and what to do.
     """
@@ -146,7 +146,7 @@ class Internal(Problem):
 
 
 class Unavailable(Problem):
-    """A resource that the request needs is temporarily unavailable."""
+    """A component that the request needs, such as the database or an engine, is temporarily unavailable."""
 
     status, title = 503, "Service unavailable"
 

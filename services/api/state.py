@@ -239,7 +239,7 @@ class ControlState:
     draining: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server starts to drain; endless responses then end."""
     repeated: Repeated = field(default_factory=Repeated)
-    """Answers cached for idempotent requests."""
+    """Cache of answers to requests with an Idempotency-Key."""
     audit_reads: TokenBuckets = field(default_factory=lambda: TokenBuckets(1 / 60, 1))
     """Limits audit entries about reading the audit log to one per key and filter each minute."""
     tasks: set[asyncio.Task[None]] = field(default_factory=set)

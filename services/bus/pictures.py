@@ -33,7 +33,7 @@ class Picture:
 
     header: Mapping[str, Any]
     image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3]."""
+    """Pixels, RGB uint8 [H, W, 3]."""
 
 
 class PicturePublisher:

@@ -204,7 +204,7 @@ class StreamFolder:
         return None
 
     def write_record(self, role: Role, spec_digest: str) -> None:
-        """Record this process as the one that serves a role."""
+        """Write the record of this process, which runs as `role` with the specification of this digest."""
         write_json(self.path / f"{role}.json", {**asdict(ProcessIdentity.own()), "spec_digest": spec_digest})
 
     def lock(self, role: Role) -> int:

@@ -29,7 +29,8 @@ _NAMES = "intrasplat-names"
 
 
 class _Descriptor(io.RawIOBase):
-    """Raw stream that writes to a descriptor. After the first error, which is kept, all output is dropped."""
+    """Raw stream that writes to a file descriptor. After a write error, stored in `error`, it discards all further
+    output."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor

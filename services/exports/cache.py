@@ -26,7 +26,7 @@ from services.errors import ExportBusy, ExportFailed, ExportRefused
 from services.registry.bundle_file import SUFFIX
 
 ISPLAT = ExportFormat("isplat", SUFFIX, "application/octet-stream")
-"""Complete model with its deformation, independent of time."""
+"""Format of the complete model with its deformation. Unlike the other formats it needs no point in time."""
 ALL: Mapping[str, ExportFormat] = {**FORMATS, ISPLAT.name: ISPLAT}
 
 

@@ -28,7 +28,7 @@ STEP_S = 0.02
 DATABASE_S = 0.5
 """Seconds between database accesses: claims are renewed and new jobs are looked up."""
 AGAIN_S = 2.0
-"""Pause in seconds after a database failure."""
+"""Seconds from a database failure to the next round of the pool."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PoolSettings:
 
 
 class JobPool:
-    """Bounded number of concurrent attempts, managed by one thread."""
+    """Pool that claims jobs and runs at most `workers` attempts at once. Managed by one thread."""
 
     def __init__(self, database: Database, results: Results, runner: Runner, settings: PoolSettings) -> None:
         pool = secrets.token_hex(8)

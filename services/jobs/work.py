@@ -31,7 +31,7 @@ def work(task: Task) -> None:
         require_shown(replay(settings, _Teller(task), report=_write_reports))
         if task.pack_model:
             _pack(task.out)
-    except Exception as error:  # noqa: BLE001 - the error becomes the reason of the failed job
+    except Exception as error:  # noqa: BLE001 - the error message becomes the failed job's reason
         traceback.print_exc(file=sys.stderr)
         sentence = user_sentence(error, [task.source])
         reason = (

@@ -75,7 +75,7 @@ def open_blobs(url: str | None, folder: Path, options: dict[str, Any] | None = N
 
 
 class FolderBlobs:
-    """Blob store in a local folder."""
+    """Blob store in a local folder, one file per key."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -36,7 +36,8 @@ class FolderLock:
 
     @contextlib.contextmanager
     def shared(self) -> Iterator[None]:
-        """Hold the lock in shared mode; blocks during a cleanup."""
+        """Hold the lock in shared mode while the block runs. Waits for a cleanup, which holds it exclusively, to
+        end."""
         with self._opened() as descriptor:
             fcntl.flock(descriptor, fcntl.LOCK_SH)
             yield

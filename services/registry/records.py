@@ -129,7 +129,7 @@ MODELS = sa.Table(
     sa.Column("last_version", sa.Integer, nullable=False),
     sa.Column("active", sa.Integer, nullable=True),
 )
-"""Models. `active` is the served version number; an activation updates only this row."""
+"""Table of models. `active` is the number of the active version; an activation updates only this row of the table."""
 VERSIONS = sa.Table(
     "versions",
     METADATA,

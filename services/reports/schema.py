@@ -29,7 +29,7 @@ class Part(BaseModel):
 
 
 class RecordingFacts(Part):
-    """Recording as read, after `--scale` and `--max-frames`."""
+    """Source of the run: name, frame size, rate and number of frames, after `--scale` and `--max-frames`."""
 
     name: str
     frames: Count | None
@@ -123,11 +123,11 @@ class BaselineQuality(Part):
     """Mean of all training frames, for every held-out frame."""
     heldout_previous_frame_db: float | None = None
     heldout_neighbour_mean_db: float | None = None
-    """Mean of the previous and next frame; uses the future."""
+    """Tissue PSNR in dB of the mean of the previous and the next frame. Uses a future frame."""
 
 
 class DepthErrors(Part):
-    """Root mean squared depth error over the median true depth, of all compared pixels."""
+    """Root mean squared depth error over all compared pixels, as a share of the median true depth."""
 
     reconstruction: float
     level_plane: float
@@ -184,7 +184,7 @@ class LiveFacts(Part):
     worst_psnr_tissue_db: float | None
     """Lowest score of a frame after the first second, in dB."""
     previous_frame_db: float | None
-    """Baseline: mean after the first second of the previous raw frame."""
+    """Trivial baseline: mean tissue PSNR in dB of the previous raw frame, after the first second."""
     pictures: Count
     """Number of new pictures displayed."""
     age_p50_ms: float
@@ -229,7 +229,7 @@ class FrameEntry(Part):
     next_frame_db: float | None = None
     """Score of the model's prediction of this frame before training on it; null without a prediction."""
     age_ms: float | None = None
-    """Live runs: age of the displayed picture at display."""
+    """Age of the displayed picture at display, in milliseconds; only in live runs."""
     steps: Count | None = None
     """Live runs: optimiser steps before the display."""
 
@@ -258,7 +258,7 @@ class RunReport(Part):
     model: ModelFacts | None
     """Null if the run ended before the first snapshot."""
     live: LiveFacts | None = None
-    """Null for runs without a clock."""
+    """Throughput and picture ages of a live run; null for other runs."""
     frames_sha256: Sha256
     notes: list[str] = []
     """Sentences about fallbacks and problems."""

@@ -126,7 +126,7 @@ class ProcessState:
 
 
 class Rate:
-    """Rate of a counter that is sampled irregularly."""
+    """Estimator of a counter's rate over the last `RATE_S` seconds, from irregular samples."""
 
     def __init__(self, over_s: float = RATE_S) -> None:
         self._over_s = over_s
@@ -326,7 +326,7 @@ class ManagedProcess:
                 await asyncio.wait({ended}, timeout=LOOK_S)
                 now_s = time.monotonic()
                 if now_s - looked_s > LOOK_S + PAUSED_S:
-                    self._heard_s = now_s  # the supervisor was suspended and could not receive heartbeats
+                    self._heard_s = now_s  # while suspended, the supervisor could not receive heartbeats
                     self._shown = self._shown[0], now_s
                 looked_s = now_s
                 hangs = None if killed or ended.done() else self._hangs(now_s)

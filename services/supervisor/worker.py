@@ -67,7 +67,7 @@ class ProcessLimits(_Strict):
     start_s: float = Field(default=120.0, gt=0)
     """Time allowed from the start of a process to its first heartbeat."""
     heartbeat_s: float = Field(default=3.0, gt=0)
-    """Time without heartbeats after which a process counts as hung."""
+    """Time without heartbeats after which the supervisor kills a process as hung."""
     hung_s: float = Field(default=10.0, gt=0)
     """Time without a published picture after which an engine counts as hung, once it has published its first
     picture. A working engine at least repeats its last picture."""
