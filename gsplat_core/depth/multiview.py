@@ -204,7 +204,7 @@ MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
 POSE_ERROR_PX = 0.6
 """Residual of static tissue in pixels, from errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
-"""Share of the views whose poses must explain their pictures."""
+"""Smallest share of the views whose poses must explain the image motion."""
 CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
 """Rejection reason if fewer than `FEWEST_AGREEING` of the views agree with their poses."""
 ROUNDS = 6
@@ -352,7 +352,7 @@ WIDEST_TURN = 0.7
 LABEL_PX = 0.75
 """Parallax between neighbouring distances of the sweep, in pixels of the view with the most parallax."""
 LABELS = 24, 96
-"""Fewest and most distances of a sweep."""
+"""Smallest and largest number of distances in a sweep."""
 MARGIN = 1.6
 """Factor by which the sweep extends the range of the corners' distances at both ends."""
 WORST_COST, BEST_COST = 0.35, 0.15

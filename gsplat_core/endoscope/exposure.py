@@ -94,7 +94,7 @@ UNCHANGED: Gains = (1.0, 1.0, 1.0)
 
 
 DEAD_ZONE = 0.08
-"""Difference from the present gain that is ignored while the gain is held."""
+"""Difference of a log gain from the held gain up to which the gain stays held."""
 DRIFT_ZONE = 0.1
 """Threshold for slow changes against older references; larger because the tissue has moved since."""
 MORE_PIXELS = 1.5

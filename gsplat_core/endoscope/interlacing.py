@@ -36,7 +36,7 @@ STAND_OUT_LEVELS = 4
 
 
 class Deinterlacer:
-    """Deinterlacer of a stream."""
+    """Detector of interlacing in a stream, which removes combs while the stream is interlaced."""
 
     def __init__(self) -> None:
         self.interlaced = False

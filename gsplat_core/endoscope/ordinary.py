@@ -55,9 +55,9 @@ LEAST_CHANGE_RATIO = 0.4
 BRIGHTNESS_LEVELS = 2.0
 """Largest shift of a channel's mean from the reference, in levels of 255."""
 SHARPNESS_SHARE = 0.08
-"""Largest relative change of the mean difference of neighbouring pixels from the reference."""
+"""Largest change of an ordinary picture's sharpness (mean difference of neighbouring pixels), relative to the reference."""
 MOST_INTERVAL_RATIO = 1.7
-"""Longest interval since the last frame, as a multiple of the usual one."""
+"""Longest interval since the last frame at an ordinary picture, as a multiple of the usual interval."""
 
 
 class OrdinaryPictures:

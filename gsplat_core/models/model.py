@@ -106,12 +106,10 @@ class Model:
 
     @property
     def device(self) -> torch.device:
-        """Device of the tensors."""
         return self.gaussians.device
 
     @property
     def gaussian_count(self) -> int:
-        """Number of Gaussians."""
         return self.gaussians.count
 
     def as_model(self) -> Model:

@@ -146,7 +146,6 @@ class Snapshot:
 
     @property
     def device(self) -> torch.device:
-        """Device of the slot."""
         return self.slot.gaussians.device
 
     @contextmanager

@@ -185,7 +185,7 @@ class _Ellipses(NamedTuple):
     conics: Tensor
     compensations: Tensor
     positive: Tensor
-    """Mask, bool: True where the 2D covariance is invertible; elsewhere the conic is meaningless."""
+    """Mask of invertible 2D covariances, bool; elsewhere the conic is meaningless."""
 
 
 def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Ellipses:

@@ -123,7 +123,7 @@ class FinishedFrame:
         return self._outputs
 
     def result(self) -> RenderOutput:
-        """The three standard outputs."""
+        """Return the three standard outputs of the frame."""
         return standard_outputs(self._outputs)
 
 

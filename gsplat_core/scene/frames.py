@@ -40,7 +40,7 @@ class Frame:
     right_camera: Camera | None = None
     """Camera of `right_image`; its pose maps left-camera coordinates to its own. None if unknown."""
     depth: NDArray[np.float32] | None = None
-    """z in millimetres [H, W]; 0 = unknown."""
+    """Depth z in millimetres [H, W]; 0 = unknown."""
     depth_confidence: NDArray[np.float32] | None = None
     """Confidence of each pixel's depth [H, W], 0 to 1; None for full confidence."""
     depth_origin: DepthOrigin | None = None
@@ -126,12 +126,10 @@ class Frame:
 
     @property
     def height_px(self) -> int:
-        """Height of the image."""
         return int(self.image.shape[0])
 
     @property
     def width_px(self) -> int:
-        """Width of the image."""
         return int(self.image.shape[1])
 
     def with_fields(self, **fields: Any) -> Frame:

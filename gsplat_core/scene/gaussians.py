@@ -91,12 +91,10 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
-        """Device of the tensors."""
         return self.means.device
 
     @property
     def dtype(self) -> torch.dtype:
-        """The tensors' dtype."""
         return self.means.dtype
 
     def tensors(self) -> dict[str, Tensor]:

@@ -86,7 +86,6 @@ class GaussianRows:
         return self.all.count
 
     def replace(self, gaussians: Gaussians) -> None:
-        """Replace all Gaussians."""
         self._use(gaussians.count)
         for tensor, values in self._beside(gaussians):
             tensor.copy_(values)

@@ -48,7 +48,6 @@ class _MaskedPair:
 
     @property
     def pixels(self) -> int:
-        """Number of pixels of the frame."""
         return int(self.image.shape[0] * self.image.shape[1])
 
     def masked(self) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -200,7 +200,6 @@ class PostponedGrowth:
 
     @property
     def archived(self) -> int:
-        """Number of archived Gaussians."""
         return 0 if self._out_of_view is None else len(self._out_of_view.archive)
 
     def unseen_s(self, count: int) -> Tensor | None:

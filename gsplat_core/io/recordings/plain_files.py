@@ -182,7 +182,8 @@ class Picture:
     image: NDArray[np.uint8]
     """Decoded picture, RGB uint8 [H, W, 3]."""
     damage: str | None = None
-    """Description of damage, after which parts may be the decoder's error concealment; None without any sign of damage.
+    """Description of the damage; None without any sign of damage. Parts of a damaged picture may be the decoder's error
+    concealment.
     """
 
 

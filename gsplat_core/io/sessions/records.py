@@ -151,9 +151,9 @@ class ReconstructorMade(Record):
     seed: Count
     renderer: Text
     config: dict[str, Any]
-    """Fields of `ReconstructorConfig`."""
+    """Values of the fields of `ReconstructorConfig`, by name."""
     training: dict[str, Any]
-    """Fields of `LiveTraining`."""
+    """Values of the fields of `LiveTraining`, by name."""
     camera: CameraRecord
     stereo: bool = False
     """True if the reconstructor was created for stereo frames."""

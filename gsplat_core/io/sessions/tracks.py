@@ -301,7 +301,6 @@ class TrackReader:
         return self._next[1:]
 
     def close(self) -> None:
-        """Close the file."""
         pictures, self._pictures, self._next = self._pictures, None, None
         if pictures is not None:
             pictures.close()  # type: ignore[attr-defined]
