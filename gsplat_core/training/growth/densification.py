@@ -48,7 +48,8 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
             picture = render(now, one.camera).image
             tissue = (one.mask > 0).to(picture.dtype)
             off = (picture - one.image.to(picture.dtype) / 255).abs().mean(-1) * tissue
-        # A uniform grey is not clamped, so its gradient is exactly the sum of the blending weights.
+        # A uniform grey is not clamped. The gradient of a Gaussian's colour is therefore the sum over pixels of its
+        # blending weight times the pixel's weight: tissue mask in the first channel, error in the second.
         grey = torch.zeros_like(now.sh).requires_grad_()
         picture = render(replace(now, sh=grey), one.camera).image
         weighted = (picture * torch.stack([tissue, off, torch.zeros_like(off)], -1)).sum()
