@@ -236,7 +236,8 @@ class BackgroundDepth:
 
     def _put(self, found: Frame, places: bool) -> None:
         self.counts.take(found, found)
-        # Prepared in this thread, because the training thread has no spare time between two frames.
+        # The training data is computed in the background thread, because the training thread has no spare time between
+        # two frames.
         late = LateDepth.of(found, self._device, places=places)
         with self._changed:
             self._found = found, late

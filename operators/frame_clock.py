@@ -206,7 +206,8 @@ class FrameClock:
         last, self._last_arrival = self._last_arrival, (arrived_ns, seq)
         if last is None:
             return
-        # Dropped frames count as intervals. Pauses and the bursts after them are clipped.
+        # Divide by the number of frames since the last arrival, including dropped ones. The interval is clipped to
+        # ignore pauses and the bursts after them.
         each_ns = (arrived_ns - last[0]) / max(1, seq - last[1])
         seen = min(max(each_ns, 0.2 * self.interval_ns), 5 * self.interval_ns)
         self.interval_ns += INTERVAL_DECAY * (seen - self.interval_ns)

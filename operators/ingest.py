@@ -116,8 +116,8 @@ class SourceOp(Operator):
         op_output.emit(frame, "frame")
         self.emitted += 1
         if self.emitted == self.source.description.frame_count:
-            # Ending here, not on an empty compute, keeps "calls" in the report equal to the number
-            # of frames.
+            # End in the compute of the last frame, so that the number of computes in the report equals the number of
+            # frames.
             self._end()
 
     def contribute(self, outcome: OutcomeBuilder) -> None:

@@ -453,7 +453,7 @@ class OutputFolder:
             except KeyboardInterrupt:
                 _switch_to(
                     self.folder, complete, self.made_by
-                )  # finish now, which is quick, instead of leaving it to the next run
+                )  # an interrupt must not leave the publication half done, and finishing it is quick
                 raise
 
     def _make(self) -> None:
@@ -469,7 +469,7 @@ class OutputFolder:
                 part.rmdir()
 
     def _remove_marker(self) -> None:
-        with contextlib.suppress(OSError):  # the folder was deleted meanwhile
+        with contextlib.suppress(OSError):  # the folder was deleted during the run
             if not _results(self.folder) and not (self.folder / RECORDINGS).is_dir():
                 (self.folder / MARKER).unlink()
 
@@ -635,7 +635,7 @@ def _switch_to(folder: Path, complete: Path, made_by: str) -> None:
 def _read_contents(complete: Path) -> dict[str, str]:
     try:
         found = json.loads(read_regular(complete / _CONTENTS, MOST_MARKER_BYTES))
-    except FileNotFoundError:  # an old version was interrupted here
+    except FileNotFoundError:  # an interrupted run of an old version leaves this state
         return {path.relative_to(complete).as_posix(): _fingerprint(path) for path in _files_in(complete)}
     return dict(found)
 

@@ -120,7 +120,8 @@ class Rasterizer:
         if self._stream is None:
             self._stream = torch.cuda.Stream(model.device, priority=-1)
         if isinstance(model, Model):
-            # A plain model has no completion event; a snapshot synchronises by itself.
+            # A `Model` has no CUDA event for its completion, so wait for the whole stream. A snapshot synchronises by
+            # itself.
             self._stream.wait_stream(torch.cuda.current_stream(model.device))
         return cast(AbstractContextManager[Any], torch.cuda.stream(self._stream))
 

@@ -13,7 +13,7 @@ NICENESS = 10
 
 def step_back() -> None:
     """Lower the scheduling priority of the calling thread. No effect except on Linux."""
-    if sys.platform == "linux":  # elsewhere it would affect the whole process
+    if sys.platform == "linux":  # on other systems the nice value applies to the whole process
         with suppress(OSError):  # if not permitted, keep the normal priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 

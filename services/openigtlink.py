@@ -156,7 +156,7 @@ class MessageServer:
             try:
                 client, address = self._listener.accept()
             except OSError:
-                return  # closed
+                return  # `close` has closed the listening socket
             with self._changed:
                 full = self._closed or len(self._clients) >= MOST_CLIENTS
                 if not full:

@@ -71,7 +71,7 @@ def _close(folder: Path, is_ours: Callable[[], bool]) -> bool:
         mode = f"{stat.S_IMODE(found.st_mode):04o}"
         if found.st_uid == 0 != os.geteuid() and os.access(
             folder, os.W_OK
-        ):  # Kubernetes volume: its group is the service's group
+        ):  # a Kubernetes volume, whose group is the service's own group
             if found.st_mode & 0o007:
                 log.warning("%s belongs to root and is open to every user of this machine (mode %s)", folder, mode)
             return False

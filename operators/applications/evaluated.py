@@ -178,7 +178,7 @@ def _check_camera(made: Camera, seen: Camera, name: str) -> None:
             f"the model's pictures have {made.width_px}x{made.height_px} px, those of {name} {seen.width_px}x{seen.height_px} px, which is"
             " another shape; give the recording that it was made from"
         )
-    # The height is rounded separately, so rows and columns have slightly different scales.
+    # Scaling rounds width and height to whole pixels separately, so their scale factors differ slightly.
     wanted = made.scaled(ratio).K if ratio != 1 else made.K
     apart = float(np.abs(wanted - seen.K).max()) / seen.width_px
     if apart > SAME_CAMERA + 1.0 / seen.height_px * (ratio != 1):

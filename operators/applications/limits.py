@@ -100,8 +100,8 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
     frames = source.frame_count or config.window_frames
     kept = frames if offline else min(frames, config.window_frames)
     pixels = source.width_px * source.height_px
-    # Offline training ends with all Gaussians. Online, Gaussians are added for new tissue, of which
-    # a fixed scope shows little.
+    # Offline training uses the full capacity. Online training adds Gaussians only for new tissue, of which a static
+    # endoscope shows little.
     gaussians = config.max_gaussians if offline else config.gaussians
     field = FIELDS[config.field].training_bytes(gaussians, frames / source.fps / config.motion_spacing_s)
     model = PARAMETER_BYTES * gaussians * _CANONICAL + field

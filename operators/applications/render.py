@@ -216,7 +216,7 @@ def render_model(
     check_device(device)
     check_renderer(renderer, device)
     model = load_model(bundle).to(device)
-    if is_scene_file(bundle) and view.name == RECORDED.name:  # such files contain no camera
+    if is_scene_file(bundle) and view.name == RECORDED.name:  # a scene file contains no camera for the recorded view
         view = ViewWish("orbit")
     check_shown_size(model.camera.width_px, model.camera.height_px, scale)
     camera = model.camera.scaled(scale)

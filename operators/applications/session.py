@@ -162,7 +162,7 @@ class Session:
     def run(self) -> None:
         """Run the graph to its end. Errors of this program are kept in `failure`; KeyboardInterrupt propagates."""
         assert self.started is not None, "start() comes first"
-        # Preserve the state of the caller's random generators.
+        # `seeded` restores the state of the caller's random generators after the run.
         with seeded(self.settings.seed, self.settings.device):
             self._attempt(lambda: run(self.graph, self.engine))
         self.wall_s = perf_counter() - self.started.s

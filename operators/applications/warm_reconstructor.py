@@ -40,10 +40,10 @@ def warm_reconstructor(
     image = noise(reconstructor.camera)
     height, width = image.shape[:2]
     tissue = np.ones((height, width), np.uint8)
-    tissue[height // 2 :, : width // 2] = 0  # initialisation differs if tools hide part of the scene
+    tissue[height // 2 :, : width // 2] = 0  # a tool, so that the code for hidden tissue runs, too
     depth = np.full((height, width), reconstructor.config.default_depth_mm, np.float32)
     drawn: list[object] = []
-    for frames in (WARM_FRAMES, 1):  # the second scene reuses the memory of the first, as in the stream
+    for frames in (WARM_FRAMES, 1):  # the second scene runs the code that reuses memory
         for seq in range(frames):
             frame = Frame(seq, seq * 33_000_000, image, mask=tissue)
             if stereo:

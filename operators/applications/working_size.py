@@ -168,7 +168,7 @@ def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
         (only,) = near
         squared = only**2 * allowed_s / measured[only]
         if measured[only] <= allowed_s:
-            # With mostly fixed cost this underestimates. Measuring a size a quarter larger gives
+            # If the fixed cost dominates, this estimate is too small. A measurement at a size about a quarter larger gives
             # the cost per pixel.
             squared = max(squared, (only + max(1, only // 4)) ** 2)
     else:

@@ -86,7 +86,7 @@ class Fragment:
                 f"add_flow({upstream.name}, {downstream.name}): capacity must be at least 1, got {capacity}"
             )
         chosen = None if policy is None else queue_policy(policy)
-        # On Holoscan the pairs are a set, whose order differs between runs.
+        # Holoscan's interface takes a set of pairs. Sorting makes the order equal in every run.
         for output, port in sorted(port_pairs):
             if output not in outputs:
                 raise GraphInvalid(f"operator {upstream.name!r} has no output {output!r}; it has {sorted(outputs)}")

@@ -175,7 +175,7 @@ class HoloscanScheduler:
     def wake(self) -> None:
         """Make the SDK check every operator again. Thread-safe."""
         for gate in self._gates:
-            if gate.checked:  # unknown to the SDK before its first check
+            if gate.checked:  # the SDK cannot be notified about a condition before its first check
                 gate.notify_scheduler()
 
     def now_ns(self, timestamp: int) -> int:
@@ -193,12 +193,12 @@ class HoloscanScheduler:
             begin.set()
             interruptible_wait(
                 self._over
-            )  # not join: after an interrupt, join considers the thread ended (Python 3.11)
+            )  # an event instead of `Thread.join`, which treats the thread as ended after an interrupt (Python 3.11)
         finally:
             stopped, begun = graph.stopping, begin.is_set()
             graph.stop()
             begin.set()
-            if begun:  # otherwise an interrupt came first, and the thread may not exist
+            if begun:  # False if an interrupt came before the start, so that the thread may not exist
                 interruptible_wait(self._over)
         if self.error is not None:
             raise self.error

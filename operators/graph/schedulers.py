@@ -203,7 +203,8 @@ class MultiThreadScheduler:
 
     def _rouse(self, task: OperatorTask) -> None:
         """Wake the thread of an operator if it sleeps. Requires the lock."""
-        # Removed here, because until its thread runs `_check_deadlock` would count it as asleep.
+        # Removed before the operator's thread wakes up, because `_check_deadlock` would still count the operator as
+        # asleep.
         if self._asleep.pop(task, None) is not None:
             self._wakers[task].notify()
 
@@ -217,7 +218,7 @@ class MultiThreadScheduler:
     def _join(self, threads: list[threading.Thread]) -> None:
         deadline_ns = self.clock.timestamp() + int(self.stop_timeout_s * 1e9)
         for thread in threads:
-            if not thread.is_alive():  # also never started, after an early interrupt
+            if not thread.is_alive():  # has ended, or was never started because of an early interrupt
                 continue
             thread.join(max(0, deadline_ns - self.clock.timestamp()) * 1e-9)
         stuck = [thread.name for thread in threads if thread.is_alive()]

@@ -56,7 +56,7 @@ def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
     zoom = -(-MINIMUM_PANE_WIDTH_PX // frame.width_px) if frame.width_px < MINIMUM_PANE_WIDTH_PX else 1
     middle = zoom * frame.width_px
     canvas = np.empty((CAPTION_HEIGHT_PX + zoom * frame.height_px, 2 * middle, 3), np.uint8)
-    # OpenCV fills faster than NumPy broadcasts a colour.
+    # Filling by OpenCV is faster than NumPy's broadcast of a colour.
     cv2.rectangle(canvas, (0, 0), (2 * middle, CAPTION_HEIGHT_PX - 1), _BACKGROUND, cv2.FILLED)
     for pane, image in (
         (canvas[CAPTION_HEIGHT_PX:, :middle], frame.image),

@@ -96,7 +96,7 @@ class VideoFile:
 
     @property
     def _frame_bytes(self) -> int:
-        # Far above the size of an encoded frame, to cover the encoder's buffers.
+        # The size of an uncompressed frame, far above that of an encoded frame, to cover the encoder's buffers.
         return self._even[0] * self._even[1] * 3
 
     def write(self, image: NDArray[np.uint8], time_s: float | None = None) -> None:
@@ -119,7 +119,7 @@ class VideoFile:
         if self._even != self._size:
             below, right = self._even[0] - self._size[0], self._even[1] - self._size[1]
             image = np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge")
-        # Eight times as fast as FFmpeg's conversion.
+        # OpenCV's conversion to YUV is eight times as fast as FFmpeg's.
         planes = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
         frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
         time_s = self.frames / self._fps if time_s is None else time_s

@@ -83,7 +83,7 @@ class ScaledSource(DerivedSource):
         super().__init__(source, scaled_description(source.description, scale))
 
     def _derived(self, frame: Frame) -> Frame:
-        # A frame of another size keeps the factor instead of the stream's size.
+        # A frame whose size differs from the description is scaled by the same factor, not to the described size.
         own, read = self.description, self._source.description
         if (frame.width_px, frame.height_px) == (read.width_px, read.height_px):
             return resized_frame(frame, own.width_px, own.height_px)

@@ -129,7 +129,7 @@ class KeyStore:
 
     def last_used(self) -> Mapping[str, str]:
         """Return the time of last use by key id, in UTC. Unused keys are absent."""
-        if self._used is None:  # no server in this process: read the file that a server may have updated
+        if self._used is None:  # no server in this process: another process may have written the file
             return _parse_used(self._used_path)
         return dict(self._used)
 
@@ -434,7 +434,7 @@ def limits_of(key: ApiKey) -> Detail:
     found: Detail = {}
     if key.expires_at is not None:
         found["expires_at"] = key.expires_at
-    if key.streams is not None:  # audit values are short: the number of streams and the first names
+    if key.streams is not None:  # audit values have a length limit: number of streams and first names
         found["streams"] = f"{len(key.streams)}: {' '.join(key.streams)}"[:400]
     return found
 

@@ -56,7 +56,7 @@ def batch_command(
 
 def _checked(options: Mapping[str, Any]) -> JobOptions:
     chosen = JobOptions(**options)
-    check_depth(chosen.depth)  # reads the network of onnx:FILE once, before the recordings
+    check_depth(chosen.depth)  # an unusable network of onnx:FILE must fail before the first recording
     return chosen
 
 

@@ -38,7 +38,7 @@ def serve_command(
     flags = {name: json.dumps(str(value)) for name, value in named.items() if value is not None}
     settings = load_settings(config, {**_assigned(setting), **flags})
     log_to_stderr(settings.log)
-    listener = bind(settings)  # before anything is created or started
+    listener = bind(settings)  # a failure must come before any file or process is created
     refuse_unfinished_restore(settings)
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     parts = assembled(settings)

@@ -262,7 +262,7 @@ class InterruptRequest:
         self._wakeup_before = signal.set_wakeup_fd(self._sender, warn_on_full_buffer=False)
         for number in ASKING:
             if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
-                continue  # nohup: the run must outlive its terminal
+                continue  # SIGHUP is ignored under nohup, so that the run survives its terminal
             self._before[number] = signal.signal(number, self._handle)
         threading.Thread(target=_acknowledge, args=(receiver,), name="signals", daemon=True).start()
         return self

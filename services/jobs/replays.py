@@ -66,7 +66,7 @@ class Replays:
         """
         gone = []
         for job_id, why in self._store.surplus(max_age_s, most):
-            with suppress(NotFound):  # deleted by a concurrent request
+            with suppress(NotFound):  # a concurrent request has deleted the replay
                 self.delete(job_id)
                 gone.append(Expired(job_id, why))
         return gone

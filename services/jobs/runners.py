@@ -81,7 +81,7 @@ class Forks:
         """See `Runner`."""
         for pid, job in self._pids.items():
             if job == job_id:
-                os.kill(pid, signal.SIGKILL)  # a child that was not reaped, so the id is not reused
+                os.kill(pid, signal.SIGKILL)  # the child was not reaped, so its process id cannot have been reused
 
     def close(self) -> None:
         """See `Runner`."""

@@ -96,7 +96,8 @@ class FolderBlobs:
             (self.folder / key).unlink(missing_ok=True)
 
     def stored(self) -> list[StoredBlob]:
-        # Only this machine writes here, and the caller holds the registry's lock.
+        # All files count as abandoned, because only this machine writes into the folder and the caller holds the
+        # registry's lock.
         with _store_errors(str(self.folder)):
             return [
                 StoredBlob(path.name, path.stat().st_size, abandoned=True) for path in sorted(self.folder.iterdir())
@@ -146,7 +147,7 @@ class RemoteBlobs:
             try:
                 found = self._files.ls(self._root, detail=True)
             except FileNotFoundError:
-                return []  # empty prefix
+                return []  # the prefix has no objects yet
         return [
             StoredBlob(
                 each["name"].rsplit("/", 1)[-1],

@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.write(f"{str(error).splitlines()[0]}\n")
         return 1
     except (MemoryError, RuntimeError) as error:
-        # torch's allocators raise RuntimeError when out of memory.
+        # torch's allocators raise RuntimeError when out of memory. Any other RuntimeError is a bug of the check.
         if isinstance(error, RuntimeError) and not any(words in str(error).lower() for words in _MEMORY_WORDS):
             raise
         reason = f"it needs more memory than the {CHECK_MEMORY_BYTES} bytes that a check may take"

@@ -260,7 +260,7 @@ class ModelRegistry:
                 try:
                     return version_record(version_row(connection, name, number))
                 except NotFound:
-                    continue  # replaced and deleted between the two queries
+                    continue  # between the two queries, the version was replaced and deleted: query again
         raise Conflict(f"the active version of model {name!r} changes all the time; ask again")
 
     def folder_of(self, name: str, version: int) -> Path:

@@ -99,7 +99,7 @@ class CapturedSource(LiveSource):
         for socket in (pictures, status, ended):
             poller.register(socket, zmq.POLLIN)
         run: Any = None
-        self._heard_s = time.monotonic()  # no subscription existed before, so earlier silence does not count
+        self._heard_s = time.monotonic()  # no heartbeat could arrive before the subscription
         try:
             while not self.wait(0):
                 found = dict(poller.poll(LOOK_MS))

@@ -246,7 +246,7 @@ class SupervisedStreams:
         """
         stream = self._stream(name)
         async with stream.changing:
-            self._launcher.open()  # opened with the first stream, because its preloaded modules take memory
+            self._launcher.open()  # not before the first stream, because preloaded modules take memory
             await stream.start()
         return stream.view()
 
