@@ -171,7 +171,7 @@ def kernel(log: str, work: str, asked: str = "", front: bool = False) -> Row:
 
 TABLES = (
     Table(
-        "Live, one NVIDIA H200",
+        "Live, one GPU",
         "`intrasplat live RECORDING --device cuda`, the whole command. PSNR is over tissue pixels. The displayed frame has been trained on "
         "before it is shown, so its PSNR is a training error. *Next frame* is what was predicted for a frame before the frame was seen, "
         "which is comparable with the previous frame shown again. Age runs from a frame's arrival to its picture on the screen.",
@@ -203,7 +203,7 @@ TABLES = (
         LIVE_FRONT,
     ),
     Table(
-        "What a live model keeps, one NVIDIA H200",
+        "What a live model keeps, one GPU",
         "A recording that does not repeat, played once in real time with as many steps as live has time for (`endless.py --clock --once`). At its end the frames of the last 5 s are rendered from the final model and compared with the recorded frames.",
         "recording",
         STREAM_COLUMNS,
@@ -217,17 +217,17 @@ TABLES = (
         "recording",
         REPLAY_COLUMNS,
         (
-            Row("`cutting`, H200", "cuda/replay_cutting"),
-            Row("`sinus`, H200", "cuda/replay_sinus"),
-            Row("`sinus`, H200, `--depth none`", "cuda/replay_sinus_no_depth"),
-            Row("`resting_bowel`, H200", "cuda/replay_resting_bowel"),
+            Row("`cutting`, one GPU", "cuda/replay_cutting"),
+            Row("`sinus`, one GPU", "cuda/replay_sinus"),
+            Row("`sinus`, one GPU, `--depth none`", "cuda/replay_sinus_no_depth"),
+            Row("`resting_bowel`, one GPU", "cuda/replay_resting_bowel"),
             Row("`cutting`, two CPU cores", "cpu/replay_cutting", asked="33 dB, 150 s, 3 GB"),
             Row("`cutting`, two CPU cores, HexPlane", "cpu/replay_cutting_hexplane"),
             Row("`sinus`, two CPU cores", "cpu/replay_sinus"),
         ),
     ),
     Table(
-        "Offline reconstruction, one NVIDIA H200",
+        "Offline reconstruction, one GPU",
         "`intrasplat reconstruct RECORDING --device cuda`, default settings. Every eighth frame is held out. The neighbours' mean sees the frame after the held-out one.",
         "recording",
         OFFLINE_COLUMNS,
@@ -253,7 +253,7 @@ TABLES = (
         ),
     ),
     Table(
-        "Kernels, one NVIDIA H200",
+        "Kernels, one GPU",
         "Time of one call, next to gsplat 1.5.3 and plain PyTorch in the same process.",
         "work",
         KERNEL_COLUMNS,
@@ -338,6 +338,12 @@ def provenance(table: Table, logs: Path = LOGS) -> str:
     return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in sorted(measured.items()))
 
 
+def front_gpus(table: Table, logs: Path = LOGS) -> str:
+    """Return the names of the GPUs on which the README's rows of a table were measured; empty for none."""
+    machines = [line["machine"] for row in table.rows if row.front for line in log_lines(row.log, logs)]
+    return ", ".join(sorted({machine["gpu"] for machine in machines if "gpu" in machine}))
+
+
 def failures(logs: Path = LOGS) -> list[str]:
     """Return a Markdown line for each logged command that ended with an error."""
     found = []
@@ -374,7 +380,8 @@ def readme_block(name: str, logs: Path = LOGS) -> str:
     parts = []
     for table in TABLES:
         if table.readme and (text := table_text(table, logs, front=True)):
-            parts.append(f"**{table.title}**\n\n{text}")
+            gpus = front_gpus(table, logs)
+            parts.append(f"**{table.title}{f' ({gpus})' if gpus else ''}**\n\n{text}")
     return "\n\n".join(parts) + "\n" if parts else ""
 
 
