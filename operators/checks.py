@@ -168,7 +168,14 @@ class OrdinaryStream:
         self.reset()
 
     def join(self, stages: int) -> range:
-        """Register `stages` further stages for the rotation. Return their member numbers, the argument of `looks`."""
+        """Add stages to the rotation, in which each stage checks only some of the ordinary frames.
+
+        Args:
+            stages: number of stages to add.
+
+        Returns:
+            Number of each added stage, the argument of `looks`.
+        """
         first, self._members = self._members, self._members + stages
         return range(first, self._members)
 

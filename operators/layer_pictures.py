@@ -49,7 +49,9 @@ class DepthColours:
     def __init__(self) -> None:
         self._range: tuple[float, float] | None = None
         self.median: float | None = None
-        """Median depth of covered pixels, in the scene's unit; None before the first covered picture."""
+        """Median depth of covered pixels, smoothed over the pictures, in the scene's unit; None before the first
+        picture with covered pixels.
+        """
 
     def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
         """Update the depth range.

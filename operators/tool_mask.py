@@ -115,8 +115,9 @@ class FoundToolMaskOp(Operator):
     Params:
         make_finder: factory called in `start()`.
         method: name for `FoundMasks`.
-        doubts: reject an all-tool mask as all tissue, unless tissue was detected within the last
-            `BELIEVED_FRAMES` frames. Grey tissue can be mistaken for steel throughout a stream.
+        doubts: True to replace an all-tool mask by an all-tissue mask, unless tissue was detected in
+            one of the last `BELIEVED_FRAMES` frames. The detector can mistake grey tissue for steel
+            throughout a stream.
     """
 
     def __init__(

@@ -210,7 +210,9 @@ class LearnedDepth(Estimator):
         self._looked_ns: int | None = None
         self._answer: DepthMap | None = None
         self._before: NDArray[np.float64] | None = None
-        """Last confident result on the comparison grid, as depth or inverse depth like the network's output."""
+        """Last usable result on the comparison grid, as depth or inverse depth like the network's output. The next
+        output is aligned to it in scale and offset.
+        """
         self._pose: NDArray[np.float64] | None = None
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:

@@ -198,7 +198,7 @@ RELIEF = 0.5
 LARGEST_RELIEF = 4.0
 """Bound of the ratio between a point's inverse depth and that of the plane."""
 LEAST_PARALLAX_PX = 1.5
-"""Smallest median parallax in pixels, in the view with the most parallax; with less, depth is noise."""
+"""Smallest sufficient `Parallax.parallax_px`; with less, depth is noise."""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
 """Median residual in pixels, and as a share of the view's parallax. A view that exceeds both contradicts its pose."""
 POSE_ERROR_PX = 0.6
@@ -223,7 +223,7 @@ class Parallax:
     views: tuple[int, ...]
     """Indices of the views that agree with their poses."""
     parallax_px: float
-    """Median parallax in pixels in the view with the most parallax."""
+    """Median parallax of the tracked corners in pixels, in the view in which it is largest."""
     own_motion: float
     """Median residual that no depth explains, as a share of the parallax: the tissue's own motion. Motion along the
     parallax direction is mistaken for depth, so the relative depth error is about this share, or up to twice as large.

@@ -56,7 +56,7 @@ class FieldOfView:
         same array until the field changes.
         """
         self.changes = 0
-        """Number of field changes."""
+        """Number of times that a new outline of the field of view was accepted at the current picture size."""
         self._shape: tuple[int, ...] = ()
         self._outline: Outline | None = None
         self._reduced: NDArray[np.bool_] = np.zeros((0, 0), bool)

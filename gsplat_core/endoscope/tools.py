@@ -338,7 +338,11 @@ def view_of(image: NDArray[np.uint8]) -> View:
 
 
 def field_of_view(brightness: Bytes) -> Bytes:
-    """Return 1 except on black pixels connected to the border of the picture. `brightness` is uint8 [h, w]."""
+    """Return the mask of the endoscope's field of view, uint8 [h, w].
+
+    It is 0 on dark pixels that are connected to the border of the picture and on the pixels next to them, else 1.
+    `brightness` is uint8 [h, w].
+    """
     darkest = math.ceil(min(24.0, 0.15 * cv2.minMaxLoc(brightness)[1])) - 1
     dark = np.empty_like(brightness)
     cv2.threshold(brightness, darkest, 1, cv2.THRESH_BINARY_INV, dst=dark)

@@ -42,7 +42,8 @@ SOFTNESS = 0.25
 """Fill light by subsurface scattering and surrounding walls: cos θ is replaced by (cos θ + SOFTNESS) / (1 + SOFTNESS).
 """
 ROUND = 0.1
-"""Angle in radians below which angle differences hardly affect highlights, since fine bumps are never level throughout.
+"""Angle between normal and ray, in radians, below which highlights hardly depend on the angle, because fine bumps keep
+parts of the tissue from facing the ray.
 """
 
 
@@ -66,7 +67,11 @@ class Grid:
 
     @property
     def waves(self) -> list[tuple[int, int, float]]:
-        """Half periods of each cosine down and across, and along the longer side. The constant is excluded."""
+        """Frequencies of the basis cosines, without the constant.
+
+        Each tuple has the half periods down the picture, the half periods across it, and the magnitude of both in half
+        periods per longer side.
+        """
         longer = max(self.height, self.width)
         all_waves = ((j, i) for j in range(HALF_WAVES) for i in range(HALF_WAVES))
         counted = [(j, i, float(np.hypot(i * longer / self.width, j * longer / self.height))) for j, i in all_waves]
@@ -74,7 +79,7 @@ class Grid:
 
     @property
     def half_waves(self) -> Array:
-        """Half periods of each cosine along the longer side, float64 [cosines]."""
+        """Frequency magnitude of each cosine in half periods per longer side, float64 [cosines]."""
         return np.array([count for _, _, count in self.waves])
 
     def middles(self) -> tuple[Array, Array]:

@@ -77,7 +77,7 @@ class Shading(Cells):
     """Shading of a picture. The brightness is computed from a mixture of the colour channels."""
 
     glints: NDArray[np.float64]
-    """Share of each cell's pixels in highlights of wet tissue, [h, w]."""
+    """Share of each cell's pixels that are specular highlights on tissue, [h, w]."""
     wet_share: NDArray[np.float64]
     """Share of each cell's pixels in which highlights are detectable, [h, w]."""
     diffuse: Cells | None = None

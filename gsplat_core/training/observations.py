@@ -207,7 +207,7 @@ class ObservationWindow:
             return [newest] * steps
         to_newest = max(1, round(steps * NEWEST_SHARE))
         chosen = [self._frames[int(i)] for i in self._random.integers(0, older, steps - to_newest)]
-        # Spread the newest frame's steps evenly over the schedule, the last step included.
+        # Space the `to_newest` steps on the newest frame evenly. The last step is always one of them.
         order: list[Observation] = []
         for k in range(steps):
             newest_turn = (k + 1) * to_newest // steps > k * to_newest // steps

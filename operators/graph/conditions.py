@@ -127,7 +127,7 @@ class BooleanCondition(Condition):
         self._enabled = enable_tick
 
     def check(self, timestamp: int) -> Verdict:
-        """Return READY while enabled."""
+        """Return READY while enabled, and NEVER after `disable_tick`."""
         return _READY if self._enabled else _NEVER
 
     def check_tick_enabled(self) -> bool:

@@ -30,9 +30,9 @@ class Wanted:
     event: str | None = None
     """Event name such as `model.activate`, or `model` for all its events."""
     actor: str | None = None
-    """Text contained in the actor, which has the name and id of a key."""
+    """Part of the entry's actor in any letter case, for example the name or the id of an API key."""
     subject: str | None = None
-    "Text contained in the subject."
+    """Part of the entry's subject in any letter case."""
     outcome: Outcome | None = None
     since: datetime | None = None
     until: datetime | None = None

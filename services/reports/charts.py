@@ -154,7 +154,10 @@ def _log_axis(low: float, high: float) -> _Axis:
 
 
 def _number(value: float) -> str:
-    """Format a number with at most four significant digits, without exponent."""
+    """Format a number with thousands separators and without exponent.
+
+    Decimals are rounded to four significant digits and to four decimal places. Integer digits are never rounded.
+    """
     if value == 0:
         return "0"
     digits = max(0, 3 - math.floor(math.log10(abs(value))))

@@ -287,10 +287,16 @@ class ModelShow:
             self._give_way(showing, f"{showing} took {took_ms:.1f} ms for a picture, {LATE_IN_A_ROW} times in a row")
 
     def _give_way(self, showing: Showing, why: str) -> bool:
-        """Roll back to the previous model, or to the live reconstruction if there is none.
+        """Replace a failed model by the model displayed before it, or by the live reconstruction if there is none.
+
+        The display stays unchanged if a command has already selected another model.
+
+        Args:
+            showing: the model that failed.
+            why: reason of the failure, for the log and the status.
 
         Returns:
-            False if the live reconstruction is displayed next.
+            True if a model is displayed next, False if the live reconstruction is.
         """
         log.error("%s; what was shown before is shown again", why)
         with self._lock:

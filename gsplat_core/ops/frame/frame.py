@@ -52,9 +52,10 @@ class FrameMode(IntEnum):
     TRAINING = 1
     """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of weight times z."""
     SEGMENTS = 2
-    """Picture with a segment of `capacity` instances (at most MAX_SEGMENT) for every tile.
+    """Picture. Every tile's list has its own segment of the buffer, with space for `capacity` instances.
 
-    Saves two launches and takes 8 bytes per instance.
+    `capacity` is at most MAX_SEGMENT. A frame takes two kernel launches instead of four, because no prefix sum over
+    the list lengths is needed. The buffer takes 8 bytes for each of tiles x `capacity` instances, used or not.
     """
 
 

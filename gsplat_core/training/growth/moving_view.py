@@ -187,12 +187,12 @@ class NewTissue:
         return bool(self._entered.any())
 
     def _empty(self, now: Gaussians) -> tuple[Tensor, Tensor]:
-        """Return which new cells are almost empty of Gaussians, bool [rows, columns], and the mean depth around each."""
+        """Return the new cells with almost no Gaussians, bool [rows, columns], and the mean depth around each cell."""
         count, depth = around_cells(now, self._camera, self._spacing, self._shape)
         return tensor_of(self._entered.reshape(self._shape), now.device) & (count < 9 * USUAL_DENSITY), depth
 
     def pixels(self, now: Gaussians) -> Tensor:
-        """Mark pixels of new cells without Gaussians, bool [H, W]. Does not synchronise."""
+        """Return the pixels of the new grid cells with almost no Gaussians, bool [H, W], without host sync."""
         return self._of_cells(self._empty(now)[0])
 
     def unfilled(self, now: Gaussians, mask: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:

@@ -84,7 +84,7 @@ class LastSeen:
         self.times().masked_fill_(seen, observation.time_s)
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Remove Gaussians by their row moves."""
+        """Remove the times of removed Gaussians. `moves` overwrites their rows with the last remaining rows."""
         moves.apply(self._times, 0.0)
         self._count = moves.count
 

@@ -356,10 +356,11 @@ def motion_of(step: TrainingStep) -> EditableMotion:
 
 
 class Following:
-    """Delivery of a stream's frames to its motion prior.
+    """Queue of trained frames for a stream's motion prior.
 
-    The prior is needed only to display frames without training. Processing a frame takes longer than some training
-    steps. Without `at_once`, the two newest trained frames are therefore delivered only when a frame is skipped.
+    The prior is needed only for frames that are displayed without training. Processing a frame takes the prior longer
+    than some training steps. Without `at_once`, the queue therefore keeps the two newest trained frames, and the prior
+    processes them only when training skips a frame.
     """
 
     def __init__(self, config: ReconstructorConfig, *, at_once: bool) -> None:
@@ -418,9 +419,15 @@ class Following:
 
 @contextmanager
 def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -> Iterator[None]:
-    """Set the prior's continuation on the field while a copy is published. Training is not affected.
+    """Make the field extrapolate with the prior's velocities inside the block, in which a copy is published.
 
-    If the prior has not processed the newest trained frame, at `learned_s`, the scene is static after that time.
+    Training is not affected.
+
+    Args:
+        step: training step of the scene.
+        prior: motion prior; None to leave the field unchanged.
+        learned_s: time of the newest trained frame in seconds, from which the field extrapolates. If the prior has not
+            processed this frame, the scene is static after this time.
     """
     continuation = step.capabilities.continuation
     if prior is None or continuation is None:

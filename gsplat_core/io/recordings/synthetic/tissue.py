@@ -207,7 +207,7 @@ class Tissue:
     focal_factor = DEFAULT_FOCAL_FACTOR
     """Focal length of the scene's camera over the longer side of its pictures."""
     exposed_mm = REFERENCE_MM
-    """Reference distance in mm that sets the exposure; see `lamp.REFERENCE_MM`."""
+    """Distance from the lamp in mm at which a white surface facing the scope has radiance 1; sets the exposure."""
     looked_at_mm = TISSUE_DISTANCE_MM
     """Distance in mm of the point that a moving scope keeps at the centre of its view."""
     sway_mm = (7.0, 4.5, 6.0)
