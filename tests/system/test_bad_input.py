@@ -192,7 +192,7 @@ def test_a_recording_of_one_frame_works_and_says_what_it_cannot_show(tiny, tmp_p
     assert report.frames.displayed == 1
     assert report.quality.baselines.previous_frame_db is None
     assert report.quality.heldout.frames == 0
-    assert "had no tool mask" in " ".join(report.notes)
+    assert "the recording has no depth" in " ".join(report.notes)
 
 
 def test_a_folder_of_somebody_else(tiny, tmp_path, refused):

@@ -37,6 +37,7 @@ export function snapshotsOf(place, report) {
   list.className = "files";
   const kept = document.createElement("details"), title = document.createElement("summary");
   kept.append(title, list);
+  kept.hidden = true;
   const take = button("Take a snapshot", async () => {
     if (!name.reportValidity()) return;
     const key = crypto.randomUUID?.() ?? String(performance.now());
