@@ -84,7 +84,7 @@ def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
 
 
 def test_a_refit_leaves_out_the_pull() -> None:
-    """The same with few points: errors at the pulled place shrink, and the rest of the motion stays."""
+    """With few points, errors near the pulled point shrink and the remaining motion is unchanged."""
     points, poses = places(TIMES_S, count=90), swaying(TIMES_S)
     tracks = tracks_of(pulled(points), poses, TIMES_S)
     first = fitted(tracks, HZ, rounds=4)

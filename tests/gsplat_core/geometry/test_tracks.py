@@ -77,7 +77,7 @@ def test_at_most_seven_hundred_points_a_fortieth_of_the_longer_side_apart():
 
 
 def test_no_point_is_replaced_before_a_tenth_is_missing():
-    """Of 700 points, a stripe of tissue that becomes covered loses few at first and then many."""
+    """Covering a stripe of tissue that holds 700 points loses few points at first and then many."""
     tracks, picture = FeatureTracks(), wide_texture(0)
     tracks.follow(picture, None)
     narrow, wide = (np.ones((512, 640), np.uint8) for _ in range(2))
@@ -122,7 +122,7 @@ def test_a_picture_that_shows_less_than_a_fifth_of_the_points_is_left_out():
 
 
 def test_a_point_whose_way_back_misses_is_lost():
-    """What only one picture shows has no counterpart; a shifted patch returns to its start."""
+    """A patch visible in only one picture has no match; a shifted patch is tracked back to its start."""
     first = cv2.cvtColor(wide_texture(5), cv2.COLOR_RGB2GRAY)
     second = np.roll(first, (2, 3), (0, 1))
     second[300:, 400:] = cv2.cvtColor(wide_texture(6), cv2.COLOR_RGB2GRAY)[300:, 400:]
