@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal, Protocol, get_args
 
 import torch
@@ -19,6 +19,43 @@ from gsplat_core.scene.cameras import Camera
 Precision = Literal["fp32", "fp16"]
 STANDARD_OUTPUTS = RenderOutput._fields
 """Default outputs of a frame: `image`, `alpha`, `depth`."""
+DepthOrder = Literal["splat", "pixel"]
+MOST_SAMPLES = 1 << 20
+MOST_SUPERSAMPLING = 8
+
+
+@dataclass(frozen=True)
+class RendererOptions:
+    """Options of individual renderers; `Capabilities.options` names those that a renderer has.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
+
+    samples: int = 16
+    """Random samples per pixel of a frame."""
+    supersampling: int = 1
+    """Sub-pixels per pixel and axis."""
+    order: DepthOrder = "splat"
+    """Depth that decides which splat is in front: of the splat's centre, or of its plane at each pixel."""
+    seed: int = 0
+    """Seed of all random numbers; equal seeds give equal bytes."""
+    progressive: bool = False
+    """True adds the samples of consecutive frames of the same model, camera and time."""
+
+    def __post_init__(self) -> None:
+        for name, most in (("samples", MOST_SAMPLES), ("supersampling", MOST_SUPERSAMPLING)):
+            value = getattr(self, name)
+            if not 1 <= value <= most:
+                raise InvalidSetting(f"{name} must be from 1 to {most}, got {value}")
+        if self.order not in get_args(DepthOrder):
+            raise InvalidSetting(f"unknown order {self.order!r}; choose {' or '.join(get_args(DepthOrder))}")
+        if not 0 <= self.seed < 1 << 63:
+            raise InvalidSetting(f"seed must be from 0 to 2^63 - 1, got {self.seed}")
+
+    def changed(self) -> tuple[str, ...]:
+        """Return the names of the options whose values are not the defaults."""
+        return tuple(field.name for field in fields(self) if getattr(self, field.name) != field.default)
 
 
 @dataclass(frozen=True)
@@ -38,6 +75,11 @@ class Capabilities:
     """True if equal model, camera and time give bit-identical results on one device."""
     reads_snapshots: bool = False
     """True if `prepare` accepts a `Snapshot`; otherwise it receives an immutable `Model` copy."""
+    options: tuple[str, ...] = ()
+    """Fields of `RendererOptions` that the renderer has.
+
+    A renderer with at least one receives the `RendererOptions` as the keyword argument `options`.
+    """
 
     @property
     def devices(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import torch
 from gsplat_core import RENDERERS, Camera, InvalidInput, Model, SnapshotSlots, new_renderer, render
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, checked_outputs
+from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, RendererOptions, checked_outputs
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
 WINDOW_S = (1.0, 3.0)
@@ -99,6 +99,20 @@ def test_what_a_user_chose_is_refused_with_what_there_is():
         new_renderer("alpha", CAMERA, precision="fp16")
     with pytest.raises(InvalidSetting, match="unknown precision 'fp8'"):
         new_renderer("alpha", CAMERA, precision="fp8")
+
+
+def test_options_that_a_renderer_lacks_are_refused():
+    new_renderer("alpha", CAMERA, options=RendererOptions())
+    with pytest.raises(InvalidSetting, match="renderer 'alpha' has no option samples; choose "):
+        new_renderer("alpha", CAMERA, options=RendererOptions(samples=4))
+    for options, sentence in (
+        ({"samples": 0}, "samples must be from 1 to"),
+        ({"supersampling": 9}, "supersampling must be from 1 to 8, got 9"),
+        ({"order": "tile"}, "unknown order 'tile'; choose splat or pixel"),
+        ({"seed": -1}, "seed must be from 0"),
+    ):
+        with pytest.raises(InvalidSetting, match=sentence):
+            RendererOptions(**options)
 
 
 def test_misuse_is_refused(moving):
