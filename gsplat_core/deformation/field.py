@@ -326,6 +326,7 @@ def displaced(gaussians: Gaussians, deltas: Tensor) -> Gaussians:
         logit_opacities=opacities if deltas.shape[1] < OPACITY.stop else opacities + deltas[:, OPACITY.start],
         sh=base if sh.shape[1] == 1 else torch.cat([base, sh[:, 1:]], dim=1),
         right_sh=gaussians.right_sh,
+        extra=gaussians.extra,
     )
 
 

@@ -313,6 +313,7 @@ class HexPlaneField(DeformationField):
             logit_opacities=gaussians.logit_opacities + opacity[:, 0],
             sh=gaussians.sh,
             right_sh=gaussians.right_sh,
+            extra=gaussians.extra,
         )
 
 

@@ -95,7 +95,7 @@ class PartSums:
         for thawed in self._errors:
             names = {name for part in thawed for name in PARTS[part]}
             mixed: dict[str, Tensor] = {name: (moved if name in names else frozen)[name] for name in moved}
-            shown = picture_of(Gaussians(**mixed))[tissue].astype(np.float64)
+            shown = picture_of(Gaussians.from_tensors(mixed))[tissue].astype(np.float64)
             self._errors[thawed] += float(np.square(shown - wanted).sum())
         self._frames += 1
 

@@ -205,7 +205,7 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
         raise BundleCorrupt(f"{path} is not a safetensors file ({error}); copy the bundle again") from error
     _check_tensors(path, tensors, expected)
     _check_finite(tensors, f"{path} cannot be used")
-    loaded = Gaussians(**{name: tensors[f"gaussians.{name}"] for name in gaussians.tensors()})
+    loaded = Gaussians.from_tensors({name: tensors[f"gaussians.{name}"] for name in gaussians.tensors()})
     if field is not None:
         field.load_state_dict(
             {name.removeprefix("field."): t for name, t in tensors.items() if name.startswith("field.")}, assign=True

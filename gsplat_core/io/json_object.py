@@ -61,6 +61,18 @@ class JsonObject:
         """Return the list of 1 to `most` numbers stored under a key."""
         return [float(value) for value in self._checked(key, ListOf(wanted, 1, most))]
 
+    def integers(self, key: str, wanted: IntegerIn, most: int) -> tuple[int, ...]:
+        """Return the list of at most `most` integers stored under a key."""
+        listed = self.values.get(key)
+        if not isinstance(listed, list) or len(listed) > most:
+            raise BundleCorrupt(
+                f"{self.name}: {key} must be a list of at most {most} integers, got {shortened(listed)}"
+            )
+        try:
+            return tuple(int(wanted.checked(f"{key}[{index}]", value)) for index, value in enumerate(listed))
+        except InvalidInput as error:
+            raise BundleCorrupt(f"{self.name}: {error}") from error
+
     def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
         """Return two ordered numbers at most `longest` apart."""
         start, end = self._checked(key, ListOf(wanted, 2, 2))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from typing import Any, cast
 
 import numpy as np
@@ -18,7 +21,7 @@ from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
-from gsplat_core.value_ranges import IntegerIn, NumberIn
+from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
 
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 1 << 20
@@ -41,6 +44,12 @@ ROTATION_TOLERANCE = 2e-3
 """Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
+EXTRA_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+MOST_EXTRA = 16
+"""Largest number of extra tensors."""
+EXTRA_SIDE = IntegerIn(1, 1024)
+EXTRA_SIDES = 3
+"""Largest number of dimensions of an extra tensor after the first."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 
@@ -61,6 +70,8 @@ class Manifest:
     depth_source: DepthSource | None = None
     right_eye: bool = False
     """True if the Gaussians have separate colours for the right eye."""
+    extra: Mapping[str, tuple[int, ...]] = dataclass_field(default_factory=dict)
+    """Shapes of the extra tensors of a Gaussian by name."""
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
         """Return Gaussians and field of the described shapes on the meta device, without memory."""
@@ -69,6 +80,7 @@ class Manifest:
             gaussians = Gaussians(
                 torch.empty(n, 3), torch.empty(n, 4), torch.empty(n, 3), torch.empty(n), torch.empty(n, k, 3)
             ).with_right(self.right_eye)
+            gaussians = replace(gaussians, extra={name: torch.empty(n, *shape) for name, shape in self.extra.items()})
             return gaussians, None if self.field is None else field_from_config(self.field, gaussians)
 
 
@@ -116,7 +128,17 @@ def parse_manifest(text: bytes, name: str) -> Manifest:
         parameters=root.integer("parameters", PARAMETERS) if "parameters" in root.values else None,
         depth_source=None if root.values.get("depth") is None else _depth_source(root.nested("depth")),
         right_eye=gaussians.boolean("right_eye") if "right_eye" in gaussians.values else False,
+        extra=_extra_shapes(gaussians.nested("extra")) if "extra" in gaussians.values else {},
     )
+
+
+def _extra_shapes(reader: JsonObject) -> dict[str, tuple[int, ...]]:
+    if len(reader.values) > MOST_EXTRA:
+        raise BundleCorrupt(f"{reader.name}: {len(reader.values)} extra tensors; at most {MOST_EXTRA} are allowed")
+    for name in reader.values:
+        if not EXTRA_NAME.fullmatch(name):
+            raise BundleCorrupt(f"{reader.name}: {shortened(name)} is no name of a tensor; use a to z, 0 to 9 and _")
+    return {name: reader.integers(name, EXTRA_SIDE, EXTRA_SIDES) for name in reader.values}
 
 
 def _depth_source(reader: JsonObject) -> DepthSource:

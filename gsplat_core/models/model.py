@@ -171,7 +171,9 @@ class Model:
         source = self.depth_source
         # Omitted if unknown, which preserves the digest of models of earlier versions.
         depth = {} if source is None else {"depth": {"origin": source.origin.name, "metric": source.metric}}
-        right = {} if self.gaussians.right_sh is None else {"right_eye": True}
+        right: dict[str, Any] = {} if self.gaussians.right_sh is None else {"right_eye": True}
+        if self.gaussians.extra:
+            right["extra"] = {name: list(tensor.shape[1:]) for name, tensor in self.gaussians.extra.items()}
         return {
             "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree, **right},
             "field": None if self.field is None else self.field.config(),

@@ -8,8 +8,8 @@ spherical harmonic as colour. Rows [N, 16] hold deformation deltas and their gra
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from gsplat_core.errors import InvalidInput
 MAX_SH_DEGREE = 4
 SH_C0 = 0.28209479177387814
 """The constant basis function Y00 = 1 / (2 sqrt(pi)); a colour c has the coefficient (c - 0.5) / SH_C0."""
+EXTRA_PREFIX = "extra."
+"""Prefix of the names of `Gaussians.extra` in `Gaussians.tensors`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class Gaussians:
     """Spherical-harmonics coefficients [N, K, 3], K = (degree + 1)²; the colour is their sum plus 0.5, at least 0."""
     right_sh: Tensor | None = None
     """Difference of the right eye's SH coefficients to `sh`, same shape; None for equal colours."""
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+    """Further parameters [N, ...] of a renderer or output by name, such as the logits of semantic classes."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.dim() else -1
@@ -59,6 +63,9 @@ class Gaussians:
             raise InvalidInput(
                 f"gaussians: right_sh must be {list(self.sh.shape)} as sh is, got {list(self.right_sh.shape)}"
             )
+        for name, tensor in self.extra.items():
+            if not tensor.dim() or tensor.shape[0] != n:
+                raise InvalidInput(f"gaussians: extra {name!r} must be [N, ...] with N = {n}, got {list(tensor.shape)}")
         kinds = {(tensor.dtype, tensor.device) for tensor in self.tensors().values()}
         if len(kinds) != 1 or not self.means.is_floating_point():
             found = {name: f"{t.dtype} on {t.device}" for name, t in self.tensors().items()}
@@ -98,7 +105,7 @@ class Gaussians:
         return self.means.dtype
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by field name: five, plus `right_sh` if present."""
+        """Return the tensors by field name: five, plus `right_sh` if present, plus `extra.NAME` of each extra tensor."""
         right = {} if self.right_sh is None else {"right_sh": self.right_sh}
         return {
             "means": self.means,
@@ -107,11 +114,19 @@ class Gaussians:
             "logit_opacities": self.logit_opacities,
             "sh": self.sh,
             **right,
+            **{EXTRA_PREFIX + name: tensor for name, tensor in self.extra.items()},
         }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
+        """Create Gaussians from tensors named as in `tensors()`."""
+        own = {name: tensor for name, tensor in tensors.items() if not name.startswith(EXTRA_PREFIX)}
+        extra = {name.removeprefix(EXTRA_PREFIX): tensors[name] for name in tensors if name not in own}
+        return cls(**own, extra=extra)
 
     @property
     def left_tensors(self) -> tuple[Tensor, ...]:
-        """Tensors from which a picture is rendered: all five except `right_sh`, in field order."""
+        """Tensors from which a picture is rendered: the first five, in field order."""
         return self.means, self.quats, self.log_scales, self.logit_opacities, self.sh
 
     def seen_by_right(self) -> Gaussians:
@@ -124,9 +139,17 @@ class Gaussians:
             return self
         return replace(self, right_sh=torch.zeros_like(self.sh) if wanted else None)
 
+    def like(self, other: Gaussians) -> Gaussians:
+        """Return the Gaussians with the optional tensors of `other`: zeros where missing, without those it lacks."""
+        extra = {
+            name: self.extra.get(name, tensor.new_zeros(self.count, *tensor.shape[1:]))
+            for name, tensor in other.extra.items()
+        }
+        return replace(self.with_right(other.right_sh is not None), extra=extra)
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Return the Gaussians with `function` applied to each tensor."""
-        return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
+        return Gaussians.from_tensors({name: function(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> Gaussians:
         """Return the Gaussians detached from the autograd graph, sharing memory."""
@@ -153,7 +176,7 @@ class Gaussians:
     def append(self, other: Gaussians) -> Gaussians:
         """Concatenate these Gaussians and `other`.
 
-        `right_sh` is kept if these Gaussians have it; missing values of `other` become 0.
+        `right_sh` and `extra` are kept if these Gaussians have them; missing values of `other` become 0.
 
         Raises:
             InvalidInput: if SH degree, dtype or device differ.
@@ -164,8 +187,10 @@ class Gaussians:
             raise InvalidInput(
                 f"gaussians: cannot append {other.dtype} on {other.device} to {self.dtype} on {self.device}"
             )
-        theirs = other.with_right(self.right_sh is not None).tensors()
-        return Gaussians(**{name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()})
+        theirs = other.like(self).tensors()
+        return Gaussians.from_tensors(
+            {name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()}
+        )
 
 
 RAW_COLUMNS = 16

@@ -107,7 +107,7 @@ class GaussianRows:
 
     def _beside(self, others: Gaussians) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield pairs of each tensor in use and the corresponding tensor of `others`."""
-        others = others.with_right(self.used.right_sh is not None)
+        others = others.like(self.used)
         return zip(self.used.tensors().values(), others.tensors().values(), strict=True)
 
     def _use(self, count: int) -> None:

@@ -60,6 +60,31 @@ def test_colours_of_the_right_eye_are_kept_and_part_of_the_digest(make_gaussians
             load_bundle(tmp_path)
 
 
+def test_extra_tensors_are_kept_and_part_of_the_digest(make_gaussians, tmp_path):
+    plain = make_gaussians(4)
+    model = make_model(replace(plain, extra={"semantics": torch.randn(4, 3), "weight": torch.randn(4)}))
+    save_bundle(model, tmp_path)
+    loaded = load_bundle(tmp_path)
+    assert loaded.sha256() == model.sha256() != make_model(plain).sha256()
+    assert torch.equal(loaded.at(1.0).extra["semantics"], model.gaussians.extra["semantics"])
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert manifest["gaussians"]["extra"] == {"semantics": [3], "weight": []}
+    for claim, message in (
+        (3, "extra must be a JSON object"),
+        ({"A/b": [3]}, "'A/b' is no name of a tensor"),
+        ({"semantics": 3}, "semantics must be a list of at most 3 integers, got 3"),
+        ({"semantics": [3, 1, 1, 1]}, "at most 3 integers"),
+        ({"semantics": [0]}, "an integer from 1 to 1024, got 0"),
+        ({f"t{index}": [] for index in range(17)}, "17 extra tensors; at most 16"),
+        ({"semantics": [1024] * 3}, "describes|describe"),
+    ):
+        (tmp_path / "manifest.json").write_text(
+            json.dumps({**manifest, "gaussians": {**manifest["gaussians"], "extra": claim}})
+        )
+        with pytest.raises(BundleCorrupt, match=message):
+            load_bundle(tmp_path)
+
+
 @pytest.mark.parametrize(
     "source", [None, *(DepthSource(origin, metric=False) for origin in (DEPTH_ORIGINS[name] for name in DEPTH_ORIGINS))]
 )

@@ -100,3 +100,16 @@ def test_colours_of_the_right_eye_have_the_shape_of_the_left_ones():
     left = gaussians()
     with pytest.raises(InvalidInput, match="right_sh must be"):
         dataclasses.replace(left, right_sh=left.sh[:, :1, :2])
+
+
+def test_extra_tensors_follow_the_rows():
+    scene = dataclasses.replace(gaussians(), extra={"semantics": torch.arange(15.0).reshape(5, 3)})
+    assert list(scene.tensors())[-1] == "extra.semantics"
+    assert torch.equal(scene.select(torch.tensor([3, 1])).extra["semantics"], scene.extra["semantics"][[3, 1]])
+    grown = scene.append(gaussians())
+    assert grown.extra["semantics"].shape == (10, 3) and not grown.extra["semantics"][5:].any()
+    assert not gaussians().append(scene).extra
+    same = Gaussians.from_tensors(scene.tensors())
+    assert all(same.tensors()[name] is tensor for name, tensor in scene.tensors().items())
+    with pytest.raises(InvalidInput, match=r"extra 'semantics' must be \[N, \.\.\.\] with N = 5, got \[4, 3\]"):
+        dataclasses.replace(scene, extra={"semantics": torch.zeros(4, 3)})
