@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gsplat_core.deformation.registry import FieldKind
     from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.renderer import RendererKind
+    from gsplat_core.training.losses.loss import LossKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
@@ -58,6 +59,15 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     },
 )
 """Factories of motion priors by name; each takes a `ReconstructorConfig`. `bumps` uses the field's extrapolation alone."""
+
+LOSSES: Registry[LossKind] = Registry(
+    "loss",
+    {
+        "photometric": "gsplat_core.training.losses.photometric:Photometric",
+        "depth": "gsplat_core.training.losses.depth:Depth",
+    },
+)
+"""Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""
 
 Eyes = Literal["left", "both"]
 """Eyes of a stereo scope whose pictures are trained on."""

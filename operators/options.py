@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 Command = Literal["replay", "batch", "reconstruct", "live", "job", "stream"]
 """Uses of options: commands of `intrasplat`, replay jobs of the service, and streams of the service."""
 EVERYWHERE: tuple[Command, ...] = get_args(Command)
+_NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:e-?[0-9]{1,2})?")
 MAX_TEXT = 4096
 """Maximum length of a text, in characters."""
 
@@ -51,11 +53,13 @@ class Names:
         registry: mapping whose keys are the accepted names.
         addresses: names that must be followed by a colon and an address, with an example of the syntax.
         more: accepted names that are not in the registry.
+        weighted: True if a colon and a positive number, the weight, may follow a name.
     """
 
     registry: Registry[Any] | Mapping[str, Any]
     addresses: Mapping[str, str] = dataclasses.field(default_factory=dict)
     more: tuple[str, ...] = ()
+    weighted: bool = False
 
     @property
     def choices(self) -> list[str]:
@@ -72,6 +76,10 @@ class Names:
         name, colon, address = value.partition(":")
         if name in self.addresses and name in self.registry and not address:
             raise ValueError(f"it needs an address: {self.addresses[name]}")
+        if self.weighted and name in self.registry and colon and _NUMBER.fullmatch(address) and float(address) > 0:
+            return value
+        if self.weighted and name in self.registry and colon:
+            raise ValueError(f"a positive number follows the colon, as in {name}:0.1")
         if (name in self.registry or name in self.more) and colon and name not in self.addresses:
             raise ValueError(f"nothing follows {name}, write {name!r}")
         if name not in self.registry and value not in self.more:
@@ -87,6 +95,8 @@ class Names:
         made = {name: value for name, value in handler(schema).items() if name != "type"}
         plain = [*self.more, *(name for name in self.registry if name not in self.addresses)]
         addressed = [f"^{name}:.+" for name in self.addresses if name in self.registry]
+        if self.weighted:
+            addressed += [f"^{name}:{_NUMBER.pattern}$" for name in self.registry]
         words = {"type": "string", "enum": plain}
         if not addressed:
             return {**made, **words}

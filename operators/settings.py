@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, RENDERERS, Eyes
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, RENDERERS, Eyes
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
 from operators.graph.application import Engine
@@ -91,6 +91,10 @@ class ReconstructSection(Section):
             "Seed of all random numbers; the same seed gives the same bytes", ge=0, le=MAX_SEED, callers_le=2**31 - 1
         ),
     ] = 0
+    losses: Annotated[
+        tuple[Annotated[str, Names(LOSSES, weighted=True)], ...],
+        Option("Losses in addition to photometric and depth, each as name or name:weight, or none"),
+    ] = ()
     eyes: Annotated[Eyes | None, Option("Pictures of a stereo scope that are trained on", null="left")] = None
 
 

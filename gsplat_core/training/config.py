@@ -12,6 +12,7 @@ from gsplat_core.deformation.registry import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training.losses.registry import loss_weights
 from gsplat_core.training.motion.image_motion import Detail
 
 
@@ -93,6 +94,10 @@ class ReconstructorConfig:
     """Weight of the inverse-depth loss of frames with depth, multiplied by the scene's initial distance so that it does
     not depend on the unit, and by a factor of the depth's origin (`DEPTH_ORIGINS`).
     """
+    losses: tuple[str, ...] = ()
+    """Losses added to those of colours and depth: names in `LOSSES`, each optionally followed by a colon and its
+    weight. On a GPU, a step with further losses is not captured as a CUDA graph and therefore slower.
+    """
     default_depth_mm: float = RELATIVE_DISTANCE
     """Distance of the plane on which a scene without depth starts, in millimetres."""
     eyes: Eyes = "left"
@@ -121,6 +126,7 @@ class ReconstructorConfig:
             if getattr(self, name) < 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
         MOTION_PRIORS.check(self.motion_prior)
+        loss_weights(self.losses)
         if self.motion_detail not in get_args(Detail):
             raise InvalidSetting(f"motion_detail is {self.motion_detail!r}; choose {' or '.join(get_args(Detail))}")
         check_eyes(self.eyes)

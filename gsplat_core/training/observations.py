@@ -157,6 +157,11 @@ class ObservationWindow:
         """Frame added last."""
         return self._frames[-1]
 
+    @property
+    def frames(self) -> list[Observation]:
+        """Return the frames of the window in temporal order."""
+        return list(self._frames)
+
     def find(self, seq: int, among: int) -> Observation | None:
         """Return the frame with number `seq` if it is one of the `among` newest ones."""
         newest = islice(reversed(self._frames), among)

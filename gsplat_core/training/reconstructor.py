@@ -299,6 +299,7 @@ class Reconstructor:
         self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
+        self._step.frames = lambda: seen
         tracks = SurfaceTracks(frames, seen, given.at_rest)
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
@@ -371,6 +372,7 @@ class Reconstructor:
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)
+        self._step.frames = lambda: self._window.frames
         if end_s is None:
             self._motion.begin(field)
         is_captured = self.device.type == "cuda" and field.capabilities.slot is not None

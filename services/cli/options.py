@@ -212,7 +212,7 @@ def takes_run_options(command: Callable[..., int], parameter: str = "options") -
 def _default(each: Declared) -> Any:
     if each.option.word and each.default is None:
         return each.option.word
-    return ",".join(each.default) if isinstance(each.default, tuple) else each.default
+    return (",".join(each.default) or "none") if isinstance(each.default, tuple) else each.default
 
 
 def _value(each: Declared, given: Any) -> Any:

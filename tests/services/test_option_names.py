@@ -135,6 +135,23 @@ def test_names_that_are_added_at_run_time_are_accepted_and_documented():
         ReplayOptions(renderer="points")
 
 
+@pytest.mark.parametrize("value", ["depth", "photometric,depth:0.5", "none"])
+def test_losses_with_and_without_weights_are_accepted(value, given):
+    losses = () if value == "none" else tuple(value.split(","))
+    for command in KINDS:
+        assert given(command, "--losses", value).losses == losses
+    wanted = ReplayRequest.model_validate({"recording": "a", "options": {"losses": list(losses)}})
+    assert wanted.options.losses == losses
+
+
+@pytest.mark.parametrize(
+    ("value", "message"), [("nope", "choose photometric"), ("depth:x", "as in depth:0.1"), ("depth:0", "positive")]
+)
+def test_losses_that_there_are_not_are_refused(value, message):
+    with pytest.raises(InvalidSetting, match=message):
+        ReplayOptions(losses=value)
+
+
 @pytest.mark.parametrize("name", [*SINKS, ",".join(SINKS), "none"])
 def test_every_sink_is_accepted_by_runs_and_jobs(name, given):
     sinks = () if name == "none" else tuple(name.split(","))

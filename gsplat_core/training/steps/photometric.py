@@ -7,7 +7,7 @@ are learned from the left eye and apply to both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -121,6 +121,31 @@ def loss_and_gradients(
         "sh": v_sh,
     }
     return Compared(loss, gradients, colour_change)
+
+
+def with_losses(compared: Compared, gaussians: Gaussians, losses: Callable[[Gaussians], Tensor | None]) -> Compared:
+    """Add the value and the gradients of further losses.
+
+    Args:
+        compared: result of `loss_and_gradients`. If colours are corrected, their gradient of degree 0 remains 0.
+        gaussians: the same scene.
+        losses: differentiable function of the scene; None as its result adds nothing.
+    """
+    with torch.enable_grad():
+        scene = gaussians.detach().requires_grad_()
+        value = losses(scene)
+    if value is None or not value.requires_grad:
+        return compared
+    tensors = scene.tensors()
+    found = torch.autograd.grad(value, list(tensors.values()), allow_unused=True)
+    gradients = dict(compared.gradients)
+    for name, gradient in zip(tensors, found, strict=True):
+        if gradient is not None:
+            gradients[name] = gradients[name] + gradient if name in gradients else gradient
+    if compared.colour_change is not None:
+        gradients["sh"] = gradients["sh"].clone()
+        gradients["sh"][:, 0] = 0
+    return compared._replace(loss=compared.loss + value.detach(), gradients=gradients)
 
 
 def _loss_of_picture(

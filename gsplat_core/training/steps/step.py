@@ -18,10 +18,12 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.unseen import depth_of
+from gsplat_core.training.losses.loss import LossContext
+from gsplat_core.training.losses.registry import WeightedLosses, loss_weights
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam
-from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, loss_and_gradients, with_eye
+from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, loss_and_gradients, with_eye, with_losses
 
 
 class AutogradTraining:
@@ -78,8 +80,9 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
 class TrainingStep:
     """Scene in training: its Gaussians, deformation field and optimiser.
 
-    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it. Otherwise the gradient is
-    computed at the deformed Gaussians, and the field's training propagates it to the field and the canonical Gaussians.
+    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it and no further losses are
+    named. Otherwise the gradient is computed at the deformed Gaussians, and the field's training propagates it to the
+    field and the canonical Gaussians.
     """
 
     def __init__(
@@ -95,6 +98,9 @@ class TrainingStep:
         # length.
         depth_weight = config.depth_weight * self.distance(camera) if config.depth_weight else 0.0
         self._weights = LossWeights(config.ssim_weight, depth_weight, config.squared_error)
+        self._losses = WeightedLosses(loss_weights(config.losses))
+        self.frames: Callable[[], Sequence[Observation]] = tuple
+        """Function that returns the observations available for training, for losses that compare several."""
         self._adam = FusedAdam(gaussians.tensors())
         self._rows: GaussianRows | None = None
         """Preallocated rows in which Gaussians are added and removed without moving tensors."""
@@ -122,7 +128,8 @@ class TrainingStep:
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         frame_deltas = self.capabilities.frame_deltas
-        if gaussians.device.type == "cuda" and kind.captured_training is not None and frame_deltas is not None:
+        captures = gaussians.device.type == "cuda" and not self._losses
+        if captures and kind.captured_training is not None and frame_deltas is not None:
             training = kind.captured_training(field)
             self._rate_values, self._frame_time = training.rate_values, frame_deltas.frame_time
             self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera)
@@ -151,7 +158,11 @@ class TrainingStep:
         deformed = self._training.deform(self.gaussians, observation.time_s)
         right_sh = self.gaussians.right_sh
         of_right = observation.of_right and right_sh is not None
-        compared = loss_and_gradients(_seen_by(deformed, observation), observation, self._weights, relaxation)
+        seen = _seen_by(deformed, observation)
+        compared = loss_and_gradients(seen, observation, self._weights, relaxation)
+        if self._losses:
+            context = LossContext(self.frames(), self.at)
+            compared = with_losses(compared, seen, lambda scene: self._losses(scene, observation, context))
         gradients = compared.gradients if right_sh is None else with_eye(compared.gradients, of_right)
         own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         if right_sh is not None:

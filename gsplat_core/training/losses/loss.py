@@ -1,0 +1,54 @@
+"""Interface of the loss terms of training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from torch import Tensor
+
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.observations import Observation
+
+
+@dataclass(frozen=True)
+class LossContext:
+    """Data other than the observation that a loss may read."""
+
+    frames: Sequence[Observation]
+    """Observations available for training in temporal order, including the current one."""
+    at: Callable[[float], Gaussians]
+    """Function that returns the scene at another time in seconds, without gradients."""
+
+
+class Loss(Protocol):
+    """Loss term, created once per scene. It may keep values that it computed from observations."""
+
+    name: ClassVar[str]
+    """Name in `LOSSES`."""
+    default_weight: ClassVar[float]
+    """Factor of the term if the user gives none."""
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Compare the scene with an observation.
+
+        Args:
+            scene: Gaussians at the observation's time in the colours of its eye; their tensors require gradients.
+            observation: target.
+            context: further observations, and the scene at other times.
+
+        Returns:
+            Scalar on the scene's device, differentiable in the scene's tensors. None if the observation has nothing
+            to compare.
+        """
+
+
+class LossKind(Protocol):
+    """Registry entry of a loss, usually its class."""
+
+    name: ClassVar[str]
+    default_weight: ClassVar[float]
+
+    def __call__(self) -> Loss:
+        """Create the loss for a new scene."""

@@ -1,0 +1,29 @@
+"""Difference of colours between the rendered picture and an observation."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from torch import Tensor
+
+from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.losses.loss import LossContext
+from gsplat_core.training.observations import Observation
+
+
+class Photometric:
+    """L1 difference of the colours over tissue.
+
+    Every step computes this term by the fused path of `image_loss`, with the settings `ssim_weight` and
+    `squared_error`. This class evaluates it alone.
+    """
+
+    name: ClassVar[str] = "photometric"
+    default_weight: ClassVar[float] = 1.0
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """See `Loss`."""
+        output = render(scene, observation.camera, depth=False)
+        return image_loss(output.image, observation.image, observation.mask).loss
