@@ -149,6 +149,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // changes by grey_step grey values or more.
   m.def("smooth_within_edges(Tensor planes, Tensor guide, float strength, float grey_step) -> Tensor");
 
+  // Splat regression f(x) = sum of v g(x) at points [n, d], d = 1 to 4, for k splats with centres [k, d], factors A [k, d, d]
+  // and values [k, m]; g = |det A|^-1 N(A^-1 (x - b)). The backward pass takes dL/df [n, m].
+  m.def("splat_regression(Tensor points, Tensor centres, Tensor factors, Tensor values) -> Tensor");
+  m.def(
+      "splat_regression_backward(Tensor points, Tensor centres, Tensor factors, Tensor values, Tensor gradient) -> "
+      "(Tensor v_centres, Tensor v_factors, Tensor v_values)");
+
   // Structural similarity per pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");

@@ -25,6 +25,7 @@ from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
+from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
 from gsplat_core.reference.ssim import ssim_map
 from gsplat_core.reference.stereo_matching import match_disparities
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
@@ -54,5 +55,7 @@ __all__ = [
     "render_frame",
     "smooth_within_edges",
     "spherical_harmonics",
+    "splat_regression",
+    "splat_regression_gradients",
     "ssim_map",
 ]
