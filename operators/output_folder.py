@@ -4,7 +4,7 @@ An output folder is new, empty, or the output of an earlier run of this program.
 inputs, home or current folders, or files of other programs. A lock prevents two runs from writing into one folder.
 
 `--overwrite` replaces only files that this program wrote. They are recognised by a mark in the file: a comment in
-`.ply` and `.mp4`, the generator of `.glb`, bytes after the array of `.npy`.
+`.ply`, `.spz` and `.mp4`, the generator of `.glb`, bytes after the array of `.npy`.
 A `.splat` has no space for a mark, so its rows are validated instead.
 
 A run collects its results in the staging folder `.run-…` inside the output folder. At the end the results replace the
@@ -46,8 +46,9 @@ import numpy as np
 from gsplat_core.io.exports.export import TIMES_FILE
 from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.files import open_regular, read_regular, replace_durably, sync_folder, unfinished
-from gsplat_core.io.ply import MARK_LINE
+from gsplat_core.io.ply_header import MARK_LINE
 from gsplat_core.io.recordings.calibration import TRAILER
+from gsplat_core.io.spz import GZIP_START
 from operators.errors import OutputError, OutputFolderInUse
 from operators.storage import STAGING_PREFIX, storage_errors, write_whole
 
@@ -105,6 +106,10 @@ def _splat(file: BinaryIO) -> bool:
     return bool(np.isfinite(rows["position"]).all() and np.isfinite(rows["scale"]).all() and (rows["scale"] >= 0).all())
 
 
+def _spz(file: BinaryIO) -> bool:
+    return file.read(len(GZIP_START)) == GZIP_START
+
+
 def _sequence(file: BinaryIO) -> bool:
     with zipfile.ZipFile(file) as archive:
         return archive.namelist()[:2] == [TIMES_FILE, "0000.ply"]
@@ -137,6 +142,7 @@ _KINDS: dict[str, Callable[[BinaryIO], bool]] = {
     ".npy": _npy,
     ".mp4": _mp4,
     ".splat": _splat,
+    ".spz": _spz,
     ".zip": _sequence,
     ".isplat": _packed,
     ".html": _page,

@@ -1,12 +1,17 @@
-"""Safe opening of untrusted model files: regular files only, non-blocking, inside their folder."""
+"""Safe reading of untrusted model files: regular files only, non-blocking, inside their folder, in blocks of rows."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from gsplat_core.errors import BundleError
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.files import open_regular
 from gsplat_core.memory import available_bytes, in_gib
 
@@ -49,3 +54,63 @@ def check_memory(path: Path, needed: int) -> None:
         raise BundleError(
             f"{path} needs {in_gib(needed)} of memory to load, and {in_gib(available)} are available; free some, or use a machine with more"
         )
+
+
+BLOCK_BYTES = 4 << 20
+"""Size of the blocks in which rows are read and written."""
+MOST_THREADS = 8
+
+
+def read_rows(
+    descriptor: int,
+    path: Path,
+    start: int,
+    layout: np.dtype[Any],
+    count: int,
+    take: Callable[[int, NDArray[Any]], None],
+) -> None:
+    """Read rows of equal size in blocks, on several threads.
+
+    Args:
+        descriptor: open file.
+        path: name for messages.
+        start: offset of the first row in bytes.
+        layout: dtype of a row.
+        count: number of rows.
+        take: called with the number of a block's first row and the block; it writes to its own part of the results.
+
+    Raises:
+        BundleCorrupt: if the file ends before the last row.
+    """
+    step = max(1, BLOCK_BYTES // layout.itemsize)
+
+    def work(first: int) -> None:
+        rows = np.empty(min(step, count - first), layout)
+        raw = memoryview(rows.view(np.uint8))
+        done = 0
+        while done < len(raw):
+            read = os.preadv(descriptor, [raw[done:]], start + first * layout.itemsize + done)
+            if read == 0:
+                raise BundleCorrupt(f"{path} became shorter while it was read; copy it again")
+            done += read
+        take(first, rows)
+
+    firsts = range(0, count, step)
+    threads = min(MOST_THREADS, os.cpu_count() or 1, len(firsts))
+    if threads <= 1:
+        for first in firsts:
+            work(first)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(work, firsts):
+            pass
+
+
+LEAST_OPACITY = 1e-4
+"""Opacity of the byte 0; 1 minus this value is the opacity of 255, so that both have finite logits."""
+
+
+def logit_of_bytes(opacities: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+    """Convert opacities of 0 to 255 to logits."""
+    share = np.clip(np.arange(256) / 255.0, LEAST_OPACITY, 1 - LEAST_OPACITY)
+    return np.log(share / (1 - share)).astype(np.float32)[opacities]

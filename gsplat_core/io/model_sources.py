@@ -1,4 +1,4 @@
-"""Loading of models by path: a bundle folder, or a static splat file (`.ply`, `.splat`)."""
+"""Loading of models by path: a bundle folder, or a static splat file (`.ply`, `.splat`, `.spz`)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.exports.files import ROW
-from gsplat_core.io.model_files import check_memory, open_model_file
+from gsplat_core.io.model_files import check_memory, logit_of_bytes, open_model_file, read_rows
 from gsplat_core.io.ply import load_ply
+from gsplat_core.io.spz import load_spz
 from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
@@ -28,6 +29,8 @@ WINDOW_S = (0.0, 4.0)
 """Time window in seconds of a splat file: one turn of an orbit."""
 LEAST_RADIUS = 0.02
 """Smallest displayable scene radius, because of the near plane of the rasterizer."""
+MOST_PLACED = 1_000_000
+"""Largest number of Gaussians from which the default camera is computed; of more, every k-th is used."""
 MOST_COORDINATE = 1e9
 MOST_LOG_SCALE = 20.0
 
@@ -45,26 +48,29 @@ def load_splat(path: Path) -> Gaussians:
             raise BundleCorrupt(
                 f"{path} has {size} bytes, no multiple of {ROW.itemsize}: it is no .splat file, or was cut short"
             )
-        check_memory(path, 8 * size)
-        rows = np.frombuffer(file.read(size), ROW)
-    for name in ("position", "scale"):
-        bad = int(np.count_nonzero(~np.isfinite(rows[name])))
-        if bad or (name == "scale" and (rows[name] < 0).any()):
-            raise BundleCorrupt(
-                f"{path}: {bad} values of {name} are NaN or infinite, or scales are negative; it is no .splat file"
-            )
-    opacity = np.clip(rows["colour"][:, 3] / 255.0, 1e-4, 1 - 1e-4)
-    arrays = (
-        rows["position"],
-        (rows["rotation"].astype(np.float32) - 128) / 128,
-        np.log(np.maximum(rows["scale"], 1e-20)),
-        np.log(opacity / (1 - opacity)),
-        ((rows["colour"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None],
-    )
-    return Gaussians(*(torch.from_numpy(np.array(array, np.float32)) for array in arrays))
+        count = size // ROW.itemsize
+        check_memory(path, 4 * 14 * count)
+        means, quats, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
+        logits, sh = np.empty(count, np.float32), np.empty((count, 1, 3), np.float32)
+
+        def take(first: int, rows: NDArray[np.void]) -> None:
+            part = slice(first, first + len(rows))
+            for name in ("position", "scale"):
+                bad = int(np.count_nonzero(~np.isfinite(rows[name])))
+                if bad or (name == "scale" and (rows[name] < 0).any()):
+                    raise BundleCorrupt(
+                        f"{path}: {bad} values of {name} are NaN or infinite, or scales are negative; it is no .splat file"
+                    )
+            means[part], log_scales[part] = rows["position"], np.log(np.maximum(rows["scale"], 1e-20))
+            quats[part] = (rows["rotation"].astype(np.float32) - 128) / 128
+            logits[part] = logit_of_bytes(rows["colour"][:, 3])
+            sh[part, 0] = (rows["colour"][:, :3] / np.float32(255) - 0.5) / SH_C0
+
+        read_rows(file.fileno(), path, 0, ROW, count, take)
+    return Gaussians(*(torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)))
 
 
-READERS: Mapping[str, Callable[[Path], Gaussians]] = {".ply": load_ply, ".splat": load_splat}
+READERS: Mapping[str, Callable[[Path], Gaussians]] = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz}
 """Readers of splat files by suffix."""
 
 
@@ -77,7 +83,7 @@ def load_model(path: Path) -> Model:
     """Load a model from a bundle or a splat file.
 
     Args:
-        path: bundle folder, or a `.ply` or `.splat` file. A splat file becomes a static scene with
+        path: bundle folder, or a `.ply`, `.splat` or `.spz` file. A splat file becomes a static scene with
             a camera that shows all of it.
 
     Raises:
@@ -86,7 +92,7 @@ def load_model(path: Path) -> Model:
     if not is_scene_file(path):
         if path.exists() and not path.is_dir():
             raise BundleError(
-                f"{path} is no model; give a model folder, a packed model (.isplat) where it is taken, or a {' or '.join(READERS)} file"
+                f"{path} is no model; give a model folder, a packed model (.isplat) where it is taken, or a {', '.join(READERS)} file"
             )
         return load_bundle(path)
     gaussians = READERS[path.suffix.lower()](path)
@@ -96,7 +102,7 @@ def load_model(path: Path) -> Model:
         ("position", gaussians.means, MOST_COORDINATE),
         ("scale", gaussians.log_scales, MOST_LOG_SCALE),
     ):
-        found = float(values.max() if name == "scale" else values.abs().max())
+        found = float(values.max() if name == "scale" else max(values.max(), -values.min()))
         if found > most:
             shown = f"exp({found:.3g})" if name == "scale" else f"{found:.3g}"
             raise BundleCorrupt(f"{path} holds a {name} of {shown}, beyond what can be shown; export it again")
@@ -109,10 +115,11 @@ def _camera_for(gaussians: Gaussians, path: Path) -> Camera:
     Raises:
         BundleCorrupt: if the scene is too small for the camera's near plane.
     """
-    means: NDArray[np.float64] = gaussians.means.numpy().astype(np.float64)
+    every = slice(None, None, -(-gaussians.count // MOST_PLACED))
+    means: NDArray[np.float64] = gaussians.means[every].numpy().astype(np.float64)
     centre = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), SHOWN_SHARE))
-    size = float(np.exp(np.median(gaussians.log_scales.numpy().astype(np.float64))))
+    size = float(np.exp(np.median(gaussians.log_scales[every].numpy().astype(np.float64))))
     radius = max(radius, 3 * size)
     if radius < LEAST_RADIUS:
         raise BundleCorrupt(f"{path} is {2 * radius:.3g} across, too small to be shown; export it in a smaller unit")

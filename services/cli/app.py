@@ -86,7 +86,7 @@ def export(
     format: Annotated[
         str | None,
         typer.Option(
-            help="Gaussians: ply, splat, glb, ply-sequence. Surface: mesh-ply, mesh-glb, points-ply.",
+            help="Gaussians: ply, compressed-ply, splat, spz, glb, ply-sequence. Surface: mesh-ply, mesh-glb, points-ply.",
             show_default="by the file's ending",
         ),
     ] = None,
@@ -101,7 +101,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Export a model for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its surface."""
+    """Export a model for other programs: .ply, .splat, .spz, .glb, or a .zip of .ply over time; or its surface."""
     from services.cli.models import export_command
 
     return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)

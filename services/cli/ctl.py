@@ -243,7 +243,7 @@ SNAPSHOT: Columns = {
 FormatOption = Annotated[
     str | None,
     typer.Option(
-        help="ply, splat, glb, ply-sequence, mesh-ply, mesh-glb, points-ply or isplat.",
+        help="ply, compressed-ply, splat, spz, glb, ply-sequence, mesh-ply, mesh-glb, points-ply or isplat.",
         show_default="by the file's ending",
     ),
 ]

@@ -102,7 +102,7 @@ def export_command(
         OutputError: if the file cannot be written.
     """
     wish = ExportWish(format_of(file) if format_name is None else format_named(format_name), time_s, times)
-    if file.suffix.lower() != wish.format.suffix:
+    if not file.name.lower().endswith(wish.format.suffix):
         raise OutputError(
             f"{file} does not end in {wish.format.suffix}, as a file of the format {wish.format.name} does; give such a name"
         )

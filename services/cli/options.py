@@ -46,7 +46,7 @@ ModelArgument = Annotated[
     Path,
     path_argument(
         "MODEL",
-        "A model folder that replay or reconstruct wrote; render, view, export and measure also take a scene.ply or .splat of other programs.",
+        "A model folder that replay or reconstruct wrote; render, view, export and measure also take a scene.ply, .splat or .spz of other programs.",
     ),
 ]
 PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]

@@ -107,7 +107,7 @@ def view(
     model: Annotated[
         Path,
         path_argument(
-            "MODEL", "A model folder, a packed model (.isplat), or a scene of other programs (.ply, .splat)."
+            "MODEL", "A model folder, a packed model (.isplat), or a scene of other programs (.ply, .splat, .spz)."
         ),
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",

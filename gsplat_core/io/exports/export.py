@@ -14,6 +14,7 @@ import torch
 
 from gsplat_core.errors import ExportError
 from gsplat_core.geometry.mesh import mesh_of
+from gsplat_core.io.compressed_ply import compressed_ply_pieces
 from gsplat_core.io.exports.files import (
     glb_pieces,
     mesh_glb_pieces,
@@ -25,6 +26,7 @@ from gsplat_core.io.exports.files import (
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.ply import ply_pieces
+from gsplat_core.io.spz import spz_pieces
 from gsplat_core.models.model import Model
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -74,7 +76,8 @@ def _pieces(format_name: str, gaussians: Gaussians, time_s: float) -> Iterator[b
     elif format_name == "glb":
         yield from glb_pieces(rows, NODE_NAME, time_s)
     else:
-        yield from ply_pieces(with_unit_rotations(gaussians))
+        encoders = {"ply": ply_pieces, "compressed-ply": compressed_ply_pieces, "spz": spz_pieces}
+        yield from encoders[format_name](with_unit_rotations(gaussians))
 
 
 def _surface_pieces(format_name: str, model: Model, time_s: float) -> Iterator[bytes]:

@@ -19,6 +19,7 @@ class ExportFormat:
 
     name: str
     suffix: str
+    """Ending of the file name, in lower case."""
     media_type: str
     is_surface: bool = False
     """True if the file contains the surface seen by the model's camera instead of the Gaussians."""
@@ -30,7 +31,9 @@ FORMATS: Mapping[str, ExportFormat] = {
     each.name: each
     for each in (
         ExportFormat("ply", ".ply", "application/octet-stream"),
+        ExportFormat("compressed-ply", ".compressed.ply", "application/octet-stream"),
         ExportFormat("splat", ".splat", "application/octet-stream"),
+        ExportFormat("spz", ".spz", "application/octet-stream"),
         ExportFormat("glb", ".glb", "model/gltf-binary"),
         ExportFormat("ply-sequence", ".zip", "application/zip", is_sequence=True),
         ExportFormat("mesh-ply", ".ply", "application/octet-stream", is_surface=True),
@@ -52,15 +55,15 @@ def format_named(name: str) -> ExportFormat:
 
 
 def format_of(path: Path) -> ExportFormat:
-    """Return the format for a file name's suffix; among several, the one with Gaussians.
+    """Return the format for a file name's ending; among several, the longest ending, then the one with Gaussians.
 
     Raises:
-        InvalidSetting: if no format has the suffix.
+        InvalidSetting: if no format has the ending.
     """
-    for each in FORMATS.values():
-        if path.suffix.lower() == each.suffix:
-            return each
-    endings = ", ".join(each.suffix for each in FORMATS.values())
+    fitting = [each for each in FORMATS.values() if path.name.lower().endswith(each.suffix)]
+    if fitting:
+        return max(fitting, key=lambda each: len(each.suffix))
+    endings = ", ".join(dict.fromkeys(each.suffix for each in FORMATS.values()))
     raise InvalidSetting(f"{path.name!r:.80} ends in none of {endings}; give such a name, or --format")
 
 

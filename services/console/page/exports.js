@@ -7,7 +7,9 @@ import { when } from "./times.js";
 const FORMATS = {
   isplat: "IntraSplat model (.isplat)",
   ply: "Gaussians (.ply)",
+  "compressed-ply": "Gaussians, compressed (.compressed.ply)",
   splat: "Gaussians (.splat)",
+  spz: "Gaussians, compressed (.spz)",
   glb: "glTF (.glb)",
   "ply-sequence": "over time (.zip)",
   "mesh-glb": "surface, glTF (.glb)",

@@ -1,6 +1,8 @@
-"""`.ply` and `.splat` scenes of other programs in `render`, `export`, `measure` and `view`; hostile ones get a sentence."""
+"""`.ply`, `.splat` and `.spz` scenes of other programs in `render`, `export`, `measure` and `view`; hostile ones get a sentence."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,13 +65,14 @@ def test_a_splat_is_read_as_it_was_written(tmp_path):
         assert close, name
 
 
-@pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "SCENE.PLY"])
+@pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "scene.compressed.ply", "scene.spz", "SCENE.PLY"])
 def test_commands_take_a_scene_file(tmp_path, name):
     save_ply(cloud(), tmp_path / "scene.ply")
-    if name == "scene.splat":
-        export_model(load_model(tmp_path / "scene.ply"), tmp_path / name, ExportWish(format_named("splat")))
-    elif name == "SCENE.PLY":
+    if name == "SCENE.PLY":
         (tmp_path / "scene.ply").rename(tmp_path / name)
+    elif name != "scene.ply":
+        assert run(["export", str(tmp_path / "scene.ply"), str(tmp_path / name)]) == OK
+        assert run(["export", str(tmp_path / "scene.ply"), str(tmp_path / name), "--overwrite"]) == OK
     scene, out = str(tmp_path / name), tmp_path / "images"
     assert run(["render", scene, "--out", str(out), "--scale", "0.1", "--fps", "1"]) == OK
     assert len(list(out.glob("*.png"))) > 1
@@ -156,10 +159,26 @@ def test_a_scene_of_another_program_without_our_mark_is_read(tmp_path):
     assert load_ply(tmp_path / "scene.ply").count == 2
 
 
-@pytest.mark.parametrize("format_name", ["glb", "ply", "splat"])
+@pytest.mark.parametrize(("name", "least_db"), [("scene.compressed.ply", 38), ("scene.spz", 33)])
+def test_a_compressed_scene_shows_the_same_picture(tmp_path, name, least_db):
+    gaussians = cloud(60)
+    # A different colour from each side and a shape that a wrong rotation would change.
+    turned = torch.randn(60, 4, generator=torch.Generator().manual_seed(2))
+    higher = 0.4 * torch.rand(60, 15, 3, generator=torch.Generator().manual_seed(3)) - 0.2
+    stretched = gaussians.log_scales + torch.tensor([1.0, 0.0, -1.0])
+    gaussians = replace(gaussians, quats=turned, log_scales=stretched, sh=torch.cat([gaussians.sh, higher], 1))
+    save_ply(gaussians, tmp_path / "scene.ply")
+    assert run(["export", str(tmp_path / "scene.ply"), str(tmp_path / name)]) == OK
+    first, second = (load_model(tmp_path / each) for each in ("scene.ply", name))
+    camera = first.camera.resized(160, 128)
+    difference = (first.render(0.0, camera).image - second.render(0.0, camera).image).square().mean()
+    assert -10 * float(difference.log10()) > least_db
+
+
+@pytest.mark.parametrize("format_name", ["glb", "ply", "compressed-ply", "splat", "spz"])
 def test_the_bytes_of_an_export_do_not_depend_on_its_name(tmp_path, format_name):
     save_ply(cloud(), tmp_path / "scene.ply")
     model = load_model(tmp_path / "scene.ply")
     for name in ("a", "another name"):
-        export_model(model, tmp_path / f"{name}.{format_name}", ExportWish(format_named(format_name)))
-    assert (tmp_path / f"a.{format_name}").read_bytes() == (tmp_path / f"another name.{format_name}").read_bytes()
+        export_model(model, tmp_path / name, ExportWish(format_named(format_name)))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "another name").read_bytes()
