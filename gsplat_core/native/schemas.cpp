@@ -137,6 +137,16 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // fy, cx, cy, width, height. CPU only.
   m.def("surface_motion(Tensor points, Tensor flow, float[] before, float[] after, bool arrived) -> Tensor");
 
+  // Blended optical flow of splats that carry the surface of the first picture to the second camera: [height, width, 4],
+  // the sums of weight times flow x, flow y and depth in the second camera, and of the weights. intrinsics: fx, fy,
+  // cx, cy of both cameras. Tiles have 16x16 pixels.
+  m.def(
+      "blend_flow(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor planes, Tensor isect_offsets, "
+      "Tensor flatten_ids, float[] intrinsics, int width, int height) -> Tensor");
+  m.def(
+      "blend_flow_backward(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor planes, Tensor isect_offsets, "
+      "Tensor flatten_ids, float[] intrinsics, int width, int height, Tensor v_out) -> Tensor");
+
   // Semi-global matching of two rectified grey images uint8 [H, W] over the disparities lowest .. lowest + count - 1.
   // Returns the disparity in 1/16 pixel, int32 [H, W], with INT32_MIN where unknown; and uint8 [H, W], 1 for pixels
   // with neither a disparity jump nor a hole nearby.

@@ -20,6 +20,7 @@ from gsplat_core.reference.deformation import (
 )
 from gsplat_core.reference.disparity_fit import fit_disparities
 from gsplat_core.reference.edge_aware_filter import smooth_within_edges
+from gsplat_core.reference.flow_blending import blend_flow
 from gsplat_core.reference.frame import render_frame
 from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
@@ -37,6 +38,7 @@ __all__ = [
     "basis_field_backward",
     "basis_field_backward_adam_",
     "basis_field_move_to_",
+    "blend_flow",
     "fit_disparities",
     "frame_loss",
     "fully_fused_projection",

@@ -12,7 +12,6 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,37 +19,11 @@ from torch import Tensor
 from gsplat_core.depth.maps import OfRecording
 from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.registration import EXACT_KD_TREE
+from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.growth.densification import UNSEEN_PX, densify, on_tissue, shares_of
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.transfers import HostCopy, tensor_of
-
-NEIGHBOURS = 8
-"""Number of neighbours per point; fewer if there are fewer points."""
-
-
-def nearest_others(points: Tensor) -> Tensor:
-    """Return the indices of the nearest other points of `points` [N, 3], int64 [N, K]. Synchronises with the device.
-
-    Ties are broken arbitrarily. A non-finite point has only itself as neighbour and is no neighbour of others.
-    """
-    host = HostCopy(points.detach().float()).numpy()
-    finite = np.flatnonzero(np.isfinite(host).all(axis=1))
-    count = min(NEIGHBOURS, max(len(finite) - 1, 0))
-    others = np.repeat(np.arange(len(host))[:, None], count, axis=1)
-    if count:
-        there = np.ascontiguousarray(host[finite] - host[finite].mean(axis=0))
-        tree = cv2.flann_Index(there, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10})  # type: ignore[attr-defined]
-        found, _ = tree.knnSearch(there, count + 1, params={"checks": -1, "eps": 0.0, "sorted": True})
-        # A point is its own first result, unless other points coincide with it. In that case drop the
-        # last result instead.
-        itself = found == np.arange(len(there))[:, None]
-        itself[~itself.any(axis=1), -1] = True
-        others[finite] = finite[found[~itself].reshape(len(there), count)]
-    return tensor_of(np.ascontiguousarray(others.astype(np.int64)), points.device)
-
 
 NOISE_LEVELS = 2.5
 """Standard deviation of noise in compressed video, in grey levels of 255."""

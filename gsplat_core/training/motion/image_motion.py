@@ -110,6 +110,47 @@ def smoothed(flow: NDArray[np.float32], tissue: NDArray[np.uint8]) -> Flow:
     return np.asarray((moved + WIDE_WEIGHT * wide) / np.maximum(total, 1e-6), np.float32)
 
 
+CONSISTENT_PX = 1.0
+"""Largest distance in pixels between a pixel and its position after moving to the second picture and back."""
+
+
+def consistent_flow(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    first_mask: NDArray[np.uint8] | None = None,
+    second_mask: NDArray[np.uint8] | None = None,
+) -> NDArray[np.float32]:
+    """Return the DIS flow [H, W, 2] in pixels from one picture to another, NaN where it is not reliable.
+
+    Reliable flow starts and arrives on tissue in the pictures, and the backward flow returns to within 1 px.
+
+    Args:
+        first: RGB uint8 [H, W, 3].
+        second: RGB uint8 [H, W, 3].
+        first_mask: [H, W], non-zero on tissue, or None for all.
+        second_mask: mask of the second picture.
+    """
+    height, width = first.shape[:2]
+    nothing = np.full((height, width, 2), np.nan, np.float32)
+    if second.shape != first.shape or min(height, width) < SMALLEST_PX:
+        return nothing
+    one, other = (np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (first, second))
+    method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    ahead = np.asarray(method.calc(one, other, None), np.float32)
+    back = np.asarray(method.calc(other, one, None), np.float32)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    there_x, there_y = x + ahead[..., 0], y + ahead[..., 1]
+    returned = cv2.remap(back, there_x, there_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    reliable = np.linalg.norm(ahead + returned, axis=2) <= CONSISTENT_PX
+    reliable &= (there_x >= 0) & (there_x <= width - 1) & (there_y >= 0) & (there_y <= height - 1)
+    if first_mask is not None:
+        reliable &= first_mask != 0
+    if second_mask is not None:
+        arrives = cv2.remap((second_mask != 0).astype(np.uint8), there_x, there_y, cv2.INTER_NEAREST)
+        reliable &= arrives != 0
+    return np.where(reliable[..., None], ahead, nothing)
+
+
 def typical_px(flow: Flow) -> float:
     """Return the median length of the flow in pixels."""
     return float(np.median(np.linalg.norm(flow, axis=2)))

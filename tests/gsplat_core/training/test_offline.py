@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
+from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import POSITION
 from gsplat_core.training import offline
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, nearest_others
+from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 

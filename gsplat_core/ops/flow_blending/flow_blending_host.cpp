@@ -1,0 +1,194 @@
+// Host code of blend_flow and blend_flow_backward: checks, memory, and the launch on each device.
+#include "flow_blending.h"
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <vector>
+
+#include "host_call.h"
+#if !defined(GSPLAT_CUDA)
+#include "counting_sort.h"
+#endif
+
+namespace gsplat::flow_blending {
+namespace {
+
+constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
+
+// Checked inputs of either pass. The tensors own the memory that `in` points to.
+struct Arguments {
+  Tensor means2d, conics, opacities, rays, planes, offsets, flatten_ids;
+  Inputs in = {};
+
+  Arguments(const Call& call, const Tensor& means2d_, const Tensor& conics_, const Tensor& opacities_, const Tensor& rays_,
+            const Tensor& planes_, const Tensor& offsets_, const Tensor& flatten_ids_, const std::vector<double>& intrinsics,
+            int64_t width, int64_t height)
+      : means2d(call.floats(means2d_, "means2d")),
+        conics(call.floats(conics_, "conics")),
+        opacities(call.floats(opacities_, "opacities")),
+        rays(call.floats(rays_, "rays")),
+        planes(call.floats(planes_, "planes")),
+        offsets(call.ints(offsets_, "isect_offsets")),
+        flatten_ids(call.ints(flatten_ids_, "flatten_ids")) {
+    const int64_t count = opacities.numel();
+    check(offsets.dim() == 2, "blend_flow: isect_offsets must be [tile_height, tile_width]");
+    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && rays.numel() == kRayNumbers * count &&
+              planes.numel() == kPlaneNumbers * count,
+          "blend_flow: means2d, conics, opacities, rays and planes must be of the same splats");
+    const int64_t tile_height = offsets.size(0), tile_width = offsets.size(1);
+    check(width >= 0 && height >= 0 && width < kMaxInts && height < kMaxInts && tile_width * kTileSize >= width &&
+              tile_height * kTileSize >= height,
+          "blend_flow: the tiles of isect_offsets do not cover the image");
+    check(count < kMaxInts && flatten_ids.numel() <= kMaxInts && offsets.numel() <= kMaxInts,
+          "blend_flow: more than 2^31 - 1 splats, instances or tiles");
+    check(intrinsics.size() == 8, "blend_flow: intrinsics must be fx, fy, cx, cy of both cameras");
+    const auto pinhole = [&](size_t first) {
+      const Pinhole p = {float(intrinsics[first]), float(intrinsics[first + 1]), float(intrinsics[first + 2]),
+                         float(intrinsics[first + 3])};
+      check(p.fx > 0 && p.fy > 0, "blend_flow: focal lengths must be positive");
+      return p;
+    };
+    in.means2d = data(means2d);
+    in.conics = data(conics);
+    in.opacities = data(opacities);
+    in.offsets = offsets.const_data_ptr<int32_t>();
+    in.flatten_ids = flatten_ids.const_data_ptr<int32_t>();
+    in.count = count;
+    in.instances = flatten_ids.numel();
+    in.images = 1;
+    in.width = int32_t(width);
+    in.height = int32_t(height);
+    in.tile_size = kTileSize;
+    in.tile_width = int32_t(tile_width);
+    in.tile_height = int32_t(tile_height);
+    in.rays = data(rays);
+    in.planes = data(planes);
+    in.before = pinhole(0);
+    in.after = pinhole(4);
+  }
+};
+
+#if defined(GSPLAT_CUDA)
+
+void forward(Call& call, const Inputs& in, float* out) { blend_on_device(in, out, call, call.stream); }
+
+void backward(Call& call, const Inputs& in, const float* v_out, float* v_planes) {
+  blend_backward_on_device(in, v_out, v_planes, call, call.stream);
+}
+
+#else
+
+// Position of the first tile's list. Earlier entries are unused: lists of a fixed capacity are filled from the end.
+int64_t first_listed(const Inputs& in) { return in.tiles() > 0 ? in.offsets[0] : in.instances; }
+
+// Validate the caller's lists; an out-of-range index would read outside of the tensors.
+void check_lists(const Inputs& in) {
+  int32_t before = 0;
+  bool ordered = true;
+  for (int64_t i = 0; i < in.tiles(); ++i) ordered &= in.offsets[i] >= before, before = in.offsets[i];
+  check(ordered && before <= in.instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
+  for (int64_t i = first_listed(in); i < in.instances; ++i)
+    check(uint64_t(uint32_t(in.flatten_ids[i])) < uint64_t(in.count), "flatten_ids must be in [0, ", in.count, "), found ",
+          in.flatten_ids[i]);
+}
+
+bool all_finite(const float* values, int count) {
+  float zero = 0;
+  for (int i = 0; i < count; ++i) zero += 0 * values[i];
+  return zero == 0;
+}
+
+// Records of all splats, and a parallel loop over all tiles.
+struct Pass {
+  std::unique_ptr<compositing::SplatRecord[]> records;
+  Splats splats;
+
+  explicit Pass(const Inputs& in) : records(uninitialised<compositing::SplatRecord>(in.count)), splats{in, {in, records.get()}} {
+    check_lists(in);
+    torch::stable::parallel_for(0, in.count, 2048, [&](int64_t begin, int64_t end) {
+      compositing::kernels().records(in, begin, end, records.get());
+      // A splat with a non-finite value reaches no pixel.
+      for (int64_t i = begin; i < end; ++i)
+        if (!all_finite(in.rays + i * kRayNumbers, kRayNumbers) || !all_finite(in.planes + i * kPlaneNumbers, kPlaneNumbers))
+          records[size_t(i)].l = -INFINITY;
+    });
+  }
+
+  // Call run(tile) for all tiles. Threads take the next free tiles; no result depends on the assignment.
+  template <class Run>
+  void for_tiles(const Run& run) const {
+    constexpr int64_t kRun = 4;
+    std::atomic<int64_t> next{0};
+    const int64_t tiles = splats.in.tiles();
+    const int64_t workers = std::max<int64_t>(1, std::min<int64_t>(torch::stable::get_num_threads(), tiles));
+    torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
+      for (int64_t first; (first = next.fetch_add(kRun, std::memory_order_relaxed)) < tiles;)
+        for (int64_t tile = first; tile < std::min(first + kRun, tiles); ++tile) run(tile);
+    });
+  }
+};
+
+void forward(Call&, const Inputs& in, float* out) {
+  const Pass pass(in);
+  pass.for_tiles([&](int64_t tile) { kernels().tile(pass.splats, tile, out); });
+}
+
+void backward(Call&, const Inputs& in, const float* v_out, float* v_planes) {
+  const Pass pass(in);
+  // One row per instance; the rows of a splat are contiguous and in list order.
+  auto first = uninitialised<int32_t>(in.count + 1), row_of = uninitialised<int32_t>(in.instances);
+  const int64_t unused = first_listed(in), listed = in.instances - unused;
+  const int32_t* const ids = in.flatten_ids + unused;
+  const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
+    for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
+  };
+  counting_sort(listed, 1 << 15, in.count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
+    for (int64_t i = begin; i < end; ++i) row_of[size_t(unused + i)] = cursors[ids[i]]++;
+  });
+  first[size_t(in.count)] = int32_t(listed);
+  const auto rows = uninitialised<float>(listed * kPlaneNumbers);
+  const GradientRows gradients = {row_of.get(), rows.get()};
+  pass.for_tiles([&](int64_t tile) { kernels().tile_backward(pass.splats, tile, v_out, gradients); });
+  torch::stable::parallel_for(0, in.count, 2048, [&](int64_t begin, int64_t end) {
+    for (int64_t splat = begin; splat < end; ++splat) {
+      float* const to = v_planes + splat * kPlaneNumbers;
+      std::fill(to, to + kPlaneNumbers, 0.0f);
+      for (int64_t row = first[size_t(splat)]; row < first[size_t(splat) + 1]; ++row)
+        for (int k = 0; k < kPlaneNumbers; ++k) to[k] += rows[size_t(row * kPlaneNumbers + k)];
+    }
+  });
+}
+
+#endif
+
+Tensor blend_flow(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor planes, Tensor offsets,
+                  Tensor flatten_ids, std::vector<double> intrinsics, int64_t width, int64_t height) {
+  Call call(means2d);
+  const Arguments arguments(call, means2d, conics, opacities, rays, planes, offsets, flatten_ids, intrinsics, width, height);
+  Tensor out = call.empty({height, width, kChannels});
+  forward(call, arguments.in, mutable_data(out));
+  call.finish("blend_flow");
+  return out;
+}
+
+Tensor blend_flow_backward(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor planes, Tensor offsets,
+                           Tensor flatten_ids, std::vector<double> intrinsics, int64_t width, int64_t height, Tensor v_out) {
+  Call call(means2d);
+  const Arguments arguments(call, means2d, conics, opacities, rays, planes, offsets, flatten_ids, intrinsics, width, height);
+  const Tensor v = call.floats(v_out, "v_out");
+  check(v.numel() == width * height * kChannels, "blend_flow_backward: v_out must be [height, width, ", kChannels, "]");
+  Tensor v_planes = call.empty({arguments.in.count, kPlaneNumbers});
+  backward(call, arguments.in, data(v), mutable_data(v_planes));
+  call.finish("blend_flow_backward");
+  return v_planes;
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
+  m.impl("blend_flow", GSPLAT_BOX(&blend_flow));
+  m.impl("blend_flow_backward", GSPLAT_BOX(&blend_flow_backward));
+}
+
+}  // namespace gsplat::flow_blending
