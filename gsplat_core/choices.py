@@ -65,6 +65,8 @@ LOSSES: Registry[LossKind] = Registry(
     {
         "photometric": "gsplat_core.training.losses.photometric:Photometric",
         "depth": "gsplat_core.training.losses.depth:Depth",
+        "flow": "gsplat_core.training.losses.flow:FlowLoss",
+        "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
     },
 )
 """Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""

@@ -121,7 +121,10 @@ def render_flow(
 
 
 def render_depth(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return the expected z [H, W] at the rays' intersections with the splats; 0 where nothing is observed."""
+    """Return the expected z [H, W] at the rays' intersections with the splats; 0 where nothing is observed.
+
+    Differentiable in means and rotations with constant weights: a splat's surface moves with the splat.
+    """
     still = torch.arange(gaussians.count, device=gaussians.device)[:, None]
     return render_flow(gaussians, gaussians, camera, camera, neighbours=still).depth
 
