@@ -8,6 +8,9 @@
 Axes are the camera's (x right, y down, z forward), lengths the scene's, times the model's in
 seconds. `intrinsics` {"fx", "fy", "cx", "cy"}, in pixels of the model's camera, may be given for
 all cameras or for none. Linear motion does not overshoot into tissue, as smoother curves would.
+
+The `cameras.json` that the INRIA trainer writes next to a `.ply` is read, too: a list of cameras with `position`,
+`rotation` (camera to world), `fx`, `fy`, `width` and `height`. They follow each other by one second.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
 from gsplat_core.io.files import read_regular
 from gsplat_core.io.json_object import JsonObject
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.value_ranges import NumberIn
+from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 MOST_BYTES = 1 << 24
 MOST_CAMERAS = 100_000
@@ -32,6 +35,7 @@ TIME_S = NumberIn(-1e10, 1e10)
 PLACE = NumberIn(-1e9, 1e9)
 FOCAL_PX = NumberIn(1e-3, 1e7)
 CENTRE_PX = NumberIn(-1e7, 1e7)
+HEIGHT_PX = IntegerIn(1, 1 << 16)
 ROTATION_TOLERANCE = 2e-3
 INTRINSICS = {"fx": FOCAL_PX, "fy": FOCAL_PX, "cx": CENTRE_PX, "cy": CENTRE_PX}
 
@@ -45,6 +49,9 @@ class Waypoint:
     """Camera-to-world pose [4, 4]."""
     intrinsics: tuple[float, ...] | None = None
     """fx, fy, cx and cy in pixels; None to keep the intrinsics of the camera that follows the path."""
+    height_px: int | None = None
+    """Height of the picture that `intrinsics` belong to, which has its principal point in the middle. None for
+    intrinsics of the camera that follows the path."""
 
 
 class CameraPath:
@@ -82,7 +89,7 @@ class CameraPath:
         camera = start.with_pose(_inverse(pose))
         if before.intrinsics is None or after.intrinsics is None:
             return camera
-        fx, fy, cx, cy = (1 - share) * np.array(before.intrinsics) + share * np.array(after.intrinsics)
+        fx, fy, cx, cy = (1 - share) * _intrinsics(before, start) + share * _intrinsics(after, start)
         return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
 
 
@@ -97,6 +104,8 @@ def read_camera_path(path: Path) -> CameraPath:
     except OSError as error:
         raise InvalidSetting(f"cannot read the camera path {path}: {error.strerror or error}") from error
     try:
+        if text.lstrip()[:1] == b"[":
+            return _inria_path(text, path.name)
         listed = JsonObject.parse(text, path.name).values.get("cameras")
         if not isinstance(listed, list) or not 1 <= len(listed) <= MOST_CAMERAS:
             raise InvalidInput(f"{path.name}: cameras must be a list of 1 to {MOST_CAMERAS} objects")
@@ -105,14 +114,45 @@ def read_camera_path(path: Path) -> CameraPath:
         raise InvalidSetting(f"the camera path cannot be used: {error}") from error
 
 
-def _waypoint(reader: JsonObject) -> Waypoint:
-    pose = np.array(reader.matrix("camera_to_world", 4, PLACE))
+def _intrinsics(waypoint: Waypoint, camera: Camera) -> NDArray[np.float64]:
+    """Return fx, fy, cx and cy of a waypoint in pixels of the camera; the vertical field of view is kept."""
+    fx, fy, cx, cy = waypoint.intrinsics or ()
+    if waypoint.height_px is None:
+        return np.array([fx, fy, cx, cy])
+    factor = camera.height_px / waypoint.height_px
+    return np.array([fx * factor, fy * factor, camera.width_px / 2, camera.height_px / 2])
+
+
+def _inria_path(text: bytes, name: str) -> CameraPath:
+    listed = JsonObject.parse(b'{"cameras": ' + text + b"}", name).values["cameras"]
+    if not 1 <= len(listed) <= MOST_CAMERAS:
+        raise InvalidInput(f"{name} must have 1 to {MOST_CAMERAS} cameras, not {len(listed)}")
+    waypoints = []
+    for k, each in enumerate(listed):
+        reader = JsonObject(each, f"{name}: [{k}]")
+        pose = np.eye(4)
+        position = reader.numbers("position", PLACE, 3)
+        if len(position) != 3:
+            raise InvalidInput(f"{reader.name}: position must be three numbers, got {position}")
+        pose[:3, :3], pose[:3, 3] = reader.matrix("rotation", 3, PLACE), position
+        _check_rotation(reader.name, "rotation", pose)
+        fx, fy = reader.number("fx", FOCAL_PX), reader.number("fy", FOCAL_PX)
+        waypoints.append(Waypoint(float(k), pose, (fx, fy, 0.0, 0.0), reader.integer("height", HEIGHT_PX)))
+    return CameraPath(waypoints)
+
+
+def _check_rotation(name: str, key: str, pose: NDArray[np.float64]) -> None:
     rotation = pose[:3, :3]
     off = float(np.abs(np.clip(rotation, -2, 2) @ np.clip(rotation, -2, 2).T - np.eye(3)).max())
     if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
         raise InvalidInput(
-            f"{reader.name}: camera_to_world must be a rotation and a translation, with 0 0 0 1 as its last row; its rotation is off by {off:.3g}"
+            f"{name}: {key} must be a rotation and a translation, with 0 0 0 1 as its last row; its rotation is off by {off:.3g}"
         )
+
+
+def _waypoint(reader: JsonObject) -> Waypoint:
+    pose = np.array(reader.matrix("camera_to_world", 4, PLACE))
+    _check_rotation(reader.name, "camera_to_world", pose)
     intrinsics = None
     if reader.values.get("intrinsics") is not None:
         nested = reader.nested("intrinsics")

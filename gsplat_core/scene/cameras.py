@@ -124,6 +124,14 @@ class Camera:
         K[1] *= height_px / self.height_px
         return replace(self, K=K, width_px=width_px, height_px=height_px)
 
+    def fitted(self, width_px: int, height_px: int) -> Camera:
+        """Return the camera for pictures of another size and aspect ratio, with the same vertical field of view."""
+        factor = height_px / self.height_px
+        K = self.K.copy()
+        K[:2] *= factor
+        K[0, 2] += (width_px - self.width_px * factor) / 2
+        return replace(self, K=K, width_px=width_px, height_px=height_px)
+
     def with_pose(self, world_to_camera: ArrayLike) -> Camera:
         """Return the camera with another world-to-camera pose [4, 4]."""
         return replace(self, world_to_camera=np.asarray(world_to_camera, dtype=np.float64))

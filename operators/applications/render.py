@@ -22,7 +22,7 @@ from gsplat_core.io.model_sources import is_scene_file, load_model
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models.model import Model
 from gsplat_core.rendering.registry import check_renderer, new_renderer
-from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.rendering.renderer import Renderer, RendererOptions
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.orbit import Orbit
 from gsplat_core.transfers import HostCopy
@@ -52,6 +52,8 @@ AZIMUTH_DEG, ELEVATION_DEG = 25.0, 15.0
 """Largest angles of an orbit. They are small because a scope observes tissue from one side only."""
 EYES_APART = 0.06
 """Default stereo baseline divided by the scene's distance: 4.4 mm at 74 mm."""
+MOST_PICTURED = 1_000_000
+"""Number of Gaussians of a static scene above which `typical_depth` renders no picture."""
 COVERED = 0.5
 """Minimum opacity of a pixel that counts for `typical_depth`."""
 
@@ -135,7 +137,17 @@ def on_orbit(camera: Camera, distance: float, turns: float) -> Camera:
 
 
 def typical_depth(model: Model, camera: Camera) -> float:
-    """Return the median depth at the model's start. Raises InvalidSetting if `camera` sees no part of the scene."""
+    """Return the median depth at the model's start. Raises InvalidSetting if `camera` sees no part of the scene.
+
+    For a very large static scene it is the median over the Gaussians in front of the camera, without a picture.
+    """
+    if model.field is None and model.gaussians.count > MOST_PICTURED:
+        every = slice(None, None, -(-model.gaussians.count // MOST_PICTURED))
+        means = model.gaussians.means[every].cpu().double().numpy()
+        depths = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        if not (depths > 0).any():
+            raise InvalidSetting("the camera sees no part of the scene; there is nothing to look at from another side")
+        return float(np.median(depths[depths > 0]))
     output = model.render(model.time_window_s[0], camera)
     depth, alpha = HostCopy(output.depth).numpy(), HostCopy(output.alpha).numpy()
     known = depth[(alpha >= COVERED) & (depth > 0)]
@@ -151,7 +163,7 @@ def _along_path(model: Model, camera: Camera, file: Path) -> View:
         )
     path = read_camera_path(file)
     (start_s, end_s), (first_s, last_s) = model.time_window_s, path.window_s
-    if first_s < start_s - 1e-6 or last_s > end_s + 1e-6:
+    if model.field is not None and (first_s < start_s - 1e-6 or last_s > end_s + 1e-6):
         raise InvalidSetting(
             f"{file.name} goes from {first_s:g} to {last_s:g} s; the model has seen {start_s:g} to {end_s:g} s"
         )
@@ -176,6 +188,7 @@ def render_model(
     scale: float = 1.0,
     device: str = "cpu",
     renderer: str = "alpha",
+    options: RendererOptions | None = None,
     view: ViewWish = RECORDED,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
@@ -193,6 +206,7 @@ def render_model(
         scale: factor on the size of the model's camera.
         device: `cpu` or `cuda`.
         renderer: name of the renderer.
+        options: options of the renderer.
         view: camera path.
         overwrite: replace an existing video of this program.
         progress: called after each frame.
@@ -212,9 +226,9 @@ def render_model(
     inputs = [bundle, *view.inputs]
     to_video = out.suffix.lower() == VIDEO_SUFFIX
     if to_video:
-        _check_video_path(inputs, out, overwrite)
+        check_video_path(inputs, out, overwrite)
     check_device(device)
-    check_renderer(renderer, device)
+    check_renderer(renderer, device, options=options)
     model = load_model(bundle).to(device)
     if is_scene_file(bundle) and view.name == RECORDED.name:  # a scene file contains no camera for the recorded view
         view = ViewWish("orbit")
@@ -227,13 +241,13 @@ def render_model(
     shown = view_of(model, camera, view)
     check_width(shown.across * camera.width_px)
     frames = frames_to_render(shown.window_s, fps)
-    pictures = _Pictures(model, shown, lambda: new_renderer(renderer, camera, device))
+    pictures = _Pictures(model, shown, lambda: new_renderer(renderer, camera, device, options=options))
     images = _images(pictures, frames, fps, progress, stop_requested)
     if not to_video:
         return _write_images(images, inputs, out)
     if overwrite:
         _check_not_trained_on(model, out)
-    return _write_video(images, out, (shown.across * camera.width_px, camera.height_px), fps, overwrite)
+    return write_video(images, out, (shown.across * camera.width_px, camera.height_px), fps, overwrite)
 
 
 class _Pictures:
@@ -278,7 +292,7 @@ def _images(
             progress(Progress("render", k + 1, count))
 
 
-def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
+def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
     """Write the video atomically. After an error the partial video is kept only if no earlier video exists at `out`."""
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
@@ -317,7 +331,8 @@ def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) 
     return written
 
 
-def _check_video_path(inputs: Sequence[Path], out: Path, overwrite: bool) -> None:
+def check_video_path(inputs: Sequence[Path], out: Path, overwrite: bool) -> None:
+    """Raise OutputError if a video cannot be written to `out`."""
     with storage_errors(out.parent):
         if out.is_dir():
             raise OutputError(f"{out} is a folder; give the name of a video file that ends in {VIDEO_SUFFIX}")

@@ -14,6 +14,8 @@ from services.cli import service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     BatchOutOption,
+    BenchVideoOption,
+    CameraPathOption,
     DeviceOption,
     EvaluatedArgument,
     EvaluateOptions,
@@ -24,16 +26,20 @@ from services.cli.options import (
     LiveOutOption,
     MeshArgument,
     ModelArgument,
+    OrderOption,
     OutOption,
     PackedFileArgument,
     RecordingArgument,
     RecordKeepOption,
     RendererOption,
     RenderOutOption,
+    SamplesOption,
     ScaleOption,
     SourceArgument,
+    SupersamplingOption,
     SynthesizeOptions,
     path_option,
+    renderer_options,
     require_plain_numbers,
     takes_options,
     takes_run_options,
@@ -48,6 +54,9 @@ def render(
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",
     renderer: RendererOption = "alpha",
+    samples: SamplesOption = None,
+    supersampling: SupersamplingOption = None,
+    order: OrderOption = None,
     view: Annotated[
         str, typer.Option(help="Camera: recorded, orbit, stereo (side by side), or a camera path (.json file).")
     ] = "recorded",
@@ -65,7 +74,32 @@ def render(
     from services.cli.models import render_command
 
     chosen = {"scale": scale, "device": device, "renderer": renderer, "view": ViewWish(view, baseline)}
+    chosen["options"] = renderer_options(samples, supersampling, order)
     return render_command(model, out, fps, overwrite=overwrite, as_json=json, **chosen)
+
+
+def bench(
+    model: ModelArgument,
+    renderer: RendererOption = "alpha",
+    samples: SamplesOption = None,
+    supersampling: SupersamplingOption = None,
+    order: OrderOption = None,
+    device: DeviceOption = "cpu",
+    path: CameraPathOption = None,
+    width: Annotated[int | None, typer.Option(help="Width in pixels.", show_default="the model's")] = None,
+    height: Annotated[int | None, typer.Option(help="Height in pixels.", show_default="the model's")] = None,
+    frames: Annotated[int, typer.Option(help="Number of frames, spread evenly over the path.")] = 300,
+    out: BenchVideoOption = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing video.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Measure frame times and memory of a renderer along a camera path; with --out, also write the video."""
+    from operators.applications.bench import BenchSettings
+    from services.cli.models import bench_command
+
+    options = renderer_options(samples, supersampling, order)
+    settings = BenchSettings(renderer, options, device, path, width, height, frames)
+    return bench_command(model, settings, out, overwrite=overwrite, as_json=json)
 
 
 def pack(
@@ -348,6 +382,6 @@ def doctor(json: JsonOption = False) -> int:
     return doctor_command(as_json=json)
 
 
-for _command in (render, pack, export, measure, compare, validate, poses):
+for _command in (render, bench, pack, export, measure, compare, validate, poses):
     app.command()(_command)
 service.add_to(app)

@@ -1,4 +1,4 @@
-"""Implementation of the commands for finished models: `intrasplat render`, `pack`, `export`, `measure` and `compare`."""
+"""Implementation of the commands for finished models: `intrasplat render`, `bench`, `pack`, `export`, `measure` and `compare`."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
 from gsplat_core.io.manifest import parse_manifest
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.surface_files import read_surface
+from gsplat_core.memory import in_gib
+from operators.applications.bench import BenchSettings, bench_model
 from operators.applications.render import render_model
 from operators.errors import OutputError
 from operators.output_folder import check_file_path
@@ -41,6 +43,34 @@ def render_command(model: Path, out: Path, fps: float, *, as_json: bool, **optio
         )
     else:
         typer.echo(str(out))
+    return INTERRUPTED if interrupt.requested else OK
+
+
+def bench_command(
+    model: Path, settings: BenchSettings, out: Path | None, *, overwrite: bool, as_json: bool
+) -> int:  # fmt: skip
+    """Measure a renderer on a model and print the figures."""
+    with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
+        result = bench_model(
+            model, settings, out, overwrite=overwrite, progress=progress, stop_requested=interrupt
+        )  # fmt: skip
+    if as_json:
+        said = {**asdict(result), "options": asdict(settings.options), "interrupted": interrupt.requested}
+        typer.echo(json.dumps(said, indent=2))
+    else:
+        memory = [] if result.device_peak_bytes is None else [f"{in_gib(result.device_peak_bytes)} on the device"]
+        memory += [
+            f"{in_gib(result.host_peak_bytes)} of the process, {in_gib(result.parameter_bytes)} of them the model"
+        ]
+        typer.echo(
+            f"{result.gaussians} Gaussians of degree {result.sh_degree}, {result.width_px}x{result.height_px} px, {result.renderer} on"
+            f" {result.device}, {result.frames} frames\n"
+            f"frame: p50 {result.frame_ms_p50:.2f} ms ({result.fps_p50:.1f} frames/s), p99 {result.frame_ms_p99:.2f} ms"
+            f" ({result.fps_p99:.1f} frames/s)\n"
+            f"loaded in {result.load_s:.1f} s, prepared in {result.prepare_s:.2f} s; peak memory: {', '.join(memory)}"
+        )
+        if out is not None:
+            typer.echo(str(out))
     return INTERRUPTED if interrupt.requested else OK
 
 

@@ -46,7 +46,7 @@ ModelArgument = Annotated[
     Path,
     path_argument(
         "MODEL",
-        "A model folder that replay or reconstruct wrote; render, view, export and measure also take a scene.ply, .splat or .spz of other programs.",
+        "A model folder that replay or reconstruct wrote; render, bench, view, export and measure also take a scene.ply, .splat or .spz of other programs.",
     ),
 ]
 PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]
@@ -90,7 +90,24 @@ RecordKeepOption = Annotated[
         show_default="everything",
     ),
 ]
+CameraPathOption = Annotated[
+    Path | None,
+    path_option("--path", "A camera path (.json), or the cameras.json of another trainer. Default: an orbit."),
+]
+BenchVideoOption = Annotated[Path | None, path_option("--out", "A video (name.mp4) of the measured frames.")]
 RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a folder of images.")]
+
+
+def renderer_options(samples: int | None, supersampling: int | None, order: str | None, seed: int = 0) -> Any:
+    """Return the `RendererOptions` of command line options; None stands for a renderer's default.
+
+    Raises:
+        InvalidSetting: if a value is out of range.
+    """
+    from gsplat_core.rendering.renderer import RendererOptions
+
+    given = {"samples": samples, "supersampling": supersampling, "order": order}
+    return RendererOptions(seed=seed, **{name: value for name, value in given.items() if value is not None})
 
 
 def help_of(each: Declared) -> str:
@@ -117,6 +134,21 @@ def _shared(name: str) -> Any:
 
 DeviceOption = Annotated[str, _shared("device")]
 RendererOption = Annotated[str, _shared("renderer")]
+SamplesOption = Annotated[
+    int | None,
+    typer.Option(help="Random samples per pixel of a renderer that has them.", show_default="16"),
+]
+SupersamplingOption = Annotated[
+    int | None,
+    typer.Option(help="Sub-pixels per pixel and axis of a renderer that has them.", show_default="1"),
+]
+OrderOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Depth that decides what is in front: splat (of its centre) or pixel (of its plane at each pixel).",
+        show_default="splat",
+    ),
+]
 SeedOption = Annotated[int, _shared("seed")]
 ScaleOption = Annotated[float, _shared("scale")]
 MaxFramesOption = Annotated[int | None, _shared("max_frames")]

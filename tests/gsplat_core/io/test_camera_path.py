@@ -68,7 +68,8 @@ def test_a_file_is_read(tmp_path):
     ("cameras", "said"),
     [
         ("{", "not valid JSON"),
-        ("[]", "must be a JSON object"),
+        ("3", "must be a JSON object"),
+        ("[]", "must have 1 to"),
         ("{}", "cameras must be a list"),
         ([], "cameras must be a list"),
         ([3], r"cameras\[0\] must be a JSON object"),
@@ -91,3 +92,40 @@ def test_no_file_and_no_camera(tmp_path):
         read_camera_path(tmp_path / "none.json")
     with pytest.raises(InvalidInput, match="at least one"):
         CameraPath([])
+
+
+def inria(k, pose, **changed):
+    """Entry of the cameras.json of the INRIA trainer."""
+    entry = {"id": k, "img_name": f"{k:05d}", "width": 64, "height": 48, "fx": 80.0, "fy": 60.0}
+    return {**entry, "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(), **changed}
+
+
+def test_the_cameras_of_the_inria_trainer_follow_each_other_by_one_second(tmp_path):
+    poses = [turned(10.0 * k, (k, 2.0, 3.0)) for k in range(3)]
+    path = read_camera_path(write(tmp_path, json.dumps([inria(k, pose) for k, pose in enumerate(poses)])))
+    assert path.window_s == (0.0, 2.0)
+    for k, pose in enumerate(poses):
+        assert np.allclose(path.camera(CAMERA, k).world_to_camera @ pose, np.eye(4), atol=1e-9)
+    # Half the height: half the focal lengths, and the principal point in the middle.
+    assert path.camera(CAMERA, 1.0).K.tolist() == [[40, 0, 16], [0, 30, 12], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("entry", "reason"),
+    [
+        (inria(0, turned(0), position=[1, 2]), "position"),
+        (inria(0, turned(0), rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "rotation must be a rotation"),
+        (inria(0, turned(0), height=0), "height"),
+        (inria(0, turned(0), fx=-1), "fx"),
+        ("camera", "JSON object"),
+    ],
+)
+def test_a_wrong_camera_of_the_inria_trainer_is_named(tmp_path, entry, reason):
+    with pytest.raises(InvalidSetting, match=reason):
+        read_camera_path(write(tmp_path, json.dumps([inria(0, turned(0)), entry])))
+
+
+@pytest.mark.parametrize("text", ["[1", '[{}], "cameras": []'])
+def test_a_broken_list_of_cameras_is_refused(tmp_path, text):
+    with pytest.raises(InvalidSetting):
+        read_camera_path(write(tmp_path, text))
