@@ -76,6 +76,19 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
       "Tensor v_colors, Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
+  // Depth along each pixel's ray and further channels, blended like `composite`; rays [N, 10] of ray_blending.h. Besides
+  // the channels: opacity, mean and median depth, variance of depth, and the list positions of the last blended splat and of the
+  // median's splat.
+  m.def(
+      "blend_rays(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
+      "Tensor flatten_ids, int width, int height, float max_alpha=0.99) -> (Tensor values, Tensor alphas, Tensor depths, "
+      "Tensor medians, Tensor variances, Tensor last, Tensor median_at)");
+  m.def(
+      "blend_rays_backward(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
+      "Tensor flatten_ids, int width, int height, Tensor alphas, Tensor depths, Tensor last, Tensor median_at, Tensor v_values, "
+      "Tensor v_alphas, Tensor v_depths, Tensor v_medians, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
+      "Tensor v_opacities, Tensor v_rays, Tensor v_values)");
+
   // Fused `rasterization()`, CUDA only; gsplat_core/ops/rasterization/rasterization.py documents the list arguments.
   m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
   m.def(

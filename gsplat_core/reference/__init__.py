@@ -24,6 +24,7 @@ from gsplat_core.reference.flow_blending import blend_flow
 from gsplat_core.reference.frame import render_frame
 from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
+from gsplat_core.reference.ray_blending import blend_rays
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
@@ -39,6 +40,7 @@ __all__ = [
     "basis_field_backward_adam_",
     "basis_field_move_to_",
     "blend_flow",
+    "blend_rays",
     "fit_disparities",
     "frame_loss",
     "fully_fused_projection",

@@ -3,28 +3,12 @@
 // Every instance (a splat in a window) has its own gradient row, the sum over the window's pixels in a fixed order. A
 // splat's rows are summed in list order. There are no atomics, so results are bitwise reproducible.
 #include "gather_rows.cuh"
+#include "warp_sums.cuh"
 
 namespace gsplat::compositing {
 namespace {
 
 constexpr int kValues = 16;  // values that a warp sums per pass
-
-// Sum 2 kHalf values over groups of 4 kHalf lanes with one shuffle per value: a lane sends half of its values, then
-// half of the remaining ones. For 16 values lane i of the warp returns the sum of value i / 2.
-template <int kHalf>
-__device__ inline float warp_sums(float* v, int lane) {
-  if constexpr (kHalf == 0) {
-    return v[0] + __shfl_xor_sync(kAll, v[0], 1);
-  } else {
-    const bool upper = (lane & 2 * kHalf) != 0;
-#pragma unroll
-    for (int i = 0; i < kHalf; ++i) {
-      const float low = v[i], high = v[i + kHalf];
-      v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, 2 * kHalf);
-    }
-    return warp_sums<kHalf / 2>(v, lane);
-  }
-}
 
 __device__ inline float block_sum(float value) {
   __shared__ float parts[kWarps];

@@ -1,27 +1,18 @@
 // Host code of composite and composite_backward: checks, memory, and the launch on each device.
-#include <algorithm>
-#include <atomic>
-#include <cmath>
 #include <tuple>
 #include <vector>
 
+#include "alpha_limit.h"
 #include "compositing.h"
 #include "host_call.h"
 #if !defined(GSPLAT_CUDA)
-#include "counting_sort.h"
+#include "tile_pass.h"
 #endif
 
 namespace gsplat::compositing {
 namespace {
 
 constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
-
-AlphaLimit limit_of(double max_alpha) {
-  check(max_alpha >= kAlphaCutoff && max_alpha < 1, "composite: max_alpha must be from 1/255 to below 1, found ", max_alpha);
-  const float most = float(max_alpha);
-  // kMaxAlpha uses the constant: its last bit differs from that of the rounded logarithm.
-  return most == kMaxAlpha ? AlphaLimit{} : AlphaLimit{most, float(std::log2(max_alpha))};
-}
 
 // Checked inputs of either pass. The tensors own the memory that `in` points to.
 struct Arguments {
@@ -92,24 +83,6 @@ void backward(Call& call, const Inputs& in, const PictureGradient& from, const I
 
 #else
 
-struct alignas(64) Line {
-  float floats[16];
-};
-
-// Position of the first tile's list. Earlier entries are unused: lists of a fixed capacity are filled from the end.
-int64_t first_listed(const Inputs& in) { return in.tiles() > 0 ? in.offsets[0] : in.instances; }
-
-// Validate the caller's lists; an out-of-range index would read outside of the tensors.
-void check_lists(const Inputs& in) {
-  int32_t before = 0;
-  bool ordered = true;
-  for (int64_t i = 0; i < in.tiles(); ++i) ordered &= in.offsets[i] >= before, before = in.offsets[i];
-  check(ordered && before <= in.instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
-  uint32_t most = 0;
-  for (int64_t i = first_listed(in); i < in.instances; ++i) most = std::max(most, uint32_t(in.flatten_ids[i]));
-  check(first_listed(in) == in.instances || most < in.count, "flatten_ids must be in [0, ", in.count, "), found ", int32_t(most));
-}
-
 // Records of all splats, and a parallel loop over all tiles.
 struct Pass {
   std::unique_ptr<SplatRecord[]> records;
@@ -123,51 +96,28 @@ struct Pass {
                                 [&](int64_t begin, int64_t end) { kernels().records(in, begin, end, records.get()); });
   }
 
-  // Call run(tile, scratch) for all tiles. Threads take the next free tiles; no result depends on the assignment.
   template <class Run>
-  void for_tiles(const Run& run) const {
-    constexpr int64_t kRun = 4;
-    std::atomic<int64_t> next{0};
-    const int64_t tiles = splats.tiles();
-    const int64_t workers = std::max<int64_t>(1, std::min<int64_t>(torch::stable::get_num_threads(), tiles));
-    const int64_t scratch = kernels().scratch_floats(splats.channels);
-    torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
-      const auto lines = uninitialised<Line>(scratch / 16 + 1);
-      // Take a few adjacent tiles at a time: they share splats, and the next tile's records are prefetched.
-      for (int64_t first; (first = next.fetch_add(kRun, std::memory_order_relaxed)) < tiles;)
-        for (int64_t tile = first; tile < std::min(first + kRun, tiles); ++tile) run(tile, lines[0].floats);
-    });
+  void for_all_tiles(const Run& run) const {
+    for_tiles(splats.tiles(), kernels().scratch_floats(splats.channels), run);
   }
 };
 
 void forward(Call&, const Inputs& in, const Pixels& out) {
   const Pass pass(in);
-  pass.for_tiles([&](int64_t tile, float* scratch) { kernels().tile(pass.splats, tile, out, scratch); });
+  pass.for_all_tiles([&](int64_t tile, float* scratch) { kernels().tile(pass.splats, tile, out, scratch); });
 }
 
 void backward(Call&, const Inputs& in, const PictureGradient& from, const InputGradients& out) {
   const Pass pass(in);
-  // One row per instance; the rows of a splat are contiguous and in list order.
-  auto first = uninitialised<int32_t>(in.count + 1), row_of = uninitialised<int32_t>(in.instances);
-  const int64_t unused = first_listed(in), listed = in.instances - unused, channels = in.channels;
-  const int32_t* const ids = in.flatten_ids + unused;
-  const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
-    for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
-  };
-  counting_sort(listed, 1 << 15, in.count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
-    for (int64_t i = begin; i < end; ++i) row_of[unused + i] = cursors[ids[i]]++;
-  });
-  first[in.count] = int32_t(listed);
-
   const bool absgrad = out.absolute != nullptr;
-  const int64_t lines_per_row = (kMoments + channels + (absgrad ? 2 : 0) + 15) / 16;
-  const auto rows = uninitialised<Line>(listed * lines_per_row);
+  const int64_t channels = in.channels;
+  const InstanceRows instances(in, kMoments + channels + (absgrad ? 2 : 0));
   std::vector<float> background_parts(out.backgrounds != nullptr ? size_t(in.tiles() * channels) : 0, 0.0f);
-  const GradientRows gradients = {row_of.get(), rows[0].floats, lines_per_row * 16, absgrad,
+  const GradientRows gradients = {instances.row_of.get(), instances.rows[0].floats, instances.row_size, absgrad,
                                   out.backgrounds != nullptr ? background_parts.data() : nullptr};
-  pass.for_tiles([&](int64_t tile, float* scratch) { kernels().tile_backward(pass.splats, tile, from, gradients, scratch); });
+  pass.for_all_tiles([&](int64_t tile, float* scratch) { kernels().tile_backward(pass.splats, tile, from, gradients, scratch); });
   torch::stable::parallel_for(0, in.count, 2048, [&](int64_t begin, int64_t end) {
-    kernels().gather(pass.splats, gradients, first.get(), begin, end, out);
+    kernels().gather(pass.splats, gradients, instances.first.get(), begin, end, out);
   });
   for (int64_t image = 0; out.backgrounds != nullptr && image < in.images; ++image) {
     const int64_t tiles = in.tiles() / in.images;
