@@ -178,6 +178,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "splat_regression_backward(Tensor points, Tensor centres, Tensor factors, Tensor values, Tensor gradient) -> "
       "(Tensor v_centres, Tensor v_factors, Tensor v_values)");
+  // Sums over splats without an order, planes [D + 1, H, W]: of weight times opacity times Gaussian times channel, and of
+  // the same without the channel. Added in fixed point, so that the order of the splats does not matter.
+  m.def(
+      "weighted_sums(Tensor means2d, Tensor conics, Tensor channels, Tensor opacities, Tensor weights, Tensor isect_offsets, "
+      "Tensor flatten_ids, int width, int height) -> Tensor");
+  m.def(
+      "weighted_sums_backward(Tensor means2d, Tensor conics, Tensor channels, Tensor opacities, Tensor weights, Tensor "
+      "isect_offsets, Tensor flatten_ids, int width, int height, Tensor v_sums) -> (Tensor v_means2d, Tensor v_conics, Tensor "
+      "v_channels, Tensor v_opacities, Tensor v_weights)");
 
   // Structural similarity per pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");

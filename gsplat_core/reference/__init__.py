@@ -31,6 +31,7 @@ from gsplat_core.reference.splat_regression import splat_regression, splat_regre
 from gsplat_core.reference.ssim import ssim_map
 from gsplat_core.reference.stereo_matching import match_disparities
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
+from gsplat_core.reference.weighted_sum import weighted_sums
 
 __all__ = [
     "adam_step",
@@ -62,4 +63,5 @@ __all__ = [
     "splat_regression",
     "splat_regression_gradients",
     "ssim_map",
+    "weighted_sums",
 ]
