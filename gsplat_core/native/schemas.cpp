@@ -238,4 +238,10 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "network_adam_(Tensor(a!)[] parameters, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor step, "
       "Tensor? status, float beta1, float beta2, float epsilon) -> ()");
+
+  // Random samples of splats without sorting: adds red, green, blue, hits and z of each pixel to `sums` [H, W, 5].
+  // ops/stochastic/stochastic.py documents the lists.
+  m.def("splat_samples_(Tensor?[] scene, Tensor viewmat, Tensor intrinsics, Tensor(a!) sums, int[] options) -> ()");
+  // `count` Poisson draws for each of the rates (float64 [R]), as int64 [R, count].
+  m.def("poisson_draws(Tensor rates, int count, int seed) -> Tensor");
 }

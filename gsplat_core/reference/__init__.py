@@ -23,6 +23,7 @@ from gsplat_core.reference.edge_aware_filter import smooth_within_edges
 from gsplat_core.reference.flow_blending import blend_flow
 from gsplat_core.reference.frame import render_frame
 from gsplat_core.reference.image_loss import frame_loss, image_loss
+from gsplat_core.reference.points import point_moments
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.ray_blending import blend_rays
 from gsplat_core.reference.rendering import rasterization
@@ -30,6 +31,7 @@ from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
 from gsplat_core.reference.ssim import ssim_map
 from gsplat_core.reference.stereo_matching import match_disparities
+from gsplat_core.reference.stochastic import sample_moments
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.reference.weighted_sum import weighted_sums
 
@@ -54,10 +56,12 @@ __all__ = [
     "isect_offset_encode",
     "isect_tiles",
     "match_disparities",
+    "point_moments",
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
     "render_frame",
+    "sample_moments",
     "smooth_within_edges",
     "spherical_harmonics",
     "splat_regression",

@@ -97,7 +97,10 @@ GSPLAT_INLINE vfloat compensation_of(const Ellipse& e, vfloat det, float floor) 
 
 struct Projected {
   vint valid;  // if false, the other members are undefined
-  vfloat u, v, depth, conic[3], compensation, radius_x, radius_y;
+  vfloat u, v, depth, conic[3];
+  vfloat compensation = {}, radius_x = {}, radius_y = {};
+  vfloat half_x = {}, half_y = {};  // the radii before they are rounded up
+  vfloat determinant = {};          // of the blurred 2D covariance
 };
 
 // `opacity` may be null. Without `compensate` the compensation is 0.
@@ -113,7 +116,7 @@ GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& vi
   const vfloat det = a * c - e.b * e.b;
   valid &= (det > 0) & (det < kHuge) & finite(image.u) & finite(image.v);
   const vfloat inverse = 1.0f / det;
-  Projected out = {valid, image.u, image.v, p.z, {c * inverse, -e.b * inverse, a * inverse}, vfloat{}, vfloat{}, vfloat{}};
+  Projected out = {valid, image.u, image.v, p.z, {c * inverse, -e.b * inverse, a * inverse}};
   valid &= finite(out.conic[0]) & finite(out.conic[1]) & finite(out.conic[2]);
 
   vfloat extent = splat(gsplat::kMaxExtentSigmas);
@@ -125,8 +128,11 @@ GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& vi
     const vfloat ratio = select(valid, effective * (1.0f / gsplat::kAlphaCutoff), splat(1.0f));
     extent = min(extent, sqrt(max(1.38629436f * log2(ratio), vfloat{})));
   }
-  const vfloat rx = min(ceil(extent * sqrt(max(a, vfloat{}))), splat(gsplat::kMaxRadiusPx));
-  const vfloat ry = min(ceil(extent * sqrt(max(c, vfloat{}))), splat(gsplat::kMaxRadiusPx));
+  out.half_x = extent * sqrt(max(a, vfloat{}));
+  out.half_y = extent * sqrt(max(c, vfloat{}));
+  out.determinant = det;
+  const vfloat rx = min(ceil(out.half_x), splat(gsplat::kMaxRadiusPx));
+  const vfloat ry = min(ceil(out.half_y), splat(gsplat::kMaxRadiusPx));
   valid &= (rx > in.radius_clip) | (ry > in.radius_clip);
   valid &= (image.u + rx > 0) & (image.u - rx < in.width) & (image.v + ry > 0) & (image.v - ry < in.height);
   out.valid = valid;
