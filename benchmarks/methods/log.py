@@ -1,0 +1,44 @@
+"""Log of a benchmark of one method: figures with command, commit, machine and date as one JSON file."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import suite
+
+FOLDER = Path(__file__).resolve().parents[1] / "logs" / "methods"
+
+
+def options(description: str) -> argparse.ArgumentParser:
+    """Return a parser with the options of every method's benchmark."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--out", type=Path, help="JSON file; none is written without it")
+    parser.add_argument("--full", action="store_true", help="sizes for a GPU")
+    return parser
+
+
+def write(method: str, chosen: argparse.Namespace, figures: Mapping[str, Any]) -> None:
+    """Print the figures, and write them to `chosen.out` with command, commit, machine and date."""
+    for name, value in figures.items():
+        print(f"{name:44s} {value}")
+    if chosen.out is None:
+        return
+    stated = " ".join(["python", f"benchmarks/methods/{method}.py", *sys.argv[1:]])
+    about = {
+        "benchmark": f"methods/{method}",
+        "command": stated,
+        "commit": suite.commit(),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": suite.machine("cuda" if chosen.device.startswith("cuda") else "cpu"),
+    }
+    chosen.out.parent.mkdir(parents=True, exist_ok=True)
+    chosen.out.write_text(json.dumps({**about, **figures}, indent=1) + "\n", encoding="utf-8")

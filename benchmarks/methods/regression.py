@@ -1,0 +1,138 @@
+"""Splat regression from one corner: metric-corrected descent with birth-death against Adam alone.
+
+    python benchmarks/methods/regression.py [--seeds 10] [--full] [--device cpu|cuda] [--out FILE]
+
+The target of a seed is a sum of six round Gaussians of either sign in the unit square, at 400 points. All 32 splats start in one
+corner. Both methods have the same number of steps and gradients, and Adam's rate is the best of a grid for all seeds together.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import replace
+
+import log
+import torch
+
+from gsplat_core import reference
+from gsplat_core.ops.splat_regression.splat_regression import splat_regression
+from gsplat_core.regression import FitOptions, Splats, fit
+from gsplat_core.regression.fit import adam_alone
+
+SPLATS, POINTS, BUMPS = 32, 400, 6
+ADAM_RATES = (2e-2, 1e-2, 5e-3, 2.5e-3, 1e-3)
+
+
+def target(seed: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return points [n, 2] and values [n, 1]."""
+    g = torch.Generator().manual_seed(seed)
+    points, centres = torch.rand(POINTS, 2, generator=g), torch.rand(BUMPS, 2, generator=g)
+    widths = 0.06 + 0.1 * torch.rand(BUMPS, generator=g)
+    heights = torch.randn(BUMPS, generator=g).sign() * (0.5 + torch.rand(BUMPS, generator=g))
+    values = torch.exp(-(points[:, None] - centres).square().sum(-1) / (2 * widths.square())) @ heights[:, None]
+    return points.to(device), values.to(device)
+
+
+def corner(seed: int, device: str) -> Splats:
+    """Return splats whose centres are in [0, 0.05]²."""
+    g = torch.Generator().manual_seed(100 + seed)
+    return Splats(
+        (0.05 * torch.rand(SPLATS, 2, generator=g)).to(device),
+        0.05 * torch.eye(2, device=device).repeat(SPLATS, 1, 1),
+        (1e-3 * torch.randn(SPLATS, 1, generator=g)).to(device),
+    )
+
+
+def final_loss(seed: int, options: FitOptions, device: str) -> float:
+    """Return the final loss divided by the mean square of the values."""
+    points, values = target(seed, device)
+    fitted = fit(points, values, start=corner(seed, device), options=replace(options, seed=7 + seed))
+    return float(fitted.losses[-1]) / float(values.square().mean())
+
+
+def closed_form_error() -> float:
+    """Return the largest difference of closed forms and autograd in float64, relative to the largest gradient."""
+    g = torch.Generator().manual_seed(0)
+    worst = 0.0
+    for dims in (1, 2, 3, 4):
+        points, centres = (torch.rand(n, dims, generator=g, dtype=torch.float64) for n in (200, 20))
+        factors = 0.3 * torch.eye(dims, dtype=torch.float64) + 0.1 * torch.randn(
+            20, dims, dims, generator=g, dtype=torch.float64
+        )
+        values = torch.randn(20, 3, generator=g, dtype=torch.float64)
+        leaves = [t.requires_grad_() for t in (centres, factors, values)]
+        out = reference.splat_regression(points, *leaves)
+        gradient = torch.randn(out.shape, generator=g, dtype=torch.float64)
+        wanted = torch.autograd.grad((out * gradient).sum(), leaves)
+        found = reference.splat_regression_gradients(points, *(t.detach() for t in leaves), gradient)
+        worst = max(worst, *(float((a - b).abs().max() / b.abs().max()) for a, b in zip(found, wanted, strict=True)))
+    return worst
+
+
+def step_ms(points: int, splats: int, device: str) -> dict[str, float]:
+    """Return the median time of a forward and a backward pass in milliseconds, 3 variables and 3 values."""
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(points, 3, generator=g).to(device)
+    tensors = [
+        torch.rand(splats, 3, generator=g),
+        0.1 * torch.eye(3).repeat(splats, 1, 1),
+        torch.randn(splats, 3, generator=g),
+    ]
+    tensors = [t.to(device) for t in tensors]
+    gradient = torch.rand(points, 3, generator=g).to(device)
+    wait = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
+    found = {}
+    for name, call in {
+        "forward": lambda: splat_regression(x, *tensors),
+        "backward": lambda: torch.ops.gsplat_core.splat_regression_backward(x, *tensors, gradient),
+    }.items():
+        times = []
+        for _ in range(8):
+            start = time.perf_counter()
+            call()
+            wait()
+            times.append((time.perf_counter() - start) * 1e3)
+        found[name] = round(statistics.median(times[1:]), 3)
+    return found
+
+
+def main() -> None:
+    parser = log.options("Splat regression: convergence from one corner, exactness and speed.")
+    parser.add_argument("--seeds", type=int, default=10)
+    chosen = parser.parse_args()
+    options = FitOptions()
+    by_rate = {
+        rate: [final_loss(s, replace(adam_alone(options), rate=rate), chosen.device) for s in range(chosen.seeds)]
+        for rate in ADAM_RATES
+    }
+    adam_rate = min(by_rate, key=lambda rate: statistics.median(by_rate[rate]))
+    adam = by_rate[adam_rate]
+    parts = {
+        "metric and birth-death": options,
+        "birth-death alone": replace(options, metric=False),
+        "metric alone": replace(options, birth_death=False),
+    }
+    losses = {name: [final_loss(s, part, chosen.device) for s in range(chosen.seeds)] for name, part in parts.items()}
+    ours = losses["metric and birth-death"]
+    size = (1_000_000, 1000) if chosen.full else (20_000, 200)
+    log.write(
+        "regression",
+        chosen,
+        {
+            "closed_form_error": closed_form_error(),
+            "adam_rate": adam_rate,
+            "adam_median_loss": round(statistics.median(adam), 5),
+            "median_loss": {name: round(statistics.median(each), 5) for name, each in losses.items()},
+            "ratio_of_medians": round(statistics.median(ours) / statistics.median(adam), 4),
+            "median_ratio": round(statistics.median(a / b for a, b in zip(ours, adam, strict=True)), 4),
+            "adam_losses": [round(x, 5) for x in adam],
+            "losses": [round(x, 5) for x in ours],
+            "op_points_splats": size,
+            "op_ms": step_ms(*size, chosen.device),
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()
