@@ -14,6 +14,7 @@ from gsplat_core.registry import Registry
 if TYPE_CHECKING:
     from gsplat_core.deformation.registry import FieldKind
     from gsplat_core.depth.maps import Estimator
+    from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind
     from gsplat_core.training.losses.loss import LossKind
 
@@ -33,6 +34,20 @@ RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.
 
 CONTRIBUTING.md, "A renderer", describes how to add one.
 """
+
+OUTPUTS: Registry[OutputKind] = Registry(
+    "output",
+    {
+        "ray_depth": "gsplat_core.rendering.outputs:RAY_DEPTH",
+        "median_depth": "gsplat_core.rendering.outputs:MEDIAN_DEPTH",
+        "normals": "gsplat_core.rendering.outputs:NORMALS",
+        "depth_normals": "gsplat_core.rendering.outputs:DEPTH_NORMALS",
+        "spread": "gsplat_core.rendering.outputs:SPREAD",
+        "confidence": "gsplat_core.rendering.outputs:CONFIDENCE",
+        "semantics": "gsplat_core.rendering.outputs:SEMANTICS",
+    },
+)
+"""Outputs in addition to picture, opacity and depth, by name. `Capabilities.outputs` states those of a renderer."""
 
 DEPTHS: Registry[type[Estimator]] = Registry(
     "depth",

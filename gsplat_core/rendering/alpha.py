@@ -14,6 +14,7 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, LaunchedFrame
+from gsplat_core.rendering.outputs import SURFACE_OUTPUTS
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
@@ -25,7 +26,6 @@ from gsplat_core.rendering.renderer import (
     checked_outputs,
     standard_outputs,
 )
-from gsplat_core.rendering.surface import SURFACE_OUTPUTS
 from gsplat_core.scene.cameras import Camera
 
 
@@ -34,8 +34,8 @@ class AlphaRenderer:
 
     On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once for the slot. A
     `Model` has its own graph, captured by `prepare`. On the CPU, and for fields without a fused frame path, the field's
-    own function deforms the model and `gsplat_core.render` renders it. `Surface` outputs (`ray_depth`, `normals`,
-    `median_depth`, `spread`, `confidence`) take much longer than a picture on any device.
+    own function deforms the model and `gsplat_core.render` renders it. The outputs of a `Surface` (`SURFACE_OUTPUTS`)
+    are rendered by single launches in addition to the picture.
     """
 
     capabilities = Capabilities(

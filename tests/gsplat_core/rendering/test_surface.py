@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference, render
+from gsplat_core.choices import OUTPUTS
 from gsplat_core.models.model import Model
+from gsplat_core.rendering.alpha import AlphaRenderer
+from gsplat_core.rendering.outputs import SURFACE_OUTPUTS
 from gsplat_core.rendering.settings import EPS2D
-from gsplat_core.rendering.surface import COVERED, LEAST_VARIANCE, certainty, render_surface
+from gsplat_core.rendering.surface import COVERED, Surface, certainty, depth_normals, render_surface
 
 CAMERA = Camera.from_focal(50.0, 45, 37)
 
@@ -62,8 +66,11 @@ def along_one_ray(gaussians: Gaussians, camera: Camera, column: int, row: int) -
         alpha = min(0.99, opacity * math.exp(-0.5 * off @ inverse @ off))
         if alpha < 1 / 255:
             continue
-        slope = np.linalg.solve(ray_space[:2, :2] + (LEAST_VARIANCE - EPS2D) * np.eye(2), ray_space[:2, 2])
-        met.append((z, alpha, z + slope @ off, max(0.0, ray_space[2, 2] - slope @ ray_space[:2, 2])))
+        ray = np.array([(pixel[0] - camera.K[0, 2]) / f, (pixel[1] - camera.K[1, 2]) / camera.K[1, 1], 1.0])
+        precision = np.linalg.inv(covariance)
+        reach = 3 * math.sqrt(np.linalg.eigvalsh(covariance)[-1])
+        square = ray @ precision @ ray
+        met.append((z, alpha, np.clip(ray @ precision @ mean / square, z - reach, z + reach), 1 / square))
     through, median, weights, depths, variances = 1.0, 0.0, [], [], []
     for _, alpha, depth, variance in sorted(met):
         if through * (1 - alpha) <= 1e-4:
@@ -103,7 +110,7 @@ def test_opacity_is_that_of_the_picture(device):
     torch.testing.assert_close(surface.confidence, surface.alpha)
 
 
-@pytest.mark.parametrize(("tilt_deg", "most"), [(0.0, 1e-4), (20.0, 5e-4), (-35.0, 3e-3)])
+@pytest.mark.parametrize(("tilt_deg", "most"), [(0.0, 1e-4), (20.0, 1e-4), (-35.0, 5e-4)])
 def test_a_tilted_wall_is_where_it_is_and_faces_as_it_does(tilt_deg, most, device):
     gaussians = wall(tilt_deg).to(device)
     surface = render_surface(gaussians, CAMERA)
@@ -189,3 +196,48 @@ def test_confidence_falls_with_the_time_for_which_nobody_looked():
     assert float(surface.confidence[18, 42]) == pytest.approx(0.5 * float(surface.alpha[18, 42]), abs=1e-3)
     with pytest.raises(InvalidInput, match="certain"):
         render_surface(gaussians, CAMERA, certainty(unseen_s)[:4])
+
+
+def test_classes_are_blended_as_colours_are():
+    gaussians = cloud(60)
+    logits = torch.randn(60, 20, generator=torch.Generator().manual_seed(1))
+    surface = render_surface(replace(gaussians, extra={"semantics": logits}), CAMERA)
+    colours = replace(gaussians, sh=(logits[:, None, :3] - 0.5) / 0.28209479177387814)
+    wanted = render(colours, CAMERA).image
+    clamped = render_surface(replace(gaussians, extra={"semantics": logits.clamp(min=0)}), CAMERA).semantics
+    assert surface.semantics.shape == (37, 45, 20)
+    torch.testing.assert_close(clamped[..., :3], wanted, atol=2e-4, rtol=1e-4)
+    assert render_surface(gaussians, CAMERA).semantics.shape == (37, 45, 0)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0, -50.0])
+def test_normals_of_a_depth_map(tilt_deg, device):
+    camera = Camera.from_focal(500.0, 45, 37)
+    depth = plane_depth(camera, tilt_deg).to(device).clone()
+    depth[:, 30:] *= 1.1  # a parallel plane behind a jump of more than 2 %
+    depth[5, 5] = 0
+    normals = depth_normals(depth, camera)
+    angle = math.radians(tilt_deg)
+    normal = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], device=device)
+    known = normals.norm(dim=-1) > 0
+    assert float(((normals - normal)[known]).abs().max()) < 2e-3
+    assert not known[:, 29:31].any() and not known[0].any() and not known[5, 4:7].any() and not known[:, -1].any()
+    assert bool(known[10, 1:29].all()) and bool(known[10, 31:-1].all())
+
+
+def test_gradient_of_depth_normals_is_the_derivative():
+    camera = Camera.from_focal(500.0, 8, 7)
+    depth = plane_depth(camera, 20.0).double() + 0.01 * torch.rand(7, 8, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(lambda plane: depth_normals(plane, camera), depth.requires_grad_())
+
+
+def test_every_output_of_the_surface_is_registered_and_offered():
+    assert {*SURFACE_OUTPUTS} <= {*OUTPUTS}
+    assert {*SURFACE_OUTPUTS} == {*Surface._fields} - {"alpha"}
+    frame = AlphaRenderer(CAMERA, torch.device("cpu"))
+    frame.prepare(Model(1, wall(10.0), None, CAMERA, (0.0, 1.0)))
+    outputs = frame.render(CAMERA, 0.0, SURFACE_OUTPUTS).outputs()
+    for name in SURFACE_OUTPUTS:
+        channels = OUTPUTS[name].channels
+        shape = outputs[name].shape
+        assert shape[:2] == (37, 45) and (channels is None or tuple(shape[2:]) == ((channels,) if channels > 1 else ()))
