@@ -80,6 +80,8 @@ LOSSES: Registry[LossKind] = Registry(
     {
         "photometric": "gsplat_core.training.losses.photometric:Photometric",
         "depth": "gsplat_core.training.losses.depth:Depth",
+        "ray_depth": "gsplat_core.training.losses.ray_depth:RayDepth",
+        "normal_consistency": "gsplat_core.training.losses.normal_consistency:NormalConsistency",
         "flow": "gsplat_core.training.losses.flow:FlowLoss",
         "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
     },

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 from torch import Tensor
@@ -20,6 +20,8 @@ class LossContext:
     """Observations available for training in temporal order, including the current one."""
     at: Callable[[float], Gaussians]
     """Function that returns the scene at another time in seconds, without gradients."""
+    shared: dict[str, object] = field(default_factory=dict)
+    """Results that several losses of one evaluation use, by name."""
 
 
 class Loss(Protocol):
