@@ -172,6 +172,16 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // changes by grey_step grey values or more.
   m.def("smooth_within_edges(Tensor planes, Tensor guide, float strength, float grey_step) -> Tensor");
 
+  // Histograms [width, bins] of depth along the rays, per column of the picture; splats, lists and rays [N, 10] as in
+  // blend_rays. factors [height, width] multiply the depth of a pixel; 0 excludes it.
+  m.def(
+      "range_histogram(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor isect_offsets, Tensor flatten_ids, "
+      "Tensor? factors, float nearest, float bin, int bins, int width, int height, float max_alpha=0.99) -> Tensor");
+  m.def(
+      "range_histogram_backward(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor isect_offsets, "
+      "Tensor flatten_ids, Tensor? factors, Tensor gradient, float nearest, float bin, int bins, int width, int height, "
+      "float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, Tensor v_opacities, Tensor v_rays)");
+
   // Splat regression f(x) = sum of v g(x) at points [n, d], d = 1 to 4, for k splats with centres [k, d], factors A [k, d, d]
   // and values [k, m]; g = |det A|^-1 N(A^-1 (x - b)). The backward pass takes dL/df [n, m].
   m.def("splat_regression(Tensor points, Tensor centres, Tensor factors, Tensor values) -> Tensor");

@@ -25,6 +25,7 @@ from gsplat_core.reference.frame import render_frame
 from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.points import point_moments
 from gsplat_core.reference.projection import fully_fused_projection
+from gsplat_core.reference.range_histogram import range_histogram
 from gsplat_core.reference.ray_blending import blend_rays
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -58,6 +59,7 @@ __all__ = [
     "match_disparities",
     "point_moments",
     "quat_scale_to_covar_preci",
+    "range_histogram",
     "rasterization",
     "rasterize_to_pixels",
     "render_frame",
