@@ -13,11 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, ExportError
-from gsplat_core.io.model_files import check_memory, logit_of_bytes, read_rows
+from gsplat_core.io.model_files import check_memory, gaussians_of, logit_of_bytes, read_rows
 from gsplat_core.io.ply_header import Element, header_lines
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
@@ -76,7 +75,7 @@ def read_compressed(descriptor: int, path: Path, elements: list[Element], start:
         log_scales[first:end] = _between(of_rows[:, 6:12], _unpacked_11_10_11(rows["packed_scale"]))
         quats[first:end] = _unpacked_rotation(rows["packed_rotation"])
         colour = np.stack([(rows["packed_color"] >> shift) & 255 for shift in (24, 16, 8, 0)], 1)
-        sh[first:end, 0] = (_between(of_rows[:, 12:18], colour[:, :3] / np.float32(255)) - 0.5) / SH_C0
+        sh[first:end, 0] = (_between(of_rows[:, 12:18], (colour[:, :3] / 255.0).astype(np.float32)) - 0.5) / SH_C0
         logits[first:end] = logit_of_bytes(colour[:, 3])
 
     read_rows(descriptor, path, start + chunks.nbytes, vertices.layout, count, take)
@@ -89,7 +88,7 @@ def read_compressed(descriptor: int, path: Path, elements: list[Element], start:
 
         at = start + chunks.nbytes + vertices.nbytes
         read_rows(descriptor, path, at, harmonics.layout, count, take_harmonics)
-    return Gaussians(*(torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)))
+    return gaussians_of(means, quats, log_scales, logits, sh)
 
 
 def _check_layout(path: Path, chunks: Element, vertices: Element, harmonics: Element | None) -> None:
@@ -126,7 +125,8 @@ def _between(bounds: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray
 
 
 def _unpacked_11_10_11(packed: NDArray[np.uint32]) -> NDArray[np.float32]:
-    return np.stack([packed >> 21, (packed >> 11) & 1023, packed & 2047], 1) / np.array([2047, 1023, 2047], np.float32)
+    steps = np.stack([packed >> 21, (packed >> 11) & 1023, packed & 2047], 1).astype(np.float32)
+    return np.asarray(steps / np.array([2047, 1023, 2047], np.float32), np.float32)
 
 
 def _unpacked_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float32]:

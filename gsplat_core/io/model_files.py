@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.files import open_regular
 from gsplat_core.memory import available_bytes, in_gib
+from gsplat_core.scene.gaussians import Gaussians
 
 
 def open_model_file(path: Path, folder: Path | None = None) -> BinaryIO:
@@ -86,7 +88,7 @@ def read_rows(
 
     def work(first: int) -> None:
         rows = np.empty(min(step, count - first), layout)
-        raw = memoryview(rows.view(np.uint8))
+        raw = memoryview(rows.view(np.uint8).data)
         done = 0
         while done < len(raw):
             read = os.preadv(descriptor, [raw[done:]], start + first * layout.itemsize + done)
@@ -104,6 +106,18 @@ def read_rows(
     with ThreadPoolExecutor(threads) as pool:
         for _ in pool.map(work, firsts):
             pass
+
+
+def gaussians_of(
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    log_scales: NDArray[np.float32],
+    logits: NDArray[np.float32],
+    sh: NDArray[np.float32],
+) -> Gaussians:
+    """Return Gaussians that share the memory of the arrays."""
+    tensors = [torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)]
+    return Gaussians(tensors[0], tensors[1], tensors[2], tensors[3], tensors[4])
 
 
 LEAST_OPACITY = 1e-4

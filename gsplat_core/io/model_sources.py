@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.exports.files import ROW
-from gsplat_core.io.model_files import check_memory, logit_of_bytes, open_model_file, read_rows
+from gsplat_core.io.model_files import check_memory, gaussians_of, logit_of_bytes, open_model_file, read_rows
 from gsplat_core.io.ply import load_ply
 from gsplat_core.io.spz import load_spz
 from gsplat_core.models.model import Model
@@ -67,7 +66,7 @@ def load_splat(path: Path) -> Gaussians:
             sh[part, 0] = (rows["colour"][:, :3] / np.float32(255) - 0.5) / SH_C0
 
         read_rows(file.fileno(), path, 0, ROW, count, take)
-    return Gaussians(*(torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)))
+    return gaussians_of(means, quats, log_scales, logits, sh)
 
 
 READERS: Mapping[str, Callable[[Path], Gaussians]] = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import BundleCorrupt
 from gsplat_core.io.compressed_ply import read_compressed
 from gsplat_core.io.files import replace_durably, write_durably
-from gsplat_core.io.model_files import BLOCK_BYTES, check_memory, open_model_file, read_rows
+from gsplat_core.io.model_files import BLOCK_BYTES, check_memory, gaussians_of, open_model_file, read_rows
 from gsplat_core.io.ply_header import Element, header_lines, read_header
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
@@ -112,7 +112,7 @@ def _read_inria(descriptor: int, path: Path, vertices: Element, start: int) -> G
             sh[first:end, 1:] = table[:, at[rest]].reshape(len(rows), 3, -1).transpose(0, 2, 1)
 
     read_rows(descriptor, path, start, vertices.layout, count, take)
-    return Gaussians(*(torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)))
+    return gaussians_of(means, quats, log_scales, logits, sh)
 
 
 def _columns(names: Sequence[str], wanted: Sequence[str]) -> slice | list[int]:

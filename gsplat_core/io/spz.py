@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, ExportError
-from gsplat_core.io.model_files import BLOCK_BYTES, check_memory, logit_of_bytes, open_model_file
+from gsplat_core.io.model_files import BLOCK_BYTES, check_memory, gaussians_of, logit_of_bytes, open_model_file
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAGIC = b"NGSP"
@@ -120,7 +119,7 @@ def _read_arrays(content: _Inflated, count: int, version: int, higher: int, frac
     each(3, store_scales)
     each(3 if version == 2 else 4, store_quats)
     each(3 * higher, store_higher)
-    return Gaussians(*(torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)))
+    return gaussians_of(means, quats, log_scales, logits, sh)
 
 
 def _signs(higher: int) -> NDArray[np.float32]:

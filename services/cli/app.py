@@ -18,6 +18,7 @@ from services.cli.options import (
     CameraPathOption,
     DeviceOption,
     EvaluatedArgument,
+    EvaluatedRecordingArgument,
     EvaluateOptions,
     EvaluationOutOption,
     ExportedFileArgument,
@@ -353,14 +354,16 @@ def reconstruct(
 @takes_run_options
 def evaluate(
     model: EvaluatedArgument,
-    recording: RecordingArgument,
     options: EvaluateOptions,
+    recording: EvaluatedRecordingArgument = None,
     out: EvaluationOutOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Evaluate a model or a run on a recording, next to trivial baselines."""
-    from services.cli.evaluate import evaluate_command, evaluation_settings
+    """Evaluate a model or a run on a recording, next to trivial baselines, or a model on a scene in COLMAP's format."""
+    from services.cli.evaluate import evaluate_command, evaluate_scene_command, evaluation_settings, scene_settings
 
+    if recording is None:
+        return evaluate_scene_command(model, scene_settings(options), out, as_json=json)
     return evaluate_command(model, evaluation_settings(recording, options), out, as_json=json)
 
 

@@ -2,24 +2,86 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 
 import typer
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.protocols import Visits
+from gsplat_core.io.model_sources import is_scene_file
 from gsplat_core.plain_numbers import plain_float
 from operators.applications.evaluate import EvaluationSettings, evaluate
+from operators.applications.evaluate_scene import RESULT_FILE, SceneScore, SceneSettings, evaluate_scene
 from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
-from services.cli.options import EvaluateOptions
+from services.cli.options import EvaluateOptions, renderer_options
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest, printable
 from services.reports.evaluation_build import build_evaluation, write_evaluation
 from services.reports.evaluation_rows import decibels, future, geometry_lines, measured
 from services.reports.evaluation_schema import EvaluationReport, load_evaluated
+
+ONLY_WITH_SCENE = ("scene", "images", "every", "samples", "supersampling", "order")
+ONLY_WITH_RECORDING = ("protocol", "max_frames", "steps_per_frame", "motion_prior", "place", "poses")
+
+
+def scene_settings(options: EvaluateOptions) -> SceneSettings:
+    """Convert the options of an evaluation without a recording.
+
+    Raises:
+        InvalidSetting: if there is no scene, or an option is not valid.
+    """
+    if options.scene is None:
+        raise InvalidSetting("there is nothing to evaluate on; give a RECORDING, or --scene with a folder of COLMAP")
+    _refuse(options, ONLY_WITH_RECORDING, "is for recordings; leave it out with --scene")
+    given = {"images": options.images, "every": options.every, "scale": options.scale}
+    return SceneSettings(
+        options.scene,
+        device=options.device,
+        renderer=options.renderer,
+        options=renderer_options(options.samples, options.supersampling, options.order),
+        **{name: value for name, value in given.items() if value is not None},  # type: ignore[arg-type]
+    )
+
+
+def _refuse(options: EvaluateOptions, names: tuple[str, ...], why: str) -> None:
+    for name in names:
+        if getattr(options, name) is not None:
+            raise InvalidSetting(f"--{name.replace('_', '-')} {why}")
+
+
+def evaluate_scene_command(model: Path, settings: SceneSettings, out: Path | None, *, as_json: bool) -> int:
+    """Evaluate a model on a scene, write the requested files and print the scores.
+
+    Returns:
+        The exit code.
+    """
+
+    def measure(folder: Path | None) -> SceneScore:
+        with ProgressPrinter(quiet=as_json) as progress:
+            return evaluate_scene(model, settings, folder, progress=progress, stop_requested=interrupt)
+
+    with InterruptRequest() as interrupt:
+        if out is None:
+            score = measure(None)
+        else:
+            with OutputFolder(out, "evaluate", [model, settings.scene]) as output:
+                score = measure(output.path)
+                output.publish()
+    if as_json:
+        typer.echo(json.dumps({**asdict(score), "interrupted": interrupt.requested}, indent=2))
+    else:
+        typer.echo(
+            f"{len(score.images)} held-out images: PSNR {score.psnr_db:.2f} dB, SSIM {score.ssim:.4f}, worst {score.worst_db:.2f} dB"
+            f" ({printable(score.worst)})"
+        )
+        if out is not None:
+            typer.echo(str(out / RESULT_FILE))
+    return INTERRUPTED if interrupt.requested else OK
 
 
 def evaluation_settings(recording: Path, options: EvaluateOptions) -> EvaluationSettings:
@@ -28,6 +90,7 @@ def evaluation_settings(recording: Path, options: EvaluateOptions) -> Evaluation
     Raises:
         InvalidSetting: if an option is not valid.
     """
+    _refuse(options, ONLY_WITH_SCENE, "is for scenes of COLMAP; leave it out, or leave the recording out")
     return EvaluationSettings(
         recording,
         tuple(options.protocol or ()),
@@ -65,6 +128,8 @@ def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None,
     Returns:
         The exit code.
     """
+    if is_scene_file(path):
+        raise InvalidSetting(f"{path} comes from no recording; give a scene of COLMAP with --scene, or a model folder")
     model, run = load_evaluated(path)
 
     def measure(folder: Path) -> EvaluationReport:

@@ -34,6 +34,9 @@ def path_option(name: str, help_text: str) -> Any:
 RecordingArgument = Annotated[
     Path, path_argument("RECORDING", "A video, or a folder with video.mp4, images/, cameras.json or session.json.")
 ]
+EvaluatedRecordingArgument = Annotated[
+    Path | None, path_argument("RECORDING", "The recording to evaluate on; with --scene there is none.")
+]
 SourceArgument = Annotated[
     str,
     typer.Argument(
@@ -106,7 +109,7 @@ def renderer_options(samples: int | None, supersampling: int | None, order: str 
     """
     from gsplat_core.rendering.renderer import RendererOptions
 
-    given = {"samples": samples, "supersampling": supersampling, "order": order}
+    given: dict[str, Any] = {"samples": samples, "supersampling": supersampling, "order": order}
     return RendererOptions(seed=seed, **{name: value for name, value in given.items() if value is not None})
 
 
@@ -180,6 +183,17 @@ class EvaluateOptions:
     ] = None
     place: PlaceOption = None
     poses: PosesOption = None
+    scene: Annotated[
+        Path | None,
+        path_option("--scene", "Evaluate on the held-out images of a scene in COLMAP's format, without a recording."),
+    ] = None
+    images: Annotated[str | None, typer.Option(help="With --scene: folder of its images.", show_default="images")] = (
+        None
+    )
+    every: Annotated[int | None, typer.Option(help="With --scene: hold out every k-th image.", show_default="8")] = None
+    samples: SamplesOption = None
+    supersampling: SupersamplingOption = None
+    order: OrderOption = None
 
 
 @dataclass(frozen=True)

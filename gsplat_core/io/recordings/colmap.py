@@ -1,0 +1,281 @@
+"""Reader of scenes in COLMAP's format: cameras, posed images and points, as `.bin` or `.txt`.
+
+A scene is a folder with `images/` and a reconstruction in `sparse/0/`, `sparse/` or the folder itself. Lens models with
+distortion are refused; COLMAP's `image_undistorter` removes it. COLMAP's poses map world to camera, in the camera's
+axes x right, y down, z forward. The centre of the first pixel is at (0.5, 0.5), as in `Camera`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import CoreError, RecordingInvalid, RecordingMissing
+from gsplat_core.io.files import open_regular
+from gsplat_core.scene.cameras import Camera
+
+MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+}  # fmt: skip
+"""Name and number of parameters of COLMAP's lens models by number."""
+PLACES = (Path("sparse/0"), Path("sparse"), Path("."))
+MOST_NAME_BYTES = 4096
+MOST_SIDE_PX = 1 << 16
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """Image of a scene."""
+
+    name: str
+    """Path of the image inside `images/`."""
+    camera: Camera
+    """Camera of the image at the size that COLMAP states, which may differ from that of the file."""
+
+
+@dataclass(frozen=True)
+class ColmapScene:
+    """Posed images of a scene, sorted by name."""
+
+    folder: Path
+    sparse: Path
+    """Folder of the reconstruction."""
+    images: tuple[PosedImage, ...]
+
+    def held_out(self, every: int = 8) -> tuple[PosedImage, ...]:
+        """Return every k-th image, beginning with the first: the usual test split of 3DGS trainers."""
+        return self.images[::every]
+
+    def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Read the points of the reconstruction.
+
+        Returns:
+            Positions [N, 3] and colours [N, 3].
+
+        Raises:
+            RecordingError: if the file is missing or malformed.
+        """
+        path = _found(self.sparse, "points3D")
+        rows = list(_points_of_text(path) if path.suffix == ".txt" else _points_of_binary(path))
+        table = np.array(rows, np.float64).reshape(-1, 6)
+        if not np.isfinite(table).all():
+            raise RecordingInvalid(f"{path} holds points that are NaN or infinite; export the scene again")
+        return table[:, :3], np.clip(table[:, 3:], 0, 255).astype(np.uint8)
+
+
+def read_colmap(folder: Path) -> ColmapScene:
+    """Read the cameras and poses of a scene.
+
+    Raises:
+        RecordingMissing: if the folder has no reconstruction.
+        RecordingInvalid: if a file is malformed, or a lens model is neither SIMPLE_PINHOLE nor PINHOLE.
+    """
+    sparse = _sparse_folder(folder)
+    path = _found(sparse, "cameras")
+    cameras = dict(_cameras_of_text(path) if path.suffix == ".txt" else _cameras_of_binary(path))
+    path = _found(sparse, "images")
+    images = []
+    for number, pose, camera, name in _images_of_text(path) if path.suffix == ".txt" else _images_of_binary(path):
+        if camera not in cameras:
+            raise RecordingInvalid(f"{path}: image {number} has camera {camera}, which {sparse} does not define")
+        if not name or name.startswith(("/", "\\")) or ".." in Path(name).parts or "\0" in name:
+            raise RecordingInvalid(f"{path}: image {number} is named {name!r:.80}, which is not inside images/")
+        images.append(PosedImage(name, cameras[camera].with_pose(_matrix(path, number, pose))))
+    if not images:
+        raise RecordingInvalid(f"{path} has no images; give a scene with registered images")
+    return ColmapScene(folder, sparse, tuple(sorted(images, key=lambda each: each.name)))
+
+
+def _sparse_folder(folder: Path) -> Path:
+    for place in PLACES:
+        if any((folder / place / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            return folder / place
+    raise RecordingMissing(
+        f"{folder} is no scene of COLMAP: it has no cameras.bin or cameras.txt in sparse/0, sparse or itself"
+    )
+
+
+def _found(sparse: Path, name: str) -> Path:
+    for suffix in (".bin", ".txt"):
+        if (sparse / f"{name}{suffix}").exists():
+            return sparse / f"{name}{suffix}"
+    raise RecordingMissing(f"{sparse} has no {name}.bin or {name}.txt; export the scene again")
+
+
+def _matrix(path: Path, number: int, pose: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return world to camera [4, 4] of a quaternion wxyz and a translation."""
+    w, x, y, z, *translation = pose
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not (all(math.isfinite(value) for value in pose) and 1e-6 < length < 1e6):
+        raise RecordingInvalid(f"{path}: image {number} has the pose {pose}, which is no rotation and translation")
+    w, x, y, z = w / length, x / length, y / length, z / length
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def _camera(path: Path, number: int, model: str, width_px: int, height_px: int, values: list[float]) -> Camera:
+    if model not in ("SIMPLE_PINHOLE", "PINHOLE"):
+        raise RecordingInvalid(
+            f"{path}: camera {number} has the lens model {model[:40]}, and only SIMPLE_PINHOLE and PINHOLE are read; undistort the images with COLMAP's image_undistorter"
+        )
+    wanted = 3 if model == "SIMPLE_PINHOLE" else 4
+    if len(values) != wanted or not (0 < width_px <= MOST_SIDE_PX and 0 < height_px <= MOST_SIDE_PX):
+        raise RecordingInvalid(
+            f"{path}: camera {number} has {len(values)} parameters and {width_px}x{height_px} px; {model} has {wanted}, and a side at most {MOST_SIDE_PX}"
+        )
+    fx, fy, cx, cy = values if wanted == 4 else (values[0], *values)
+    try:
+        return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width_px, height_px)
+    except CoreError as error:
+        raise RecordingInvalid(f"{path}: camera {number} cannot be used: {error}") from error
+
+
+class _Binary:
+    """Reader of little-endian values; every error names the file."""
+
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        self._file, self.path = file, path
+        self.size = os.fstat(file.fileno()).st_size
+
+    def take(self, layout: str) -> tuple[float, ...]:
+        """Read a struct. Raises RecordingInvalid at the end of the file."""
+        size = struct.calcsize(layout)
+        data = self._file.read(size)
+        if len(data) < size:
+            raise self._short()
+        return struct.unpack(layout, data)
+
+    def count(self, least_bytes: int) -> int:
+        """Read a number of entries of at least `least_bytes` each."""
+        (found,) = self.take("<Q")
+        if found * least_bytes > self.size:
+            raise self._short(f": {found} entries do not fit into its {self.size} bytes")
+        return int(found)
+
+    def skip(self, size: int) -> None:
+        """Skip bytes. Raises RecordingInvalid beyond the end of the file."""
+        if self._file.seek(size, os.SEEK_CUR) > self.size:
+            raise self._short()
+
+    def text(self) -> str:
+        """Read a text that ends with a zero byte."""
+        data = bytearray()
+        while byte := self._file.read(1):
+            if byte == b"\0":
+                return data.decode("utf-8", "replace")
+            data += byte
+            if len(data) > MOST_NAME_BYTES:
+                break
+        raise self._short()
+
+    def _short(self, why: str = "") -> RecordingInvalid:
+        return RecordingInvalid(f"{self.path} is cut short or is no file of COLMAP{why}; export the scene again")
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        return open_regular(path)
+    except OSError as error:
+        raise RecordingInvalid(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _cameras_of_binary(path: Path) -> Iterator[tuple[int, Camera]]:
+    with _open(path) as file:
+        reader = _Binary(file, path)
+        for _ in range(reader.count(24)):
+            number, model, width_px, height_px = (int(value) for value in reader.take("<iiQQ"))
+            name, parameters = MODELS.get(model, (f"number {model}", 0))
+            values = list(reader.take(f"<{parameters}d"))
+            yield number, _camera(path, number, name, width_px, height_px, values)
+
+
+def _images_of_binary(path: Path) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
+    with _open(path) as file:
+        reader = _Binary(file, path)
+        for _ in range(reader.count(64)):
+            (number,) = reader.take("<i")
+            pose = reader.take("<7d")
+            (camera,) = reader.take("<i")
+            name = reader.text()
+            reader.skip(24 * reader.count(24))
+            yield int(number), pose, int(camera), name
+
+
+def _points_of_binary(path: Path) -> Iterator[tuple[float, ...]]:
+    with _open(path) as file:
+        reader = _Binary(file, path)
+        for _ in range(reader.count(51)):
+            values = reader.take("<Q3d3Bd")
+            reader.skip(8 * reader.count(8))
+            yield values[1:7]
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text file without comments, with their numbers. Empty lines are kept."""
+    with _open(path) as file:
+        for number, line in enumerate(file, 1):
+            text = line.decode("utf-8", "replace").strip()
+            if not text.startswith("#"):
+                yield number, text
+
+
+def _malformed(path: Path, line: int, text: str) -> RecordingInvalid:
+    return RecordingInvalid(f"{path}: line {line} cannot be read: {text[:80]!r}; export the scene again")
+
+
+def _cameras_of_text(path: Path) -> Iterator[tuple[int, Camera]]:
+    for line, text in _lines(path):
+        if not text:
+            continue
+        try:
+            number, model, width_px, height_px, *values = text.split()
+            parsed = int(number), model, int(width_px), int(height_px), [float(value) for value in values]
+        except ValueError as error:
+            raise _malformed(path, line, text) from error
+        yield parsed[0], _camera(path, *parsed)
+
+
+def _images_of_text(path: Path) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
+    is_points = False  # every second line, which may be empty, lists an image's points
+    for line, text in _lines(path):
+        if is_points or not text:
+            is_points = False
+            continue
+        is_points = True
+        try:
+            number, *pose, camera, name = text.split(maxsplit=9)
+            parsed = int(number), tuple(float(value) for value in pose), int(camera), name
+        except ValueError as error:
+            raise _malformed(path, line, text) from error
+        if len(parsed[1]) != 7:
+            raise _malformed(path, line, text)
+        yield parsed
+
+
+def _points_of_text(path: Path) -> Iterator[tuple[float, ...]]:
+    for line, text in _lines(path):
+        if not text:
+            continue
+        try:
+            values = tuple(float(value) for value in text.split()[1:7])
+        except ValueError as error:
+            raise _malformed(path, line, text) from error
+        if len(values) != 6:
+            raise _malformed(path, line, text)
+        yield values

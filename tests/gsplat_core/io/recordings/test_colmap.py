@@ -1,0 +1,115 @@
+"""Scenes in COLMAP's format, as text and binary, and hostile ones."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core import Camera
+from gsplat_core.errors import RecordingInvalid, RecordingMissing
+from gsplat_core.io.recordings.colmap import read_colmap
+from tests.colmap_writer import write_scene
+
+POINTS = [(1.0, 2.0, 3.0, 255, 0, 7), (-1.0, 0.5, 9.0, 1, 2, 3)]
+
+
+def cameras(count=5):
+    generator = np.random.default_rng(0)
+    for k in range(count):
+        pose = np.eye(4)
+        pose[:3, :3], _ = cv2.Rodrigues(generator.normal(size=3))
+        pose[:3, 3] = generator.normal(size=3)
+        yield (
+            f"set/{(7 * k) % count:03d}.png",
+            Camera(np.array([[50.0 + k, 0, 20], [0, 50.0 + k, 15], [0, 0, 1]]), 40, 30, pose),
+        )
+
+
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+def test_cameras_poses_and_points_are_read_in_the_order_of_names(tmp_path, text, model, place):
+    written = list(cameras())
+    write_scene(tmp_path / "scene" / place, written, text=text, points=POINTS, model=model)
+    scene = read_colmap(tmp_path / "scene")
+    assert [each.name for each in scene.images] == sorted(name for name, _ in written)
+    for each in scene.images:
+        wanted = dict(written)[each.name]
+        assert np.allclose(each.camera.world_to_camera, wanted.world_to_camera, atol=1e-9)
+        assert np.array_equal(each.camera.K, wanted.K) and each.camera.width_px == 40
+    positions, colours = scene.points()
+    assert positions.tolist() == [list(p[:3]) for p in POINTS] and colours.tolist() == [list(p[3:]) for p in POINTS]
+    assert [each.name for each in scene.held_out(2)] == sorted(dict(written))[::2]
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_a_distorted_lens_is_refused_by_name(tmp_path, text):
+    write_scene(tmp_path / "sparse", cameras(), text=text, model="OPENCV")
+    with pytest.raises(RecordingInvalid, match=r"lens model OPENCV.*image_undistorter"):
+        read_colmap(tmp_path)
+
+
+def test_no_scene(tmp_path):
+    with pytest.raises(RecordingMissing, match="no scene of COLMAP"):
+        read_colmap(tmp_path)
+    (tmp_path / "cameras.txt").write_text("")
+    with pytest.raises(RecordingMissing, match="images"):
+        read_colmap(tmp_path)
+    (tmp_path / "images.txt").write_text("\n\n")
+    with pytest.raises(RecordingInvalid, match="no images"):
+        read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "reason"),
+    [
+        ("cameras.bin", lambda b: b[:-1], "cut short"),
+        ("cameras.bin", lambda b: struct.pack("<Q", 2**60) + b[8:], "do not fit"),
+        ("cameras.bin", lambda b: b[:12] + struct.pack("<i", 99) + b[16:], "number 99"),
+        ("cameras.bin", lambda b: b[:16] + struct.pack("<Q", 2**40) + b[24:], "1099511627776x30"),
+        ("cameras.bin", lambda b: b[:32] + struct.pack("<d", float("nan")) + b[40:], "cannot be used"),
+        ("images.bin", lambda b: b[:-1], "cut short"),
+        ("images.bin", lambda b: b[:12] + struct.pack("<4d", 0, 0, 0, 0) + b[44:], "no rotation"),
+        ("images.bin", lambda b: b.replace(b"set/", b"../_"), "not inside images"),
+        ("images.bin", lambda b: b[:68] + struct.pack("<i", 7) + b[72:], "camera 7"),
+        ("images.bin", lambda b: b[:72] + b"x" * 10_000, "cut short"),
+    ],
+)
+def test_a_malformed_binary_scene_is_refused_with_its_reason(tmp_path, file, change, reason):
+    write_scene(tmp_path / "sparse", cameras(), text=False)
+    path = tmp_path / "sparse" / file
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(RecordingInvalid, match=reason) as raised:
+        read_colmap(tmp_path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "reason"),
+    [
+        ("cameras.txt", "PINHOLE 40", "PINHOLE wide", "line 2"),
+        ("cameras.txt", " 15.0", "", "3 parameters"),
+        ("images.txt", " 10 set", " ten set", "line 2"),
+        ("images.txt", " 10 set", " set", "line 2"),
+        ("images.txt", " 10 set/", " 10 /", "not inside images"),
+    ],
+)
+def test_a_malformed_text_scene_is_refused_with_its_line(tmp_path, file, old, new, reason):
+    write_scene(tmp_path / "sparse", cameras(), text=True)
+    path = tmp_path / "sparse" / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(RecordingInvalid, match=reason):
+        read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_broken_points_are_refused(tmp_path, text):
+    write_scene(tmp_path / "sparse", cameras(), text=text, points=POINTS)
+    path = tmp_path / "sparse" / f"points3D.{'txt' if text else 'bin'}"
+    path.write_bytes(path.read_bytes()[:12])
+    with pytest.raises(RecordingInvalid, match=r"points3D"):
+        read_colmap(tmp_path).points()
