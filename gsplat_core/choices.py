@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from gsplat_core.registry import Registry
 
 if TYPE_CHECKING:
-    from gsplat_core.deformation.registry import FieldKind
+    from gsplat_core.deformation.kinds import FieldKind
     from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind

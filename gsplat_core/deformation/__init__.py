@@ -6,15 +6,8 @@ from gsplat_core.deformation.basis import BasisField
 from gsplat_core.deformation.basis_bumps import BasisRates
 from gsplat_core.deformation.field import Capabilities, DeformationField
 from gsplat_core.deformation.hexplane import HexPlaneField
-from gsplat_core.deformation.registry import (
-    FIELDS,
-    FieldKind,
-    FieldRates,
-    NewField,
-    field_from_config,
-    kind_of,
-    new_field,
-)
+from gsplat_core.deformation.kinds import FieldKind, FieldRates, NewField
+from gsplat_core.deformation.registry import FIELDS, field_from_config, kind_of, new_field
 
 __all__ = [
     "FIELDS",

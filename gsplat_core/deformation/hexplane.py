@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.field import Capabilities, DeformationField, WholeFieldSlot, checked_window, ops_for
-from gsplat_core.deformation.registry import FieldKind, FieldRates, NewField
+from gsplat_core.deformation.kinds import FieldKind, FieldRates, NewField
 from gsplat_core.deformation.regularisers import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled

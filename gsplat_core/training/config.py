@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from gsplat_core.choices import FIELDS, MOTION_PRIORS, Eyes
-from gsplat_core.deformation.registry import FieldRates, check_rates
+from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.continuation import NewestState
-from gsplat_core.deformation.registry import FIELDS, NewField
+from gsplat_core.deformation.kinds import NewField
+from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot, SnapshotSlots

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from gsplat_core.choices import FIELDS
-from gsplat_core.deformation.registry import PARAMETER_BYTES
+from gsplat_core.deformation.kinds import PARAMETER_BYTES
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.memory import available_bytes
 from gsplat_core.scene.cameras import Camera

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.registry import CapturedTraining
+from gsplat_core.deformation.kinds import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
 from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_

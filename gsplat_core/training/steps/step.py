@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.registry import FieldRates, FieldTraining, kind_of
+from gsplat_core.deformation.kinds import FieldRates, FieldTraining
+from gsplat_core.deformation.registry import kind_of
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians

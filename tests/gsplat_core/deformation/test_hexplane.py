@@ -5,7 +5,7 @@ import torch
 
 from gsplat_core.deformation import HexPlaneField
 from gsplat_core.deformation.hexplane import KIND, MOST_ROWS, PLANE_NAMES, TIME_PLANES
-from gsplat_core.deformation.registry import NewField
+from gsplat_core.deformation.kinds import NewField
 from gsplat_core.errors import InvalidInput
 
 WINDOW = (2.0, 4.0)
