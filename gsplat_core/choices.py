@@ -29,7 +29,14 @@ FIELDS: Registry[FieldKind[Any]] = Registry(
 )
 """Kinds of deformation fields by the names that a user can choose; `auto` is an alias."""
 
-RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.rendering.alpha:AlphaRenderer"})
+RENDERERS: Registry[RendererKind] = Registry(
+    "renderer",
+    {
+        "alpha": "gsplat_core.rendering.alpha:AlphaRenderer",
+        "stochastic": "gsplat_core.rendering.stochastic:StochasticRenderer",
+        "points": "gsplat_core.rendering.points:PointRenderer",
+    },
+)
 """Renderers by name; "alpha" is alpha blending (Kerbl et al. 2023).
 
 CONTRIBUTING.md, "A renderer", describes how to add one.

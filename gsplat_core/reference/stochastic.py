@@ -46,7 +46,7 @@ class ProjectedSplats(NamedTuple):
 def project_splats(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
     """Project Gaussians and evaluate their colours for a camera."""
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
-    radii, means2d, depths, conics, _ = fully_fused_projection(
+    radii, means2d, depths, conics, *_ = fully_fused_projection(
         gaussians.means,
         None,
         gaussians.quats,

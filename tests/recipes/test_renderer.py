@@ -50,7 +50,7 @@ class PointRenderer:
         self._model = model
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
-        asked = checked_outputs("points", outputs, self.capabilities)
+        asked = checked_outputs("dots", outputs, self.capabilities)
         check_camera(self._camera, camera)
         gaussians = self._model.at(time_s)
         viewmat, K = camera.matrices(self._device)
@@ -78,10 +78,10 @@ class PointRenderer:
 
 @pytest.fixture
 def points():
-    RENDERERS.add("points", PointRenderer)
+    RENDERERS.add("dots", PointRenderer)
     PointRenderer.prepared.clear()
     yield PointRenderer
-    RENDERERS.remove("points")
+    RENDERERS.remove("dots")
 
 
 @pytest.fixture(scope="module")
@@ -91,14 +91,14 @@ def tiny(tmp_path_factory):
 
 def test_it_runs_through_a_replay(points, tiny, tmp_path, device):
     settings = {"recording": tiny, "device": device.type, "steps_per_frame": 1}
-    outcome = replay(ReplaySettings(out=tmp_path / "points", renderer="points", **settings))
+    outcome = replay(ReplaySettings(out=tmp_path / "dots", renderer="dots", **settings))
     quality = outcome.find(QualityResult)
     assert quality.frames == 3 and sorted(set(points.prepared)) == [
         1,
         2,
         3,
     ]  # and again for what is predicted of the next frame
-    assert (tmp_path / "points" / "reconstruction.mp4").exists()
+    assert (tmp_path / "dots" / "reconstruction.mp4").exists()
     blended = replay(ReplaySettings(out=tmp_path / "alpha", **settings))
     assert quality.frames_sha256 != blended.find(QualityResult).frames_sha256
     assert outcome.find(ModelResult).model.sha256() == blended.find(ModelResult).model.sha256()
@@ -111,7 +111,7 @@ def test_it_runs_through_a_replay(points, tiny, tmp_path, device):
 def test_its_own_outputs_are_asked_for_by_name(points, tiny, tmp_path):
     outcome = replay(ReplaySettings(recording=tiny, out=tmp_path / "out", steps_per_frame=1))
     model = outcome.find(ModelResult).model
-    renderer = new_renderer("points", model.camera)
+    renderer = new_renderer("dots", model.camera)
     renderer.prepare(model)
     frame = renderer.render(model.camera, 0.0, outputs=["gaussian_ids"])
     assert set(frame.outputs()) == {"image", "gaussian_ids"}
@@ -120,6 +120,6 @@ def test_its_own_outputs_are_asked_for_by_name(points, tiny, tmp_path):
 
 
 def test_an_unknown_name_is_refused_before_anything_is_written(tiny, tmp_path):
-    with pytest.raises(InvalidSetting, match="renderer is 'points'; choose alpha"):
-        replay(ReplaySettings(recording=tiny, out=tmp_path / "out", renderer="points"))
+    with pytest.raises(InvalidSetting, match="renderer is 'dots'; choose alpha"):
+        replay(ReplaySettings(recording=tiny, out=tmp_path / "out", renderer="dots"))
     assert not (tmp_path / "out").exists()

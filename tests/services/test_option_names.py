@@ -118,21 +118,23 @@ def test_a_name_that_there_is_not_is_refused_everywhere(option, tmp_path, capsys
 
 
 def test_names_that_are_added_at_run_time_are_accepted_and_documented():
-    RENDERERS.add("points", "nowhere:Points")
+    RENDERERS.add("dots", "nowhere:Dots")
     try:
-        assert ReplayOptions(renderer="points").renderer == "points"
+        assert ReplayOptions(renderer="dots").renderer == "dots"
 
         class Wanted(BaseModel):
             options: JobOptions
 
         assert Wanted.model_json_schema()["$defs"]["JobOptions"]["properties"]["renderer"]["enum"] == [
             "alpha",
+            "stochastic",
             "points",
+            "dots",
         ]
     finally:
-        RENDERERS.remove("points")
-    with pytest.raises(InvalidSetting, match="renderer is 'points'; choose alpha"):
-        ReplayOptions(renderer="points")
+        RENDERERS.remove("dots")
+    with pytest.raises(InvalidSetting, match="renderer is 'dots'; choose alpha"):
+        ReplayOptions(renderer="dots")
 
 
 @pytest.mark.parametrize("value", ["depth", "photometric,depth:0.5", "none"])

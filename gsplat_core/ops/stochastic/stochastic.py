@@ -49,7 +49,7 @@ class SplatScene(NamedTuple):
     """Logits of the opacities [N]."""
     sh: Tensor | None = None
     """Spherical-harmonics coefficients [N, K, 3]; None if packed."""
-    index: Tensor | None = None
+    file_index: Tensor | None = None
     """Index of each row in its file, int32 [N], which selects its random numbers; None for the row."""
     packed: Tensor | None = None
     """Quantised geometry and colour, int32 [N, 4]; `quantised.h` defines the bits."""
@@ -59,7 +59,7 @@ class SplatScene(NamedTuple):
     """Quantised coefficients of the bands from 1, uint8 [N, K - 1, 3]; None for degree 0."""
 
     @property
-    def count(self) -> int:
+    def splat_count(self) -> int:
         """Number of rows."""
         first = self.means if self.packed is None else self.packed
         return 0 if first is None else int(first.shape[0])

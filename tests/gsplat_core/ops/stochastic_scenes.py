@@ -34,7 +34,7 @@ def raw(gaussians, index=None):
         log_scales=gaussians.log_scales,
         logits=gaussians.logit_opacities,
         sh=gaussians.sh,
-        index=index,
+        file_index=index,
     )
 
 

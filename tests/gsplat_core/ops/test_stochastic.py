@@ -227,7 +227,7 @@ def test_wrong_arguments_are_refused():
     for change, message in [
         ({"quats": None}, "covars and opacities, or quats"),
         ({"sh": scene.sh[:, :3]}, "1, 4, 9, 16 or 25"),
-        ({"index": torch.zeros(4, dtype=torch.int32)}, "index must have 5 rows"),
+        ({"file_index": torch.zeros(4, dtype=torch.int32)}, "index must have 5 rows"),
         ({"means": scene.means.double()}, "means must be float32"),
     ]:
         with pytest.raises(RuntimeError, match=message):

@@ -1,0 +1,134 @@
+"""Formats of scenes for `sample_splats`: without a copy, precomputed, and quantised."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+from gsplat_core.ops.stochastic.stochastic import CHUNK, CHUNK_FLOATS, SplatScene
+from gsplat_core.scene.gaussians import Gaussians
+
+ALPHA_CUTOFF = 1.0 / 255.0
+ROWS_AT_ONCE = 1 << 20
+"""Rows per step, which limits temporary memory."""
+
+
+def raw_splats(gaussians: Gaussians) -> SplatScene:
+    """Return a scene that shares the memory of raw Gaussians; needs no preparation when they move."""
+    return SplatScene(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        log_scales=gaussians.log_scales,
+        logits=gaussians.logit_opacities,
+        sh=gaussians.sh,
+    )
+
+
+def prepared_splats(gaussians: Gaussians) -> SplatScene:
+    """Precompute covariances and opacities, and drop splats with an opacity below 1/255.
+
+    The rows keep the random numbers of their index in `gaussians`. Means and colours are shared if nothing is dropped.
+    """
+    opacities = gaussians.opacities
+    kept = (opacities >= ALPHA_CUTOFF).nonzero()[:, 0]
+    index = None
+    if len(kept) < gaussians.count:
+        index = kept.to(torch.int32)
+        gaussians, opacities = gaussians.select(kept), opacities[kept]
+    covars = gaussians.means.new_empty(gaussians.count, 6)
+    for rows in _steps(gaussians.count):
+        some, _ = quat_scale_to_covar_preci(
+            gaussians.quats[rows], gaussians.log_scales[rows].exp(), compute_preci=False, triu=True
+        )
+        assert some is not None
+        covars[rows] = some
+    return SplatScene(means=gaussians.means, covars=covars, opacities=opacities, sh=gaussians.sh, file_index=index)
+
+
+def quantised_splats(gaussians: Gaussians) -> SplatScene:
+    """Quantise Gaussians to 16 bytes each, plus one byte per further spherical-harmonics coefficient.
+
+    Splats with an opacity below 1/255 are dropped. The others are sorted along a Morton curve. Positions, log-scales and
+    colours are stored relative to their ranges in chunks of `CHUNK` neighbours, higher bands relative to one range per
+    band and chunk. Rows keep the random numbers of their index in `gaussians`.
+    """
+    kept = (gaussians.opacities >= ALPHA_CUTOFF).nonzero()[:, 0]
+    order = kept[morton_codes(gaussians.means[kept]).argsort(stable=True)]
+    count, bases = len(order), gaussians.sh.shape[1]
+    device = gaussians.device
+    chunks = torch.zeros((count + CHUNK - 1) // CHUNK, CHUNK_FLOATS, device=device)
+    packed = torch.empty(count, 4, dtype=torch.int32, device=device)
+    packed_sh = torch.empty(count, bases - 1, 3, dtype=torch.uint8, device=device) if bases > 1 else None
+    for number in range(len(chunks)):
+        rows = slice(number * CHUNK, min((number + 1) * CHUNK, count))
+        some = gaussians.select(order[rows])
+        ranges = chunks[number]
+        position = _steps_of(some.means, 65535, ranges, 0)
+        scales = _steps_of(some.log_scales, 255, ranges, 6)
+        most = torch.tensor([31, 63, 31], device=device)
+        colour = _steps_of(some.sh[:, 0], most, ranges, 12)
+        opacity = (some.opacities * 255).round().long().clamp(1, 255)
+        words = [
+            position[:, 0] | position[:, 1] << 16,
+            position[:, 2] | scales[:, 0] << 16 | scales[:, 1] << 24,
+            _rotation_words(some.quats),
+            scales[:, 2] | opacity << 8 | (colour[:, 0] | colour[:, 1] << 5 | colour[:, 2] << 11) << 16,
+        ]
+        packed[rows] = _as_int32(torch.stack(words, -1))
+        for band in range(1, gaussians.sh_degree + 1):
+            values = some.sh[:, band * band : (band + 1) ** 2]
+            low, high = values.amin(), values.amax()
+            step = (high - low).clamp_min(1e-12) / 255
+            ranges[18 + 2 * (band - 1)], ranges[19 + 2 * (band - 1)] = low, step
+            assert packed_sh is not None
+            packed_sh[rows, band * band - 1 : (band + 1) ** 2 - 1] = ((values - low) / step).round().to(torch.uint8)
+    return SplatScene(file_index=order.to(torch.int32), packed=packed, chunks=chunks, packed_sh=packed_sh)
+
+
+def morton_codes(means: Tensor) -> Tensor:
+    """Return the position of each point [N, 3] on a Morton curve with 2^21 cells per axis, int64 [N]."""
+    if not len(means):
+        return torch.zeros(0, dtype=torch.int64, device=means.device)
+    low, high = means.amin(0), means.amax(0)
+    cells = ((means - low) / (high - low).clamp_min(1e-12) * ((1 << 21) - 1)).long()
+    code = torch.zeros(len(means), dtype=torch.int64, device=means.device)
+    for axis in range(3):
+        x = cells[:, axis]
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            x = (x | x << shift) & mask
+        code |= x << axis
+    return code
+
+
+def _steps(count: int) -> list[slice]:
+    return [slice(first, min(first + ROWS_AT_ONCE, count)) for first in range(0, count, ROWS_AT_ONCE)]
+
+
+def _steps_of(values: Tensor, most: Tensor | int, ranges: Tensor, offset: int) -> Tensor:
+    """Quantise columns [n, 3] to 0..most; write their minima and steps to `ranges`."""
+    low, high = values.amin(0), values.amax(0)
+    step = (high - low).clamp_min(1e-12) / most
+    ranges[offset : offset + 3], ranges[offset + 3 : offset + 6] = low, step
+    return ((values - low) / step).round().long()
+
+
+def _rotation_words(quats: Tensor) -> Tensor:
+    """Return the index of the largest component and the other three in 10 bits each, int64 [n]."""
+    unit = torch.nn.functional.normalize(quats, dim=-1)
+    largest = unit.abs().argmax(-1, keepdim=True)
+    unit = unit * unit.gather(-1, largest).sign()
+    others = torch.arange(4, device=quats.device).expand(len(quats), 4)
+    others = others[others != largest].view(-1, 3)
+    steps = ((unit.gather(-1, others) * 2**0.5 + 1) * 511).round().long().clamp(0, 1022)
+    return largest[:, 0] | steps[:, 0] << 2 | steps[:, 1] << 12 | steps[:, 2] << 22
+
+
+def _as_int32(words: Tensor) -> Tensor:
+    return torch.where(words >= 1 << 31, words - (1 << 32), words).to(torch.int32)
