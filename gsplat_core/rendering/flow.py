@@ -196,17 +196,24 @@ def deformation_gradients(first: Gaussians, second: Gaussians, neighbours: Tenso
     turned = rotations(second.quats) @ rotations(first.quats).transpose(1, 2)
     if neighbours.shape[1] == 0:
         return turned
-    before = (first.means[neighbours] - first.means[:, None]).detach()
-    after = second.means[neighbours] - second.means[:, None]
-    spread = before.square().sum((1, 2)) / neighbours.shape[1]
-    apart = (spread > 0)[:, None, None]
-    # In units of the neighbours' distance, so that no product is too small for float32.
-    unit = torch.where(apart, spread[:, None, None].sqrt(), 1)
-    before, after = before / unit, after / unit
-    identity = torch.eye(3, device=before.device, dtype=before.dtype)
-    moments = before.transpose(1, 2) @ before / neighbours.shape[1] + STIFFNESS * identity
-    both = after.transpose(1, 2) @ before / neighbours.shape[1] + STIFFNESS * turned
+    count = neighbours.shape[1]
+    before = (_rows(first.means, neighbours) - first.means[:, None]).detach()
+    after = _rows(second.means, neighbours) - second.means[:, None]
+    spread = (before.square().sum((1, 2)) / count)[:, None, None]
+    apart = spread > 0
+    # In units of the neighbours' mean square distance, so that no product is too small for float32.
+    unit = torch.where(apart, count * spread, 1)
+    moments = before.transpose(1, 2) @ before / unit
+    moments.diagonal(dim1=1, dim2=2).add_(STIFFNESS)
+    both = after.transpose(1, 2) @ before / unit + STIFFNESS * turned
     return torch.where(apart, both @ _inverse(moments), turned)
+
+
+def _rows(values: Tensor, indices: Tensor) -> Tensor:
+    """Return the rows [N, K, 3] of `values` [M, 3] at indices [N, K]."""
+    if values.is_cuda:
+        return values[indices]  # the gradient of index_select adds in random order on CUDA
+    return values.index_select(0, indices.flatten()).view(*indices.shape, -1)
 
 
 def rotations(quats: Tensor) -> Tensor:
