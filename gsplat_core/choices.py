@@ -52,6 +52,8 @@ OUTPUTS: Registry[OutputKind] = Registry(
         "spread": "gsplat_core.rendering.outputs:SPREAD",
         "confidence": "gsplat_core.rendering.outputs:CONFIDENCE",
         "semantics": "gsplat_core.rendering.outputs:SEMANTICS",
+        "flow": "gsplat_core.rendering.outputs:FLOW",
+        "occlusion": "gsplat_core.rendering.outputs:OCCLUSION",
     },
 )
 """Outputs in addition to picture, opacity and depth, by name. `Capabilities.outputs` states those of a renderer."""

@@ -14,7 +14,7 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, LaunchedFrame
-from gsplat_core.rendering.outputs import SURFACE_OUTPUTS
+from gsplat_core.rendering.outputs import FLOW_OUTPUTS, FLOW_STEP_S, SURFACE_OUTPUTS
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
@@ -35,11 +35,11 @@ class AlphaRenderer:
     On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once for the slot. A
     `Model` has its own graph, captured by `prepare`. On the CPU, and for fields without a fused frame path, the field's
     own function deforms the model and `gsplat_core.render` renders it. The outputs of a `Surface` (`SURFACE_OUTPUTS`)
-    are rendered by single launches in addition to the picture.
+    and the motion to a later time (`FLOW_OUTPUTS`) are rendered by single launches in addition to the picture.
     """
 
     capabilities = Capabilities(
-        outputs=(*STANDARD_OUTPUTS, *SURFACE_OUTPUTS),
+        outputs=(*STANDARD_OUTPUTS, *SURFACE_OUTPUTS, *FLOW_OUTPUTS),
         precisions={"cpu": ("fp32",), "cuda": ("fp32", "fp16")},
         differentiable=False,
         deterministic=True,
@@ -77,7 +77,7 @@ class AlphaRenderer:
         if model is None:
             raise InvalidInput("no model was prepared; call prepare(model) before render()")
         if not {*asked} <= {*STANDARD_OUTPUTS}:
-            return FinishedFrame(_with_surface(model.as_model(), camera, time_s, self._background, asked))
+            return FinishedFrame(_with_further(model.as_model(), camera, time_s, self._background, asked))
         if self._frames is None:
             with torch.no_grad():
                 output = render(model.at(time_s), camera, self._background, depth="depth" in asked)
@@ -141,11 +141,18 @@ class _FrameInFlight:
         return standard_outputs(self.outputs())
 
 
-def _with_surface(
+def _with_further(
     model: Model, camera: Camera, time_s: float, background: Tensor | None, asked: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """Render surface outputs by single launches, also on a GPU; they are not meant for live frames."""
-    outputs = {**model.surface(time_s, camera)._asdict(), **model.render(time_s, camera, background)._asdict()}
+    """Render outputs by single launches, also on a GPU; they are not meant for live frames."""
+    outputs: dict[str, Tensor] = model.render(time_s, camera, background)._asdict()
+    if {*asked} & {*SURFACE_OUTPUTS}:
+        outputs = {**model.surface(time_s, camera)._asdict(), **outputs}
+    if {*asked} & {*FLOW_OUTPUTS}:
+        # The compiled op is loaded when it is first needed, so that pictures alone do not depend on it.
+        from gsplat_core.rendering.flow import render_motion
+
+        outputs |= render_motion(model.at(time_s), model.at(time_s + FLOW_STEP_S), camera)
     return {name: outputs[name] for name in asked}
 
 

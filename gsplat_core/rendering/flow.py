@@ -18,12 +18,13 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.geometry.neighbours import nearest_others
-from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
 from gsplat_core.ops.flow_blending.flow_blending import TILE_SIZE, blend_flow
 from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.ray_blending.ray_blending import RAY_NUMBERS, splat_rays
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.rendering.surface import COVERED, render_rays
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -35,8 +36,6 @@ STIFFNESS = 1e-3
 
 It decides the motion across a surface, where the neighbours have no offsets.
 """
-COVERED = 0.1
-"""Least opacity of a pixel with known flow."""
 
 
 class RenderedFlow(NamedTuple):
@@ -95,14 +94,15 @@ def render_flow(
     with torch.no_grad():
         rows = projected(first, camera_1)
     if mode == "gaussianflow":
-        rays = rows.depths.new_zeros(first.count, 10)
+        rays = rows.depths.new_zeros(first.count, RAY_NUMBERS)
         rays[:, 0] = 1
         planes = _screen_planes(rows, projected(gaussians_2, camera_2), camera_1, camera_2)
     else:
         if neighbours is None:
             neighbours = nearest_splats(first)
         with torch.no_grad():
-            rays = ray_numbers(first, camera_1, rows.means2d)
+            view, K = camera_1.matrices(first.device, first.dtype)
+            rays = splat_rays(first.means, first.quats, first.scales, view, K, camera_1.model)
         gradients = deformation_gradients(first, gaussians_2, neighbours)
         planes = _moved_planes(first.means, gaussians_2.means, gradients, camera_1, camera_2)
     opacities = first.opacities
@@ -121,12 +121,22 @@ def render_flow(
 
 
 def render_depth(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return the expected z [H, W] at the rays' intersections with the splats; 0 where nothing is observed.
+    """Return the expected z [H, W] along the rays, differentiable; 0 where nothing is observed."""
+    rays = render_rays(gaussians, camera)
+    return torch.where(rays.alphas >= COVERED, rays.depths, 0)
 
-    Differentiable in means and rotations with constant weights: a splat's surface moves with the splat.
-    """
-    still = torch.arange(gaussians.count, device=gaussians.device)[:, None]
-    return render_flow(gaussians, gaussians, camera, camera, neighbours=still).depth
+
+@torch.no_grad()
+def render_motion(
+    gaussians_1: Gaussians, gaussians_2: Gaussians, camera: Camera, neighbours: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Return the outputs `flow` [H, W, 2] and `occlusion` [H, W] for one camera at two times."""
+    if neighbours is None:
+        neighbours = nearest_splats(gaussians_1)
+    forward = render_flow(gaussians_1, gaussians_2, camera, camera, neighbours=neighbours)
+    backward = render_flow(gaussians_2, gaussians_1, camera, camera, neighbours=neighbours)
+    hidden = occluded(forward, backward, render_depth(gaussians_2, camera))
+    return {"flow": forward.flow, "occlusion": hidden.to(forward.flow.dtype)}
 
 
 NOT_BEHIND = 0.02
@@ -232,36 +242,6 @@ def _inverse(matrices: Tensor) -> Tensor:
     a, b, c = matrices.unbind(1)
     adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], 2)
     return adjugate / (a * adjugate[:, :, 0]).sum(1)[:, None, None]
-
-
-def ray_numbers(gaussians: Gaussians, camera: Camera, means2d: Tensor) -> Tensor:
-    """Return the numbers [N, 10] that give each splat's depth on the rays of a pinhole camera, see `blend_flow`.
-
-    The density on the ray t d is highest at t = (dᵀ G μ) / (dᵀ G d), with μ the mean and G the precision in camera axes.
-    With d = d0 + e and μ = z d0 both are polynomials in e, the offset from the mean's ray d0.
-    """
-    viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
-    rotation, focal = viewmat[:3, :3], intrinsics[[0, 1], [0, 1]]
-    z = gaussians.means @ rotation[2] + viewmat[2, 3]
-    _, precision = quat_scale_to_covar_preci(gaussians.quats, gaussians.scales, compute_covar=False)
-    assert precision is not None
-    G = rotation @ precision @ rotation.T
-    d0 = torch.cat([(means2d - intrinsics[:2, 2]) / focal, torch.ones_like(z)[:, None]], 1)
-    g = (G @ d0[..., None])[..., 0]
-    whole = (g * d0).sum(1, keepdim=True)
-    slope = g[:, :2] / (whole * focal)
-    M = G[:, :2, :2] / whole[..., None] / focal[:, None] / focal
-    reach = 3 * gaussians.scales.amax(1)
-    columns = [
-        z,
-        *(z[:, None] * slope).unbind(1),
-        *(2 * slope).unbind(1),
-        M[:, 0, 0],
-        2 * M[:, 0, 1],
-        M[:, 1, 1],
-        reach,
-    ]
-    return torch.stack([*columns, torch.zeros_like(z)], 1)
 
 
 def _moved_planes(means_1: Tensor, means_2: Tensor, gradients: Tensor, camera_1: Camera, camera_2: Camera) -> Tensor:

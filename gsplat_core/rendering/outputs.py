@@ -30,7 +30,17 @@ DEPTH_NORMALS = OutputKind("Normals of the surface of ray_depth; 0 at edges", ""
 SPREAD = OutputKind("Standard deviation of depth along the ray", "scene unit", 1, False)
 CONFIDENCE = OutputKind("Opacity, reduced where tissue has not been seen for long", "", 1, False)
 SEMANTICS = OutputKind("Blended logits of the classes of a model that was trained with labels", "", None, True)
+FLOW = OutputKind(
+    "Motion of the surface to the right and down within `FLOW_STEP_S`, for a camera at rest", "px", 2, True
+)
+OCCLUSION = OutputKind(
+    "1 where the surface is hidden or outside of the picture after `FLOW_STEP_S`, else 0", "", 1, False
+)
 
+FLOW_STEP_S = 1 / 30
+"""Interval in seconds over which the outputs `flow` and `occlusion` show motion."""
+FLOW_OUTPUTS = ("flow", "occlusion")
+"""Names of the outputs that `render_motion` computes."""
 SURFACE_OUTPUTS = (
     "ray_depth", "normals", "median_depth", "spread", "confidence", "depth_normals", "semantics",
 )  # fmt: skip

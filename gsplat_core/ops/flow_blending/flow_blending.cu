@@ -1,6 +1,7 @@
 // Blending of flow in windows of 16x16 pixels, as in compositing: four warps with a quadrant of 8x8 pixels each. The
 // gradient rows of the instances are summed per splat in list order, without atomics.
 #include "../compositing/gather_rows.cuh"
+#include "../compositing/warp_sums.cuh"
 #include "flow_blending_math.h"
 
 namespace gsplat::flow_blending {
@@ -9,6 +10,7 @@ namespace {
 using namespace blending;
 using compositing::Place;
 using compositing::record_at;
+using compositing::warp_sums;
 using GSPLAT_ISA::flow_blending::Moved;
 using GSPLAT_ISA::flow_blending::moved;
 using GSPLAT_ISA::flow_blending::moved_backward;
@@ -107,23 +109,6 @@ __global__ void __launch_bounds__(kBlockThreads) blend_windows(Inputs in, const 
   }
   for (int p = 0; p < kPixelsEach; ++p)
     if (w.inside[p]) out[place.pixel(in, w, p)] = sums[p];
-}
-
-// Sum 2 kHalf values over groups of 4 kHalf lanes with one shuffle per value: for 16 values lane i of the warp returns
-// the sum of value i / 2.
-template <int kHalf>
-__device__ inline float warp_sums(float* v, int lane) {
-  if constexpr (kHalf == 0) {
-    return v[0] + __shfl_xor_sync(kAll, v[0], 1);
-  } else {
-    const bool upper = (lane & 2 * kHalf) != 0;
-#pragma unroll
-    for (int i = 0; i < kHalf; ++i) {
-      const float low = v[i], high = v[i + kHalf];
-      v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, 2 * kHalf);
-    }
-    return warp_sums<kHalf / 2>(v, lane);
-  }
 }
 
 // Write the gradient row of every instance of the window; `rows` must be zeroed, for the instances behind the last

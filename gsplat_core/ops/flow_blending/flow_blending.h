@@ -9,16 +9,11 @@
 
 #include <cstdint>
 
-#include "../compositing/compositing.h"
+#include "../ray_blending/ray_blending.h"
 
 namespace gsplat::flow_blending {
 
-// Columns of `rays`: the density along the ray that passes (dx, dy) from a splat's mean is highest at the depth
-// (z + n.d) / (1 + l.d + d'M d), limited to z +- reach. The coefficient of dx dy in d'M d is kMxy. The last column is not
-// used.
-constexpr int kZ = 0, kNx = 1, kNy = 2, kLx = 3, kLy = 4, kMxx = 5, kMxy = 6, kMyy = 7, kReach = 8;
-constexpr int kRayNumbers = 10;
-constexpr float kLeastDenominator = 1e-12f;
+constexpr int kRayNumbers = ray_blending::kRayNumbers;
 constexpr int kPlaneNumbers = 12;  // a, then the rows of B
 constexpr int kChannels = 4;       // sums over splats of w flow_x, w flow_y, w p_z and w
 constexpr float kNearest = 1e-6f;  // smallest depth of a moved point that has a pixel
@@ -28,7 +23,7 @@ struct Pinhole {
 };
 
 struct Inputs : compositing::Inputs {
-  const float* rays;    // [count, kRayNumbers]
+  const float* rays;    // [count, kRayNumbers], as in ray_blending
   const float* planes;  // [count, kPlaneNumbers]
   Pinhole before, after;
 };
@@ -38,11 +33,12 @@ struct Splats {
   compositing::Splats listed;  // records and lists
 };
 
-// Destination of the gradient rows [instances, kPlaneNumbers]: row_of maps a position in flatten_ids to a row, such that
-// a splat's rows are contiguous.
+// Destination of the gradients of the instances' planes: row_of maps a position in flatten_ids to a row, such that a
+// splat's rows are contiguous.
 struct GradientRows {
   const int32_t* row_of;
-  float* rows;
+  float* rows;  // [instances, row_size]
+  int64_t row_size;
 };
 
 struct Kernels {

@@ -11,10 +11,9 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.ray_blending.ray_blending import RAY_NUMBERS
 from gsplat_core.scene.cameras import Camera
 
-RAY_NUMBERS = 10
-"""Values of a splat that give its depth on a ray: z, n (x, y), l (x, y), M (xx, 2 xy, yy), reach, and an unused one."""
 PLANE_NUMBERS = 12
 """Values of a splat that move a point on a ray: the vector a, then the rows of the matrix B."""
 TILE_SIZE = 16
@@ -42,7 +41,7 @@ def blend_flow(
         means2d: float32 [N, 2] pixels of the first camera.
         conics: float32 [N, 3], upper triangle of the inverse covariance, 1/pixels².
         opacities: float32 [N] in 0..1.
-        rays: float32 [N, 10] in the axes of the first camera, see `RAY_NUMBERS`.
+        rays: float32 [N, 10] of the first camera, from `splat_rays`.
         planes: float32 [N, 12] from the first camera's axes to those of the second, see `PLANE_NUMBERS`.
         before: pinhole camera of the splats and of the result.
         after: pinhole camera in which points arrive; its size is not used.

@@ -101,7 +101,7 @@ static void tile_backward(const Splats& splats, int64_t index, const float* v_ou
   const Inputs& in = splats.in;
   const Tile t = tile_of(splats.listed, index);
   for (int64_t position = t.begin; position < t.end; ++position)
-    for (int k = 0; k < kPlaneNumbers; ++k) rows.rows[int64_t(rows.row_of[position]) * kPlaneNumbers + k] = 0;
+    for (int k = 0; k < kPlaneNumbers; ++k) rows.rows[rows.row_of[position] * rows.row_size + k] = 0;
   alignas(64) float given[kChannels * kPixels] = {};
   for (int y = t.y; y < t.bottom; ++y)
     for (int x = t.x; x < t.right; ++x)
@@ -125,7 +125,7 @@ static void tile_backward(const Splats& splats, int64_t index, const float* v_ou
         }
       },
       [&](int32_t, int64_t position) {
-        sums<kPlaneNumbers>(sum, rows.rows + int64_t(rows.row_of[position]) * kPlaneNumbers);
+        sums<kPlaneNumbers>(sum, rows.rows + rows.row_of[position] * rows.row_size);
         for (vfloat& value : sum) value = vfloat{};
       });
 }

@@ -2,13 +2,12 @@
 #include "flow_blending.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <vector>
 
 #include "host_call.h"
 #if !defined(GSPLAT_CUDA)
-#include "counting_sort.h"
+#include "../compositing/tile_pass.h"
 #endif
 
 namespace gsplat::flow_blending {
@@ -79,33 +78,19 @@ void backward(Call& call, const Inputs& in, const float* v_out, float* v_planes)
 
 #else
 
-// Position of the first tile's list. Earlier entries are unused: lists of a fixed capacity are filled from the end.
-int64_t first_listed(const Inputs& in) { return in.tiles() > 0 ? in.offsets[0] : in.instances; }
-
-// Validate the caller's lists; an out-of-range index would read outside of the tensors.
-void check_lists(const Inputs& in) {
-  int32_t before = 0;
-  bool ordered = true;
-  for (int64_t i = 0; i < in.tiles(); ++i) ordered &= in.offsets[i] >= before, before = in.offsets[i];
-  check(ordered && before <= in.instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
-  for (int64_t i = first_listed(in); i < in.instances; ++i)
-    check(uint64_t(uint32_t(in.flatten_ids[i])) < uint64_t(in.count), "flatten_ids must be in [0, ", in.count, "), found ",
-          in.flatten_ids[i]);
-}
-
 bool all_finite(const float* values, int count) {
   float zero = 0;
   for (int i = 0; i < count; ++i) zero += 0 * values[i];
   return zero == 0;
 }
 
-// Records of all splats, and a parallel loop over all tiles.
+// Records of all splats, which the tiles are blended from.
 struct Pass {
   std::unique_ptr<compositing::SplatRecord[]> records;
   Splats splats;
 
   explicit Pass(const Inputs& in) : records(uninitialised<compositing::SplatRecord>(in.count)), splats{in, {in, records.get()}} {
-    check_lists(in);
+    compositing::check_lists(in);
     torch::stable::parallel_for(0, in.count, 2048, [&](int64_t begin, int64_t end) {
       compositing::kernels().records(in, begin, end, records.get());
       // A splat with a non-finite value reaches no pixel.
@@ -114,48 +99,24 @@ struct Pass {
           records[size_t(i)].l = -INFINITY;
     });
   }
-
-  // Call run(tile) for all tiles. Threads take the next free tiles; no result depends on the assignment.
-  template <class Run>
-  void for_tiles(const Run& run) const {
-    constexpr int64_t kRun = 4;
-    std::atomic<int64_t> next{0};
-    const int64_t tiles = splats.in.tiles();
-    const int64_t workers = std::max<int64_t>(1, std::min<int64_t>(torch::stable::get_num_threads(), tiles));
-    torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
-      for (int64_t first; (first = next.fetch_add(kRun, std::memory_order_relaxed)) < tiles;)
-        for (int64_t tile = first; tile < std::min(first + kRun, tiles); ++tile) run(tile);
-    });
-  }
 };
 
 void forward(Call&, const Inputs& in, float* out) {
   const Pass pass(in);
-  pass.for_tiles([&](int64_t tile) { kernels().tile(pass.splats, tile, out); });
+  compositing::for_tiles(in.tiles(), 0, [&](int64_t tile, float*) { kernels().tile(pass.splats, tile, out); });
 }
 
 void backward(Call&, const Inputs& in, const float* v_out, float* v_planes) {
   const Pass pass(in);
-  // One row per instance; the rows of a splat are contiguous and in list order.
-  auto first = uninitialised<int32_t>(in.count + 1), row_of = uninitialised<int32_t>(in.instances);
-  const int64_t unused = first_listed(in), listed = in.instances - unused;
-  const int32_t* const ids = in.flatten_ids + unused;
-  const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
-    for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
-  };
-  counting_sort(listed, 1 << 15, in.count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
-    for (int64_t i = begin; i < end; ++i) row_of[size_t(unused + i)] = cursors[ids[i]]++;
-  });
-  first[size_t(in.count)] = int32_t(listed);
-  const auto rows = uninitialised<float>(listed * kPlaneNumbers);
-  const GradientRows gradients = {row_of.get(), rows.get()};
-  pass.for_tiles([&](int64_t tile) { kernels().tile_backward(pass.splats, tile, v_out, gradients); });
+  const compositing::InstanceRows instances(in, kPlaneNumbers);
+  const GradientRows rows = {instances.row_of.get(), instances.rows[0].floats, instances.row_size};
+  compositing::for_tiles(in.tiles(), 0, [&](int64_t tile, float*) { kernels().tile_backward(pass.splats, tile, v_out, rows); });
   torch::stable::parallel_for(0, in.count, 2048, [&](int64_t begin, int64_t end) {
     for (int64_t splat = begin; splat < end; ++splat) {
       float* const to = v_planes + splat * kPlaneNumbers;
       std::fill(to, to + kPlaneNumbers, 0.0f);
-      for (int64_t row = first[size_t(splat)]; row < first[size_t(splat) + 1]; ++row)
-        for (int k = 0; k < kPlaneNumbers; ++k) to[k] += rows[size_t(row * kPlaneNumbers + k)];
+      for (int64_t row = instances.first[size_t(splat)]; row < instances.first[size_t(splat) + 1]; ++row)
+        for (int k = 0; k < kPlaneNumbers; ++k) to[k] += rows.rows[row * rows.row_size + k];
     }
   });
 }

@@ -1,6 +1,7 @@
 // Depth of a splat on a ray, and the pixel to which the splat carries the surface there; a vector of pixels at a time.
 #pragma once
 
+#include "../ray_blending/ray_blending_math.h"
 #include "flow_blending.h"
 #include "simd.h"
 
@@ -11,11 +12,9 @@ using namespace gsplat::flow_blending;
 // Return the depth of a splat's highest density on the ray that passes (dx, dy) pixels from its mean, limited to the
 // splat's extent.
 GSPLAT_INLINE vfloat depth_on_ray(const float* ray, vfloat dx, vfloat dy) {
-  const vfloat across = ray[kMxx] * dx + (ray[kMxy] * dy + ray[kLx]);
-  const vfloat down = ray[kMyy] * dy + ray[kLy];
-  const vfloat denominator = max(across * dx + (down * dy + 1.0f), splat(kLeastDenominator));
-  const vfloat t = (ray[kNx] * dx + (ray[kNy] * dy + ray[kZ])) / denominator;
-  return max(min(t, splat(ray[kZ] + ray[kReach])), splat(ray[kZ] - ray[kReach]));
+  const ray_blending::Fraction f = ray_blending::fraction_at(ray, dx, dy);
+  const vfloat t = f.numerator / f.denominator, reach = splat(ray[ray_blending::kReach]), z = splat(ray[ray_blending::kZ]);
+  return max(min(t, z + reach), z - reach);
 }
 
 // Offset of a pixel from a splat's mean, and its ray (x, y, 1) in the first camera.

@@ -10,6 +10,8 @@ import torch
 from gsplat_core import RENDERERS, Camera, InvalidInput, Model, SnapshotSlots, new_renderer, render
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.rendering.flow import render_flow
+from gsplat_core.rendering.outputs import FLOW_OUTPUTS, FLOW_STEP_S
 from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, RendererOptions, checked_outputs
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
@@ -75,8 +77,19 @@ def test_outputs_are_asked_for_by_name(moving):
     frame = renderer.render(CAMERA, 2.0, outputs=["alpha"])
     assert list(frame.outputs()) == ["image", "alpha"]
     assert not frame.result().depth.any() and frame.result().alpha.any()
-    with pytest.raises(InvalidSetting, match="'alpha' has no output 'flow'; it has image, alpha, depth, ray_depth"):
-        renderer.render(CAMERA, 2.0, outputs=["depth", "flow"])
+    with pytest.raises(InvalidSetting, match="'alpha' has no output 'heat'; it has image, alpha, depth, ray_depth"):
+        renderer.render(CAMERA, 2.0, outputs=["depth", "heat"])
+
+
+def test_motion_is_that_to_a_later_time(moving):
+    renderer = new_renderer("alpha", CAMERA)
+    renderer.prepare(moving)
+    outputs = renderer.render(CAMERA, 2.0, FLOW_OUTPUTS).outputs()
+    assert list(outputs) == ["image", *FLOW_OUTPUTS]
+    wanted = render_flow(moving.at(2.0), moving.at(2.0 + FLOW_STEP_S), CAMERA, CAMERA)
+    assert torch.equal(outputs["flow"], wanted.flow) and outputs["flow"].any()
+    assert outputs["occlusion"].shape == (CAMERA.height_px, CAMERA.width_px)
+    assert not bool(outputs["occlusion"][~wanted.observed].any())
 
 
 def test_a_renderer_has_outputs_of_its_own():
