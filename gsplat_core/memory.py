@@ -17,6 +17,17 @@ def available_bytes() -> int | None:
     return min(limits) if limits else None
 
 
+def peak_bytes() -> int:
+    """Return the peak resident size of this process in bytes.
+
+    Unlike `ru_maxrss`, the value of Linux does not include the parent process before `exec`.
+    """
+    for line in _text(Path("/proc/self/status")).splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
 def in_gib(count: int) -> str:
     """Format a number of bytes for display, such as "3.2 GiB"."""
     return f"{count / 2**30:.1f} GiB"

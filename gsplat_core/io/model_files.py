@@ -6,16 +6,17 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.files import open_regular
 from gsplat_core.memory import available_bytes, in_gib
-from gsplat_core.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsplat_core.scene.gaussians import Gaussians
 
 
 def open_model_file(path: Path, folder: Path | None = None) -> BinaryIO:
@@ -116,6 +117,11 @@ def gaussians_of(
     sh: NDArray[np.float32],
 ) -> Gaussians:
     """Return Gaussians that share the memory of the arrays."""
+    # Imported lazily, because the service opens model files in processes without torch.
+    import torch
+
+    from gsplat_core.scene.gaussians import Gaussians
+
     tensors = [torch.from_numpy(array) for array in (means, quats, log_scales, logits, sh)]
     return Gaussians(tensors[0], tensors[1], tensors[2], tensors[3], tensors[4])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.model_sources import load_model
+from gsplat_core.memory import peak_bytes
 from gsplat_core.rendering.registry import check_renderer, new_renderer
 from gsplat_core.rendering.renderer import RendererOptions
 from operators.applications.device import check_device
@@ -188,7 +188,7 @@ def bench_model(
         fps_p99=1e3 / p99,
         parameter_bytes=sum(tensor.nbytes for tensor in model.tensors().values()),
         device_peak_bytes=torch.cuda.max_memory_allocated() if cuda else None,
-        host_peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        host_peak_bytes=peak_bytes(),
     )
 
 
