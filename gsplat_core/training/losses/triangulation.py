@@ -33,7 +33,7 @@ MOST_VIEWS = 8
 LEAST_VIEWS = 2
 """Numbers of other views that a point is matched in."""
 SIGMA = 0.01
-"""Scale of the robust loss relative to a point's depth."""
+"""Smallest scale of the robust loss relative to a point's depth."""
 MOST_REPROJECTION_PX = 1.0
 """Largest root mean square distance of a triangulated point from its matches."""
 KEPT_FRAMES = 512
@@ -115,13 +115,19 @@ def check_parallax(observation: Observation, others: Sequence[Observation]) -> N
 
 
 def consensus_loss(depth: Tensor, target: Triangulated, camera: Camera) -> Tensor:
-    """Return the mean of |X - X*|² / (|X - X*|² + σ²) over the triangulated points X* with rendered depth."""
+    """Return the mean of |X - X*|² / (|X - X*|² + σ²) over the triangulated points X* with rendered depth.
+
+    σ is 1 % of a point's depth, or the median of the relative distances if that is more. A surface far from all points
+    would otherwise have almost no gradient.
+    """
     _, K = camera.matrices(depth.device, depth.dtype)
     z = sampled(depth[..., None], target.pixels[None])[0, :, 0]
     rays = torch.cat([(target.pixels - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones_like(z)[:, None]], 1)
-    squared = (rays * z[:, None] - target.points).square().sum(1)
-    robust = squared / (squared + (SIGMA * target.points[:, 2]) ** 2)
     known = z > 0
+    squared = (rays * z[:, None] - target.points).square().sum(1) / target.points[:, 2].square()
+    with torch.no_grad():
+        typical = torch.where(known, squared, torch.nan).nanmedian().nan_to_num()
+    robust = squared / (squared + typical.clamp(min=SIGMA**2))
     return torch.where(known, robust, 0).sum() / known.sum().clamp(min=1)
 
 
