@@ -76,6 +76,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
       "Tensor v_colors, Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
+  // Coefficients [N, 10] of the depth along the rays of a pinhole camera (ray_blending.h), and the shortest axes [N, 3] in
+  // camera axes, towards the camera.
+  m.def("splat_rays(Tensor means, Tensor quats, Tensor scales, Tensor viewmat, Tensor K) -> (Tensor rays, Tensor normals)");
+  m.def(
+      "splat_rays_backward(Tensor means, Tensor quats, Tensor scales, Tensor viewmat, Tensor K, Tensor v_rays, Tensor v_normals) "
+      "-> (Tensor v_means, Tensor v_quats, Tensor v_scales)");
+
   // Depth along each pixel's ray and further channels, blended like `composite`; rays [N, 10] of ray_blending.h. Besides
   // the channels: opacity, mean and median depth, variance of depth, and the list positions of the last blended splat and of the
   // median's splat.

@@ -26,7 +26,7 @@ from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.points import point_moments
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.range_histogram import range_histogram
-from gsplat_core.reference.ray_blending import blend_rays
+from gsplat_core.reference.ray_blending import blend_rays, splat_rays
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
@@ -66,6 +66,7 @@ __all__ = [
     "sample_moments",
     "smooth_within_edges",
     "spherical_harmonics",
+    "splat_rays",
     "splat_regression",
     "splat_regression_gradients",
     "ssim_map",

@@ -39,6 +39,33 @@ def ray_depths(
     return torch.minimum(torch.maximum(free, depth - reach), depth + reach), 1 / square
 
 
+def splat_rays(means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Return ray coefficients [N, 10] and normals [N, 3] for a pinhole camera; see `gsplat_core.ops.splat_rays`."""
+    local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    x, y, z = local.unbind(-1)
+    largest = scales.amax(-1)
+    w, i, j, k = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    axes = torch.stack(
+        [
+            *(1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)),
+            *(2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)),
+            *(2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)),
+        ],
+        -1,
+    ).unflatten(-1, (3, 3))
+    axes = viewmat[:3, :3] @ axes
+    # Column k is divided by the scale of principal axis k.
+    whitened = axes / scales[:, None, :]
+    across, down = whitened[:, 0] / K[0, 0], whitened[:, 1] / K[1, 1]
+    forward = whitened[:, 0] * (x / z)[:, None] + whitened[:, 1] * (y / z)[:, None] + whitened[:, 2]
+    q = (forward * forward).sum(-1)
+    gx, gy = (across * forward).sum(-1) / q, (down * forward).sum(-1) / q
+    xx, xy, yy = (across * across).sum(-1) / q, (across * down).sum(-1) / q, (down * down).sum(-1) / q
+    rays = torch.stack([z, z * gx, z * gy, 2 * gx, 2 * gy, xx, 2 * xy, yy, 3 * largest, (1 / q).detach()], -1)
+    shortest = axes.gather(2, scales.argmin(-1)[:, None, None].expand(-1, 3, 1))[..., 0]
+    return rays, torch.where((shortest * local).sum(-1, keepdim=True) > 0, -shortest, shortest)
+
+
 def depths_of_rays(rays: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Return depth and variance [P, L] of splats with ray coefficients [L, 10] at offsets [P, L, 2] from their means."""
     z, nx, ny, lx, ly, xx, xy, yy, reach, variance = rays.unbind(-1)

@@ -66,15 +66,19 @@ def certainty(unseen_s: Tensor) -> Tensor:
 
 
 def render_rays(gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> BlendedRays:
-    """Blend ray depths and values of the splats; differentiable in the Gaussians and the values.
+    """Blend ray depths, normals and values of the splats; differentiable in the Gaussians and the values.
+
+    The first three of the blended values are the shortest axes of the splats in camera axes, towards the camera. Their
+    sum has at most the length of the opacity.
 
     Args:
         gaussians: Gaussians at one time, float32.
         camera: camera of the result.
-        values: values [N, D] to blend; None for none.
+        values: further values [N, D] to blend.
     """
-    # The compiled op is loaded when it is first needed, so that pictures alone do not depend on it.
-    from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_rays
+    # The compiled ops are loaded when they are first needed, so that pictures alone do not depend on them.
+    from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays
+    from gsplat_core.ops.splat_rays.splat_rays import splat_rays
 
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     scales, opacities = gaussians.scales, gaussians.opacities
@@ -89,34 +93,14 @@ def render_rays(gaussians: Gaussians, camera: Camera, values: Tensor | None = No
             projected.means2d, projected.radii, projected.depths, grid, conics=projected.conics,
             opacities=opacities[None],
         )  # fmt: skip
-    rays = splat_rays(gaussians.means, gaussians.quats, scales, viewmat, intrinsics, camera.model)
-    values = gaussians.means.new_zeros(gaussians.count, 0) if values is None else values
+    rays, normals = splat_rays(gaussians.means, gaussians.quats, scales, viewmat, intrinsics, camera.model)
+    values = normals if values is None else torch.cat([normals, values], 1)
     size = camera.width_px, camera.height_px
     parts = [
         blend_rays(projected.means2d[0], projected.conics[0], opacities, rays, part, *size, starts[0], ids)
         for part in values.split(MAX_CHANNELS, 1)
     ]
     return parts[0] if len(parts) == 1 else parts[0]._replace(values=torch.cat([part.values for part in parts], -1))
-
-
-def splat_normals(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return the shortest principal axes [N, 3] in camera axes, towards the camera; differentiable in the rotations."""
-    viewmat, _ = camera.matrices(gaussians.device, gaussians.dtype)
-    w, x, y, z = torch.nn.functional.normalize(gaussians.quats, dim=-1).unbind(-1)
-    columns = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1),
-            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1),
-            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        1,
-    )
-    shortest = gaussians.log_scales.argmin(-1)[:, None, None].expand(-1, 1, 3)
-    normals = columns.gather(1, shortest)[:, 0] @ viewmat[:3, :3].T
-    with torch.no_grad():
-        local = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
-        away = normals[:, 2] > 0 if camera.model == "ortho" else (normals * local).sum(-1) > 0
-    return torch.where(away[:, None], -normals, normals)
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
@@ -172,14 +156,14 @@ def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None 
         camera: camera of the outputs.
         certain: confidence [N], 0 to 1, of each Gaussian; None for 1.
     """
-    columns = [splat_normals(gaussians, camera)]
+    columns = []
     if certain is not None:
         require_shape("certain", certain, (gaussians.count,), "[N]")
         columns.append(certain.to(gaussians.dtype)[:, None])
     logits = gaussians.extra.get(SEMANTICS)
     if logits is not None:
         columns.append(logits)
-    rays = render_rays(gaussians, camera, torch.cat(columns, 1))
+    rays = render_rays(gaussians, camera, torch.cat(columns, 1) if columns else None)
     observed = rays.alphas >= COVERED
     normals = torch.nn.functional.normalize(rays.values[..., :3], dim=-1)
     depth, median, spread = (

@@ -1,13 +1,4 @@
-"""Depth along the rays of a picture, and further channels, blended with the picture's weights; with gradients.
-
-For a ray d with d_z = 1 through the camera, the density of a Gaussian is highest at t = (d' G mu) / (d' G d), where mu is
-its centre in camera axes and G the inverse of its covariance (UniGS, Xie et al. 2025). With d = mu / z + J x, where x is
-the offset in pixels from the splat's mean, this is
-
-    t(x) = (z + n.x) / (1 + l.x + x' M x),  n = z g,  l = 2 g,  g = J' G d0 / q,  M = J' G J / q,  q = d0' G d0,  d0 = mu / z,
-
-in which no large numbers cancel. `splat_rays` computes these coefficients, `blend_rays` blends t.
-"""
+"""Depth along the rays of a picture, and further channels, blended with the picture's weights; with gradients."""
 
 from __future__ import annotations
 
@@ -18,16 +9,10 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.scene.cameras import CameraModel
+from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS
 
-RAY_NUMBERS = 10
-"""Columns of a splat's ray coefficients: z, n (2), l (2), M (xx, twice xy, yy), reach and variance."""
 MAX_CHANNELS = 15
 """Maximum number of channels of one call."""
-REACH_SIGMAS = 3.0
-"""Limit of the ray depth around the depth of the splat's centre, in its largest standard deviations."""
-LEAST_SCALE = 1e-5
-"""Smallest standard deviation of a splat relative to its largest one; keeps G finite in float32."""
 
 
 class BlendedRays(NamedTuple):
@@ -43,63 +28,6 @@ class BlendedRays(NamedTuple):
     """Depth [H, W] of the splat at which transmittance falls to 1/2; 0 if it never does."""
     variances: Tensor
     """Variance of depth [H, W] along the ray, across splats and within their thickness. Has no gradient."""
-
-
-def splat_rays(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, camera_model: CameraModel
-) -> Tensor:
-    """Compute the ray coefficients [N, 10] of Gaussians seen by one camera; differentiable.
-
-    Rows of Gaussians behind the camera plane or with values that are not finite are arbitrary and have no gradient. A fisheye
-    camera has no linear relation between pixel and ray. Its splats have the depth of their centre everywhere.
-
-    Args:
-        means: centres [N, 3] in world units.
-        quats: rotations [N, 4] as wxyz.
-        scales: standard deviations [N, 3].
-        viewmat: world-to-camera matrix [4, 4].
-        K: intrinsic matrix [3, 3].
-        camera_model: projection of the camera.
-    """
-    rotation = viewmat[:3, :3]
-    local = means @ rotation.T + viewmat[:3, 3]
-    with torch.no_grad():
-        visible = (local[:, 2] > 0) & torch.cat([local, quats, scales], -1).isfinite().all(-1) & (scales > 0).all(-1)
-        visible = visible[:, None]
-    x, y, z = torch.where(visible, local, local.new_tensor([0, 0, 1])).unbind(-1)
-    quats = torch.where(visible, quats, quats.new_tensor([1, 0, 0, 0]))
-    scales = torch.where(visible, scales, 1)
-    largest = scales.amax(-1)
-    reach = REACH_SIGMAS * largest
-    zero = torch.zeros_like(z)
-    if camera_model == "fisheye":
-        return torch.stack([z, *[zero] * 7, reach, largest * largest], -1)
-    w, i, j, k = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    axes = torch.stack(
-        [
-            *(1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)),
-            *(2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)),
-            *(2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)),
-        ],
-        -1,
-    ).unflatten(-1, (3, 3))
-    # Rows are the axes of camera space; column k is divided by the scale of principal axis k. All coefficients except the
-    # variance, which has no gradient, are independent of a common factor of the scales.
-    largest = largest.detach()
-    relative = (scales / largest[:, None]).clamp(min=LEAST_SCALE)
-    whitened = (rotation @ axes) / relative[:, None, :]
-    if camera_model == "ortho":
-        forward = whitened[:, 2]
-        q = (forward * forward).sum(-1)
-        slope = -(whitened[:, :2] * forward[:, None]).sum(-1) / q[:, None]
-        n = [slope[:, 0] / K[0, 0], slope[:, 1] / K[1, 1]]
-        return torch.stack([z, *n, *[zero] * 5, reach, largest * largest / q], -1)
-    across, down = whitened[:, 0] / K[0, 0], whitened[:, 1] / K[1, 1]
-    forward = whitened[:, 0] * (x / z)[:, None] + whitened[:, 1] * (y / z)[:, None] + whitened[:, 2]
-    q = (forward * forward).sum(-1)
-    gx, gy = (across * forward).sum(-1) / q, (down * forward).sum(-1) / q
-    xx, xy, yy = (across * across).sum(-1) / q, (across * down).sum(-1) / q, (down * down).sum(-1) / q
-    return torch.stack([z, z * gx, z * gy, 2 * gx, 2 * gy, xx, 2 * xy, yy, reach, largest * largest / q], -1)
 
 
 def blend_rays(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from gsplat_core.rendering.surface import COVERED, SEMANTICS, render_rays, splat_normals
+from gsplat_core.rendering.surface import COVERED, SEMANTICS, render_rays
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.losses.loss import LossContext
@@ -51,10 +50,7 @@ def rays_of(scene: Gaussians, observation: Observation, context: LossContext) ->
         K[:2] /= stride
         K[:2, 2] += 0.5 - 0.5 / stride
         camera = Camera(K, camera.width_px // stride, camera.height_px // stride, camera.world_to_camera, camera.model)
-    columns = [splat_normals(scene, camera)]
-    if SEMANTICS in scene.extra:
-        columns.append(scene.extra[SEMANTICS])
-    rays = render_rays(scene, camera, torch.cat(columns, 1))
+    rays = render_rays(scene, camera, scene.extra.get(SEMANTICS))
     unmasked = RenderedRays(
         camera, stride, rays.alphas, rays.depths, rays.values[..., :3], rays.values[..., 3:], rays.alphas >= COVERED
     )

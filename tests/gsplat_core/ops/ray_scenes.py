@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core import reference
-from gsplat_core.ops.ray_blending.ray_blending import blend_rays, splat_rays
+from gsplat_core.ops.ray_blending.ray_blending import blend_rays
+from gsplat_core.ops.splat_rays.splat_rays import splat_rays
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 
@@ -78,6 +79,30 @@ def intrinsics(width: int, height: int) -> Tensor:
     return torch.tensor([[50.0, 0, width / 2], [0, 52.0, height / 2], [0, 0, 1]], dtype=torch.float64)
 
 
+def view() -> Tensor:
+    """Return a turned and moved world-to-camera matrix in float64."""
+    turn = torch.linalg.matrix_exp(
+        torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.15], [-0.2, 0.15, 0]], dtype=torch.float64)
+    )
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = turn, torch.tensor([1.0, -2.0, 3.0])
+    return matrix
+
+
+def splat_results(count: int, device: str | None) -> dict[str, Tensor]:
+    """Return ray coefficients, normals and gradients of a fixed random linear function; device None is the reference."""
+    kind = torch.float64 if device is None else torch.float32
+    place = "cpu" if device is None else device
+    inputs = [tensor.to(place, kind).requires_grad_() for tensor in gaussians(count)]
+    camera = [tensor.to(place, kind) for tensor in (view(), intrinsics(70, 45))]
+    outputs = reference.splat_rays(*inputs, *camera) if device is None else splat_rays(*inputs, *camera, "pinhole")
+    random = torch.Generator().manual_seed(3)
+    total = sum((output * torch.randn(output.shape, generator=random).to(place, kind)).sum() for output in outputs)
+    gradients = torch.autograd.grad(total, inputs)  # type: ignore[arg-type]
+    names = "rays", "normals", "v_means", "v_quats", "v_scales"
+    return {name: tensor.detach().cpu() for name, tensor in zip(names, (*outputs, *gradients), strict=True)}
+
+
 def ray_scene(
     count: int, width: int = 70, height: int = 45, channels: int = 3, seed: int = 0, **options: float
 ) -> RayScene:
@@ -85,7 +110,7 @@ def ray_scene(
     means, quats, scales = gaussians(count, seed)
     K, viewmat = intrinsics(width, height), torch.eye(4, dtype=torch.float64)
     projected = reference.fully_fused_projection(means, None, quats, scales, viewmat[None], K[None], width, height)
-    rays = splat_rays(means, quats, scales, viewmat, K, "pinhole")
+    rays = reference.splat_rays(means, quats, scales, viewmat, K)[0]
     random = torch.Generator().manual_seed(seed + 1)
     opacities = torch.sigmoid(1 + 2 * torch.randn(count, generator=random))
     values = torch.randn(count, channels, generator=random)

@@ -1,4 +1,4 @@
-"""Ray depths of Gaussians by their definition, and their compiled blending against plain torch in float64."""
+"""Compiled blending of ray depths against plain torch in float64."""
 
 from __future__ import annotations
 
@@ -10,91 +10,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_rays
-from gsplat_core.reference.ray_blending import depths_of_rays, ray_depths
-from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, gaussians, intrinsics, ray_scene, with_bad_values
-
-
-def view() -> torch.Tensor:
-    turn = torch.linalg.matrix_exp(
-        torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.15], [-0.2, 0.15, 0]], dtype=torch.float64)
-    )
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = turn, torch.tensor([1.0, -2.0, 3.0])
-    return matrix
-
-
-def depths_by_coefficients(means, quats, scales, viewmat, K, pixels):
-    rays = splat_rays(means, quats, scales, viewmat, K, "pinhole")
-    local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    means2d = local[:, :2] / local[:, 2:] * K.diagonal()[:2] + K[:2, 2]
-    return depths_of_rays(rays, pixels[:, None] - means2d)
-
-
-@pytest.mark.parametrize("flatness", [1.0, 1e-3])
-def test_coefficients_give_the_midpoint_of_the_chord_and_its_gradient(flatness: float) -> None:
-    means, quats, scales = gaussians(40)
-    scales[:, 0] *= flatness
-    K, viewmat = intrinsics(70, 45), view()
-    pixels = torch.rand(60, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * torch.tensor(
-        [70.0, 45]
-    )
-    results = []
-    for function in (ray_depths, depths_by_coefficients):
-        inputs = [tensor.clone().requires_grad_() for tensor in (means, quats, scales)]
-        depth, variance = function(*inputs, viewmat, K, pixels)
-        random = torch.randn(depth.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-        gradients = torch.autograd.grad((depth * random).sum(), inputs)
-        results.append((depth.detach(), variance.detach(), *gradients))
-    for wanted, seen in zip(*results, strict=True):
-        torch.testing.assert_close(seen, wanted, rtol=1e-6, atol=1e-8 * float(wanted.abs().max()))
-    depth = results[0][0]
-    centre = (means @ viewmat[2, :3] + viewmat[2, 3]).expand_as(depth)
-    assert bool(((depth - centre).abs() < 2.9 * scales.amax(1)).any())
-    assert bool(((depth - centre).abs() > 2.999 * scales.amax(1)).any())  # the limit is reached
-
-
-def test_single_precision_is_accurate_for_flat_splats() -> None:
-    means, quats, scales = gaussians(200)
-    scales[:, 1] = 1e-3 * scales[:, 0]
-    K = intrinsics(640, 512)
-    pixels = means[:, :2] / means[:, 2:] * K.diagonal()[:2] + K[:2, 2]
-    pixels = pixels + torch.randn(200, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    eye = torch.eye(4, dtype=torch.float64)
-    wanted = depths_by_coefficients(means, quats, scales, eye, K, pixels)[0].diagonal()
-    single = [tensor.float() for tensor in (means, quats, scales, eye, K, pixels)]
-    seen = depths_by_coefficients(*single)[0].diagonal().double()
-    assert float(((seen - wanted) / wanted).abs().median()) < 1e-6
-    assert float(((seen - wanted) / wanted).abs().max()) < 1e-3
-
-
-def test_other_projections() -> None:
-    means, quats, scales = gaussians(30)
-    K, eye = intrinsics(70, 45), torch.eye(4, dtype=torch.float64)
-    fisheye = splat_rays(means, quats, scales, eye, K, "fisheye")
-    depth, _ = depths_of_rays(fisheye, torch.randn(5, 30, 2, dtype=torch.float64))
-    torch.testing.assert_close(depth, means[:, 2].expand(5, -1))
-    # A parallel ray through (x, y): minimum of the Mahalanobis distance over z, in closed form.
-    ortho = splat_rays(means, quats, scales, eye, K, "ortho")
-    covariance, _ = reference.quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    precision = torch.linalg.inv(covariance)
-    offset = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    wanted = means[:, 2] - (precision[:, 2, :2] @ offset) / precision[:, 2, 2]
-    depth, variance = depths_of_rays(ortho, (offset * K.diagonal()[:2]).expand(1, 30, 2))
-    limit = 3 * scales.amax(1)
-    torch.testing.assert_close(depth[0], wanted.clamp(means[:, 2] - limit, means[:, 2] + limit))
-    torch.testing.assert_close(variance[0], 1 / precision[:, 2, 2])
-
-
-def test_splats_behind_the_camera_have_no_gradient() -> None:
-    means, quats, scales = (tensor.float() for tensor in gaussians(4))
-    means[0, 2], means[1, 2], quats[2] = -3, 0, 0
-    inputs = [tensor.requires_grad_() for tensor in (means, quats, scales)]
-    rays = splat_rays(*inputs, torch.eye(4), intrinsics(70, 45).float(), "pinhole")
-    rays.sum().backward()
-    assert bool(rays.isfinite().all())
-    assert not means.grad[:2].any() and not scales.grad[:2].any()
-    assert all(bool(tensor.grad.isfinite().all()) for tensor in inputs)
+from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays
+from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, ray_scene, with_bad_values
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4, 8, 9, MAX_CHANNELS])
