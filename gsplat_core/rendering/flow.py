@@ -21,7 +21,7 @@ from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.ops.flow_blending.flow_blending import TILE_SIZE, blend_flow
 from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.projection import fully_fused_projection
-from gsplat_core.ops.ray_blending.ray_blending import RAY_NUMBERS, splat_rays
+from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS, splat_rays
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.surface import COVERED, render_rays
@@ -102,7 +102,7 @@ def render_flow(
             neighbours = nearest_splats(first)
         with torch.no_grad():
             view, K = camera_1.matrices(first.device, first.dtype)
-            rays = splat_rays(first.means, first.quats, first.scales, view, K, camera_1.model)
+            rays = splat_rays(first.means, first.quats, first.scales, view, K, camera_1.model).rays
         gradients = deformation_gradients(first, gaussians_2, neighbours)
         planes = _moved_planes(first.means, gaussians_2.means, gradients, camera_1, camera_2)
     opacities = first.opacities
