@@ -35,6 +35,7 @@ RENDERERS: Registry[RendererKind] = Registry(
         "alpha": "gsplat_core.rendering.alpha:AlphaRenderer",
         "stochastic": "gsplat_core.rendering.stochastic:StochasticRenderer",
         "points": "gsplat_core.rendering.points:PointRenderer",
+        "weighted_sum": "gsplat_core.rendering.weighted_sum:WeightedSumRenderer",
     },
 )
 """Renderers by name; "alpha" is alpha blending (Kerbl et al. 2023).

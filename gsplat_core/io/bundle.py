@@ -216,6 +216,7 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
         except InvalidInput as error:
             raise BundleCorrupt(f"{path} cannot be used: {error}") from error
     facts = dict(training_digest=manifest.training_digest, depth_source=manifest.depth_source)
+    facts["trained_by"] = manifest.trained_by
     return Model(manifest.version, loaded, field, manifest.camera, manifest.time_window_s, **facts)  # type: ignore[arg-type]
 
 

@@ -16,7 +16,7 @@ from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.registry import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
-from gsplat_core.models.model import Model
+from gsplat_core.models.model import Model, TrainedBy
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthSource
@@ -50,6 +50,8 @@ MOST_EXTRA = 16
 EXTRA_SIDE = IntegerIn(1, 1024)
 EXTRA_SIDES = 3
 """Largest number of dimensions of an extra tensor after the first."""
+RENDERER_VALUE = NumberIn(0.0, 1e30)
+"""Range of a renderer's value for the whole scene."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 
@@ -70,6 +72,7 @@ class Manifest:
     depth_source: DepthSource | None = None
     right_eye: bool = False
     """True if the Gaussians have separate colours for the right eye."""
+    trained_by: TrainedBy = dataclass_field(default_factory=TrainedBy)
     extra: Mapping[str, tuple[int, ...]] = dataclass_field(default_factory=dict)
     """Shapes of the extra tensors of a Gaussian by name."""
 
@@ -128,8 +131,21 @@ def parse_manifest(text: bytes, name: str) -> Manifest:
         parameters=root.integer("parameters", PARAMETERS) if "parameters" in root.values else None,
         depth_source=None if root.values.get("depth") is None else _depth_source(root.nested("depth")),
         right_eye=gaussians.boolean("right_eye") if "right_eye" in gaussians.values else False,
+        trained_by=_trained_by(root.nested("trained_by")) if "trained_by" in root.values else TrainedBy(),
         extra=_extra_shapes(gaussians.nested("extra")) if "extra" in gaussians.values else {},
     )
+
+
+def _trained_by(reader: JsonObject) -> TrainedBy:
+    renderer, values = reader.values.get("renderer"), reader.nested("values")
+    if not isinstance(renderer, str) or not EXTRA_NAME.fullmatch(renderer):
+        raise BundleCorrupt(f"{reader.name}: {shortened(renderer)} is no name of a renderer; use a to z, 0 to 9 and _")
+    if len(values.values) > MOST_EXTRA:
+        raise BundleCorrupt(f"{values.name}: {len(values.values)} values; at most {MOST_EXTRA} are allowed")
+    for name in values.values:
+        if not EXTRA_NAME.fullmatch(name):
+            raise BundleCorrupt(f"{values.name}: {shortened(name)} is no name of a value; use a to z, 0 to 9 and _")
+    return TrainedBy(renderer, {name: values.number(name, RENDERER_VALUE) for name in values.values})
 
 
 def _extra_shapes(reader: JsonObject) -> dict[str, tuple[int, ...]]:

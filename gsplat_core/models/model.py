@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,16 @@ def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
     """Clamp `time_s` to the window; NaN is preserved, for the field to reject."""
     start, end = window_s
     return min(max(time_s, start), end) if time_s == time_s else time_s
+
+
+@dataclass(frozen=True)
+class TrainedBy:
+    """Renderer whose pictures trained a model. Other renderers may be unable to show the model."""
+
+    renderer: str = "alpha"
+    """Name in `RENDERERS`."""
+    values: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Values of the renderer for the whole scene, learned or fixed at the start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +68,8 @@ class Model:
 
     depth_source: DepthSource | None = None
     """Source of the training depth; None without depth or in bundles of earlier versions."""
+    trained_by: TrainedBy = TrainedBy()
+    """Renderer that trained the model."""
 
     _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
     _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
@@ -174,6 +186,9 @@ class Model:
         right: dict[str, Any] = {} if self.gaussians.right_sh is None else {"right_eye": True}
         if self.gaussians.extra:
             right["extra"] = {name: list(tensor.shape[1:]) for name, tensor in self.gaussians.extra.items()}
+        by: dict[str, Any] = {}
+        if self.trained_by.renderer != "alpha":
+            by = {"trained_by": {"renderer": self.trained_by.renderer, "values": dict(self.trained_by.values)}}
         return {
             "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree, **right},
             "field": None if self.field is None else self.field.config(),
@@ -187,6 +202,7 @@ class Model:
             "time_window_s": list(self.time_window_s),
             "training_digest": self.training_digest,
             **depth,
+            **by,
         }
 
     def sha256(self) -> str:

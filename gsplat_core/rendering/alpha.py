@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,10 +24,12 @@ from gsplat_core.rendering.renderer import (
     PendingFrame,
     Precision,
     check_camera,
+    check_trained_by,
     checked_outputs,
     standard_outputs,
 )
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 
 
 class AlphaRenderer:
@@ -41,10 +44,33 @@ class AlphaRenderer:
     capabilities = Capabilities(
         outputs=(*STANDARD_OUTPUTS, *SURFACE_OUTPUTS, *FLOW_OUTPUTS),
         precisions={"cpu": ("fp32",), "cuda": ("fp32", "fp16")},
-        differentiable=False,
+        differentiable=True,
         deterministic=True,
         reads_snapshots=True,
     )
+
+    rates: ClassVar[Mapping[str, float]] = {}
+
+    @staticmethod
+    def extended(gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians, to which alpha blending adds nothing."""
+        return gaussians
+
+    @staticmethod
+    def first_values(distance: float) -> Mapping[str, float]:
+        """Return no values; see `TrainableRenderer.first_values`."""
+        return {}
+
+    @staticmethod
+    def picture(
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor | None,
+        values: Mapping[str, Tensor],
+        depth: bool = True,
+    ) -> RenderOutput:
+        """See `TrainableRenderer.picture`."""
+        return render(gaussians, camera, background, depth)
 
     def __init__(
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
@@ -61,6 +87,7 @@ class AlphaRenderer:
         """See `Renderer.prepare`. Raises InvalidInput for a model on another device."""
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
+        check_trained_by("alpha", model)
         if model is self._model:
             return
         if isinstance(model, Snapshot):

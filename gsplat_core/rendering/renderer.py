@@ -11,10 +11,11 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.models.model import Model
+from gsplat_core.models.model import Model, TrainedBy
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 
 Precision = Literal["fp32", "fp16"]
 STANDARD_OUTPUTS = RenderOutput._fields
@@ -70,7 +71,7 @@ class Capabilities:
     precisions: Mapping[str, tuple[Precision, ...]]
     """Supported device types (`cpu`, `cuda`) with their precisions, the most exact one first."""
     differentiable: bool
-    """True if the outputs have gradients with respect to the model's tensors."""
+    """True if the renderer trains scenes: its registry entry is a `TrainableRenderer`."""
     deterministic: bool
     """True if equal model, camera and time give bit-identical results on one device."""
     reads_snapshots: bool = False
@@ -152,6 +153,55 @@ class RendererKind(Protocol):
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
     ) -> Renderer:
         """Create a renderer; the caller has checked the arguments against `capabilities`."""
+
+
+class TrainableRenderer(RendererKind, Protocol):
+    """Registry entry of a renderer that trains scenes by autograd."""
+
+    @property
+    def rates(self) -> Mapping[str, float]:
+        """Learning rates of the renderer's tensors in `Gaussians.extra`, and of the logarithms of the scene's values."""
+
+    def extended(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians with the renderer's tensors in `extra`; present ones are unchanged."""
+
+    def first_values(self, distance: float) -> Mapping[str, float]:
+        """Return the renderer's positive values for the whole scene before training.
+
+        Args:
+            distance: typical distance of the scene from the camera, in its unit.
+        """
+
+    def picture(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor | None,
+        values: Mapping[str, Tensor],
+        depth: bool = True,
+    ) -> RenderOutput:
+        """Render a picture that is differentiable in the Gaussians' tensors and in the values [].
+
+        Args:
+            gaussians: scene, `extended`.
+            camera: camera of the picture.
+            background: colour [3]; None for black.
+            values: values of the whole scene by name.
+            depth: False skips the depth, which is then 0 (unknown).
+        """
+
+
+def check_trained_by(name: str, model: Model | Snapshot, shown: str = "alpha") -> None:
+    """Check that the renderer `name` can show a model, which must have been trained by the renderer `shown`.
+
+    Raises:
+        InvalidInput: otherwise.
+    """
+    trained_by = model.trained_by.renderer if isinstance(model, Model) else TrainedBy().renderer
+    if trained_by != shown:
+        raise InvalidInput(
+            f"renderer {name!r} cannot show this model, which was trained by {trained_by!r}; choose renderer {trained_by!r}"
+        )
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from gsplat_core.rendering.renderer import (
     Precision,
     RendererOptions,
     check_camera,
+    check_trained_by,
     checked_outputs,
 )
 from gsplat_core.scene.cameras import Camera
@@ -69,6 +70,7 @@ class SampledRenderer:
         """See `Renderer.prepare`. Raises InvalidInput for a model on another device."""
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
+        check_trained_by(self.name, model)
         self._model = model.as_model()
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:

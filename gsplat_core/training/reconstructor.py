@@ -338,7 +338,8 @@ class Reconstructor:
             gaussians, field = newest_state(step, prior, self._learned_s)
             facts = {**self._facts(), "time_window_s": (self._learned_s, self._last_time_s)}
             return Model(gaussians=gaussians, field=field, **facts)
-        if step is None or self.device.type != "cuda" or step.capabilities.slot is None:
+        in_slots = step is not None and step.is_trained_by_alpha and step.capabilities.slot is not None
+        if step is None or self.device.type != "cuda" or not in_slots:
             return self.snapshot()
         self._version += 1
         with continued(step, prior, self._learned_s):
@@ -353,10 +354,14 @@ class Reconstructor:
     def _facts(self) -> dict[str, Any]:
         """Return the metadata of a model or snapshot."""
         unseen_s = None if self._growth is None else self._growth.unseen_s(self.gaussians)
+        assert self._step is not None
         known = dict(
             training_digest=self._recording_digest, depth_source=self._depth_source, time_window_s=self._time_window_s
         )
-        return dict(version=self._version, camera=self.camera, unseen_s=unseen_s, **known)
+        if self._step.is_trained_by_alpha:
+            return dict(version=self._version, camera=self.camera, unseen_s=unseen_s, **known)
+        by = self._step.trained_by()
+        return dict(version=self._version, camera=self.camera, unseen_s=unseen_s, trained_by=by, **known)
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         """Create the scene from its first frame. Offline, `end_s` is the time of the last frame in seconds."""
@@ -376,7 +381,9 @@ class Reconstructor:
         self._step.frames = lambda: self._window.frames
         if end_s is None:
             self._motion.begin(field)
-        is_captured = self.device.type == "cuda" and field.capabilities.slot is not None
+        is_captured = (
+            self.device.type == "cuda" and field.capabilities.slot is not None and self._step.is_trained_by_alpha
+        )
         self._covering.begin(self.camera if is_captured else None, self.device, self._fixed_rows)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:

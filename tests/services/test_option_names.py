@@ -129,6 +129,7 @@ def test_names_that_are_added_at_run_time_are_accepted_and_documented():
             "alpha",
             "stochastic",
             "points",
+            "weighted_sum",
             "dots",
         ]
     finally:

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.models.snapshots import SnapshotSlots
 from gsplat_core.rendering.alpha import AlphaRenderer
-from gsplat_core.rendering.rasterization import render
+from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
@@ -119,7 +119,13 @@ class Uncovered:
         return gaussians_beside(wanted, frame, depth_mm, observation, config, most)
 
 
-def uncovered_tissue(observation: Observation, current: Gaussians, *, has_depth: bool = False) -> Uncovered | None:
+def uncovered_tissue(
+    observation: Observation,
+    current: Gaussians,
+    *,
+    has_depth: bool = False,
+    picture: Callable[..., RenderOutput] = render,
+) -> Uncovered | None:
     """Find tissue of an observation that the scene does not cover.
 
     The search runs on the observation's device and transfers a single number if there is little.
@@ -128,12 +134,13 @@ def uncovered_tissue(observation: Observation, current: Gaussians, *, has_depth:
         observation: the view.
         current: the scene at the observation's time.
         has_depth: True if the frame has depth, so that the scene's depth is not needed.
+        picture: renderer of the scene.
 
     Returns:
         The uncovered tissue, or None if it is not worth filling.
     """
     with torch.no_grad():
-        output = render(current, observation.camera, depth=not has_depth)
+        output = picture(current, observation.camera, depth=not has_depth)
         uncovered = uncovered_pixels(output.alpha, observation.mask)
         if not are_worth_filling(uncovered):
             return None
@@ -243,7 +250,7 @@ class Covering:
         coverage = self._coverage
         if coverage is not None and not coverage.leaves_much_uncovered(step.gaussians, step.field, observation):
             return
-        found = uncovered_tissue(observation, step.at(observation.time_s), has_depth=has_depth)
+        found = uncovered_tissue(observation, step.at(observation.time_s), has_depth=has_depth, picture=step.picture)
         if found is None:
             return
         make = lambda: found.gaussians(frame(), observation, self._config, most)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
@@ -45,13 +44,13 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
     for one in observations:
         now = step.seen_by(one)
         with torch.no_grad():
-            picture = render(now, one.camera).image
+            picture = step.picture(now, one.camera, depth=False).image
             tissue = (one.mask > 0).to(picture.dtype)
             off = (picture - one.image.to(picture.dtype) / 255).abs().mean(-1) * tissue
         # A uniform grey is not clamped. The gradient of a Gaussian's colour is therefore the sum over pixels of its
         # blending weight times the pixel's weight: tissue mask in the first channel, error in the second.
         grey = torch.zeros_like(now.sh).requires_grad_()
-        picture = render(replace(now, sh=grey), one.camera).image
+        picture = step.picture(replace(now, sh=grey), one.camera, depth=False).image
         weighted = (picture * torch.stack([tissue, off, torch.zeros_like(off)], -1)).sum()
         (gradient,) = torch.autograd.grad(weighted, grey)
         of_constant = gradient[:, 0] / SH_C0

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
@@ -82,7 +81,7 @@ class OutOfView:
             self._looked_from = observation.camera
             if self.has_in_view(observation.camera):
                 with torch.no_grad():
-                    alpha = render(step.at(observation.time_s), observation.camera, depth=False).alpha
+                    alpha = step.picture(step.at(observation.time_s), observation.camera, depth=False).alpha
                 self.bring_back(step, observation, uncovered_pixels(alpha, torch.ones_like(observation.mask)))
 
     def has_in_view(self, camera: Camera) -> bool:

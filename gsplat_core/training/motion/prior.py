@@ -458,5 +458,6 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
         # The field does not change opacities, so the displaced scene shares them with training and
         # they must be copied.
         right = None if now.right_sh is None else now.right_sh.clone()
-        own = replace(now, logit_opacities=now.logit_opacities.clone(), right_sh=right)
+        extra = {name: tensor.clone() for name, tensor in now.extra.items()}
+        own = replace(now, logit_opacities=now.logit_opacities.clone(), right_sh=right, extra=extra)
         return own, NewestState(learned_s, continuation)

@@ -19,6 +19,7 @@ from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Geometry, RenderedSplats, StepOperations, render_splats
+from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.settings import EPS2D, RenderSettings
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
@@ -121,6 +122,53 @@ def loss_and_gradients(
         "sh": v_sh,
     }
     return Compared(loss, gradients, colour_change)
+
+
+class ComparedByAutograd(NamedTuple):
+    """Result of comparing the picture of a differentiable renderer with an observation."""
+
+    loss: Tensor
+    """Loss, [] on the device."""
+    gradients: dict[str, Tensor]
+    """Gradients of the loss by the Gaussians' tensors; tensors without an effect are missing."""
+    values: dict[str, Tensor]
+    """Gradients of the loss by the renderer's values for the scene; those without an effect are missing."""
+
+
+def loss_by_autograd(
+    gaussians: Gaussians,
+    values: Mapping[str, Tensor],
+    observation: Observation,
+    weights: LossWeights,
+    picture: Callable[[Gaussians, Mapping[str, Tensor], bool], RenderOutput],
+    losses: Callable[[Gaussians], Tensor | None],
+) -> ComparedByAutograd:
+    """Compute the loss of a differentiable renderer against an observation and its gradients.
+
+    Args:
+        gaussians: scene at the observation's time.
+        values: values of the renderer for the scene, leaves of the gradient.
+        observation: target.
+        weights: weights of the loss terms.
+        picture: function that renders a scene with values, with or without depth.
+        losses: further losses of the scene; None as its result adds nothing.
+    """
+    use_depth = weights.depth > 0 and observation.depth is not None
+    with torch.enable_grad():
+        scene = gaussians.detach().requires_grad_()
+        leaves = {name: value.detach().requires_grad_() for name, value in values.items()}
+        output = picture(scene, leaves, use_depth)
+        loss = image_loss(
+            output.image, observation.image, observation.mask, output.depth if use_depth else None,
+            observation.depth if use_depth else None, weights.ssim, weights.depth, weights.squared,
+        ).loss  # fmt: skip
+        further = losses(scene)
+        loss = loss if further is None else loss + further
+    tensors = {**scene.tensors(), **{f"value {name}": value for name, value in leaves.items()}}
+    found = torch.autograd.grad(loss, list(tensors.values()), allow_unused=True)
+    gradients = {name: gradient for name, gradient in zip(tensors, found, strict=True) if gradient is not None}
+    of_values = {name: gradients.pop(f"value {name}") for name in leaves if f"value {name}" in gradients}
+    return ComparedByAutograd(loss.detach(), gradients, of_values)
 
 
 def with_losses(compared: Compared, gaussians: Gaussians, losses: Callable[[Gaussians], Tensor | None]) -> Compared:

@@ -5,17 +5,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor
 
+from gsplat_core.choices import RENDERERS
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kinds import FieldRates, FieldTraining
 from gsplat_core.deformation.registry import kind_of
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.models.model import TrainedBy
+from gsplat_core.rendering.rasterization import RenderOutput, render
+from gsplat_core.rendering.renderer import TrainableRenderer
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.gaussians import EXTRA_PREFIX, Gaussians
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.unseen import depth_of
@@ -24,7 +30,16 @@ from gsplat_core.training.losses.registry import WeightedLosses, loss_weights
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam
-from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, loss_and_gradients, with_eye, with_losses
+from gsplat_core.training.steps.photometric import (
+    LEFT,
+    RIGHT,
+    Compared,
+    LossWeights,
+    loss_and_gradients,
+    loss_by_autograd,
+    with_eye,
+    with_losses,
+)
 
 
 class AutogradTraining:
@@ -66,6 +81,51 @@ class AutogradTraining:
         return own
 
 
+class PictureTraining:
+    """Training of a scene by the pictures of a differentiable renderer, with the renderer's values for the scene."""
+
+    def __init__(self, name: str, distance: float, device: torch.device) -> None:
+        """Start with the renderer's first values.
+
+        Args:
+            name: name in `RENDERERS` of a renderer with gradients.
+            distance: typical distance of the scene from the camera.
+            device: device of the scene.
+        """
+        self.name = name
+        self.renderer = cast(TrainableRenderer, RENDERERS[name])
+        self._device = device
+        self.restart(distance)
+
+    def restart(self, distance: float) -> None:
+        """Reset the values for another scene."""
+        first = self.renderer.first_values(distance)
+        self._logs = {name: torch.full((1,), math.log(value), device=self._device) for name, value in first.items()}
+        self._adam = FusedAdam(self._logs, rows=False)
+
+    @property
+    def values(self) -> dict[str, Tensor]:
+        """Current values of the renderer for the scene, [] each."""
+        return {name: log[0].exp() for name, log in self._logs.items()}
+
+    def __call__(
+        self, scene: Gaussians, observation: Observation, weights: LossWeights, losses: Callable[[Gaussians], Tensor | None],
+        rate_scale: float,
+    ) -> Compared:  # fmt: skip
+        """Compare the scene with an observation, and do one Adam step for the renderer's values."""
+        values = self.values
+        compared = loss_by_autograd(
+            scene, values, observation, weights,
+            lambda scene, values, depth: self.renderer.picture(scene, observation.camera, None, values, depth), losses,
+        )  # fmt: skip
+        # The derivative by the logarithm is the value times the derivative by the value.
+        gradients = {name: (gradient * values[name])[None] for name, gradient in compared.values.items()}
+        rates = {name: self.renderer.rates.get(name, 0.0) * rate_scale for name in self._logs}
+        self._adam.step(self._logs, gradients, rates)
+        unused = {name: torch.zeros_like(t) for name, t in scene.tensors().items() if name not in compared.gradients}
+        return Compared(compared.loss, {**compared.gradients, **unused})
+
+
 SETTLE_EVERY = 32
 """Captured steps after which the host synchronises to detect overflowing tile lists; also after the first step."""
 
@@ -100,6 +160,11 @@ class TrainingStep:
         depth_weight = config.depth_weight * self.distance(camera) if config.depth_weight else 0.0
         self._weights = LossWeights(config.ssim_weight, depth_weight, config.squared_error)
         self._losses = WeightedLosses(loss_weights(config.losses))
+        self._pictures: PictureTraining | None = None
+        """Training by another renderer than alpha blending."""
+        if config.renderer != "alpha" and RENDERERS[config.renderer].capabilities.differentiable:
+            self._pictures = PictureTraining(config.renderer, self.distance(camera), gaussians.device)
+        gaussians = self._extended(gaussians)
         self.frames: Callable[[], Sequence[Observation]] = tuple
         """Function that returns the observations available for training, for losses that compare several."""
         self._adam = FusedAdam(gaussians.tensors())
@@ -129,7 +194,7 @@ class TrainingStep:
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         frame_deltas = self.capabilities.frame_deltas
-        captures = gaussians.device.type == "cuda" and not self._losses
+        captures = gaussians.device.type == "cuda" and not self._losses and self._pictures is None
         if captures and kind.captured_training is not None and frame_deltas is not None:
             training = kind.captured_training(field)
             self._rate_values, self._frame_time = training.rate_values, frame_deltas.frame_time
@@ -152,7 +217,7 @@ class TrainingStep:
             for it.
         """
         add_colours = self.capabilities.add_colours
-        relaxation = 0.0 if add_colours is None else colour_relaxation
+        relaxation = 0.0 if add_colours is None or self._pictures is not None else colour_relaxation
         if self._captured is not None:
             self._relaxation = relaxation
             return self._captured_step(self._captured, observation, rate_scale)
@@ -160,10 +225,13 @@ class TrainingStep:
         right_sh = self.gaussians.right_sh
         of_right = observation.of_right and right_sh is not None
         seen = _seen_by(deformed, observation)
-        compared = loss_and_gradients(seen, observation, self._weights, relaxation)
-        if self._losses:
-            context = LossContext(self.frames(), self.at)
-            compared = with_losses(compared, seen, lambda scene: self._losses(scene, observation, context))
+        losses = lambda scene: self._losses(scene, observation, LossContext(self.frames(), self.at))
+        if self._pictures is not None:
+            compared = self._pictures(seen, observation, self._weights, losses, rate_scale)
+        else:
+            compared = loss_and_gradients(seen, observation, self._weights, relaxation)
+            if self._losses:
+                compared = with_losses(compared, seen, losses)
         gradients = compared.gradients if right_sh is None else with_eye(compared.gradients, of_right)
         own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         if right_sh is not None:
@@ -257,6 +325,7 @@ class TrainingStep:
 
     def append(self, added: Gaussians, parents: Tensor | None = None) -> None:
         """Add Gaussians that are static, or move like those at `parents` (int64 indices)."""
+        added = self._extended(added)
         if self._rows is not None:
             self._rows.append(added)
             self.gaussians = self._rows.used
@@ -300,6 +369,7 @@ class TrainingStep:
         nothing changed, if that is impossible.
         """
         count, fixed = gaussians.count, self.capabilities.fixed_rows
+        gaussians = self._extended(gaussians)
         if gaussians.tensors().keys() != self.gaussians.tensors().keys():
             return False
         if self._rows is None or fixed is None or count > self._rows.capacity:
@@ -310,8 +380,30 @@ class TrainingStep:
         self._adam.restart(count)
         if self._captured is not None:
             self._captured.restart()
+        if self._pictures is not None:
+            self._pictures.restart(mm_per_px(gaussians, camera) * float(camera.K[0, 0]))
         self._mm_per_px, self._scaled_for = mm_per_px(gaussians, camera), None
         return True
+
+    @property
+    def is_trained_by_alpha(self) -> bool:
+        """True if alpha blending trains the scene."""
+        return self._pictures is None
+
+    def trained_by(self) -> TrainedBy:
+        """Return the renderer that trains the scene, with its present values. Synchronises unless that is alpha blending."""
+        if self._pictures is None:
+            return TrainedBy()
+        return TrainedBy(self._pictures.name, {name: float(value) for name, value in self._pictures.values.items()})
+
+    def picture(self, scene: Gaussians, camera: Camera, depth: bool = True) -> RenderOutput:
+        """Render the scene at one time by the renderer that trains it, differentiable in the scene's tensors."""
+        if self._pictures is None:
+            return render(scene, camera, depth=depth)
+        return self._pictures.renderer.picture(scene, camera, None, self._pictures.values, depth)
+
+    def _extended(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians if self._pictures is None else self._pictures.renderer.extended(gaussians)
 
     @property
     def fixed_rows(self) -> Gaussians | None:
@@ -348,7 +440,13 @@ class TrainingStep:
             "logit_opacities": rates.logit_opacities * rate_scale,
             LEFT: rates.sh * rate_scale,
             **right,
+            **{EXTRA_PREFIX + name: self._extra_rate(name) * rate_scale for name in self.gaussians.extra},
         }
+
+    def _extra_rate(self, name: str) -> float:
+        """Return the learning rate of a tensor in `Gaussians.extra`: of the renderer, else that of colours."""
+        own = {} if self._pictures is None else self._pictures.renderer.rates
+        return own.get(name, self._rates.sh)
 
 
 def _seen_by(scene: Gaussians, observation: Observation) -> Gaussians:

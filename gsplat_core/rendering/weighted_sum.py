@@ -1,0 +1,201 @@
+"""Renderer that sums splats with weights instead of sorting them (Hou et al. 2024, "Sort-free Gaussian Splatting via
+Weighted Sum Rendering").
+
+A pixel is C = (w_B c_B + Σ a_i ω_i c_i) / (w_B + Σ a_i ω_i). a_i is the splat's opacity times its Gaussian, ω_i a weight
+that decreases with the distance d_i, and w_B the weight of the background. The opacity is a function of the viewing
+direction, a sum of spherical harmonics that is not limited to 0..1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.models.model import Model
+from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.ops.projection.arguments import DenseProjection
+from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.ops.tiles.grid import TileGrid
+from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.weighted_sum.weighted_sum import weighted_sums
+from gsplat_core.rendering.rasterization import RenderOutput
+from gsplat_core.rendering.renderer import (
+    STANDARD_OUTPUTS,
+    Capabilities,
+    FinishedFrame,
+    PendingFrame,
+    Precision,
+    check_camera,
+    check_trained_by,
+    checked_outputs,
+)
+from gsplat_core.rendering.settings import EPS2D, TILE_SIZE
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
+
+OPACITY, FACTOR = "opacity_sh", "distance_factor"
+"""Names of the renderer's tensors in `Gaussians.extra`: harmonics of the opacity [N, 16], and v_i [N]."""
+OPACITY_DEGREE = 3
+OPACITY_BASES = (OPACITY_DEGREE + 1) ** 2
+LEAST_TOTAL = 1e-2
+"""Lower limit of the sum of all weights at a pixel. Opacities may be negative, and so may their sum."""
+LEAST_SHARE = 1e-4
+"""Smallest sum of the splats' weights at a pixel with a depth."""
+
+
+class WeightedSumRenderer:
+    """Renderer with the weights ω = v_i max(0, 1 - d/σ), the best of the three in the paper. Learned: σ and w_B for the
+    scene, v_i and the harmonics of the opacity for each Gaussian.
+
+    The picture is independent of the order of the Gaussians, so nothing pops when the camera turns. The Gaussians'
+    `logit_opacities` are not used.
+    """
+
+    name: ClassVar[str] = "weighted_sum"
+    capabilities = Capabilities(
+        outputs=STANDARD_OUTPUTS,
+        precisions={"cpu": ("fp32",), "cuda": ("fp32",)},
+        differentiable=True,
+        deterministic=True,
+    )
+    rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, FACTOR: 1e-2, "sigma": 5e-3, "background": 1e-2}
+    """Learning rates of the tensors in `Gaussians.extra`, and of the logarithms of the scene's values; 0 for others."""
+
+    def __init__(
+        self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
+    ) -> None:
+        self._camera, self._device, self._background = camera, torch.device(device), background
+        self._model: Model | None = None
+        self._values: dict[str, Tensor] = {}
+
+    def prepare(self, model: Model | Snapshot) -> None:
+        """See `Renderer.prepare`. Raises InvalidInput for a model on another device or of another renderer."""
+        if model.device.type != self._device.type:
+            raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
+        check_trained_by(self.name, model, self.name)
+        if model is self._model:
+            return
+        self._model = model = model.as_model()
+        self._values = {
+            name: torch.full((), value, device=model.device) for name, value in model.trained_by.values.items()
+        }
+
+    def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
+        """See `Renderer.render`."""
+        asked = checked_outputs(self.name, outputs, self.capabilities)
+        check_camera(self._camera, camera)
+        if self._model is None:
+            raise InvalidInput("no model was prepared; call prepare(model) before render()")
+        with torch.no_grad():
+            output = self.picture(
+                self._model.at(time_s), camera, self._background, self._values, depth="depth" in asked
+            )
+        return FinishedFrame({name: tensor for name, tensor in output._asdict().items() if name in asked})
+
+    @classmethod
+    def extended(cls, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians with the renderer's tensors; missing ones start with the present opacity and v_i = 1."""
+        extra = dict(gaussians.extra)
+        if OPACITY not in extra:
+            extra[OPACITY] = gaussians.means.new_zeros(gaussians.count, OPACITY_BASES)
+            extra[OPACITY][:, 0] = gaussians.opacities.detach() / SH_C0
+        if FACTOR not in extra:
+            extra[FACTOR] = gaussians.means.new_ones(gaussians.count)
+        return replace(gaussians, extra=extra)
+
+    @classmethod
+    def first_values(cls, distance: float) -> dict[str, float]:
+        """Return the scene's values before training, all positive.
+
+        Args:
+            distance: typical distance of the scene from the camera, in its unit.
+        """
+        return {"sigma": 2 * distance, "background": 0.1, "distance": distance}
+
+    @classmethod
+    def weights(cls, depths: Tensor, gaussians: Gaussians, values: Mapping[str, Tensor]) -> Tensor:
+        """Return ω [N] of the Gaussians at the camera depths [N]."""
+        return (1 - depths / values["sigma"]).clamp(min=0) * gaussians.extra[FACTOR]
+
+    @classmethod
+    def picture(
+        cls,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor | None,
+        values: Mapping[str, Tensor],
+        depth: bool = True,
+    ) -> RenderOutput:
+        """See `TrainableRenderer.picture`."""
+        viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device, gaussians.dtype))
+        position = torch.as_tensor(camera.position, dtype=gaussians.dtype).to(gaussians.device, non_blocking=True)
+        directions = gaussians.means - position
+        # The op evaluates three channels; two of them are unused.
+        harmonics = gaussians.extra[OPACITY][..., None].expand(-1, -1, 3)
+        opacities = spherical_harmonics(OPACITY_DEGREE, directions, harmonics)[:, 0]
+        reach = opacities.detach().abs().clamp(max=1)
+        size = camera.width_px, camera.height_px
+        rows = fully_fused_projection(
+            gaussians.means, None, gaussians.quats, gaussians.scales, viewmat, intrinsics, *size,
+            eps2d=EPS2D, camera_model=camera.model, opacities=reach,
+        )  # fmt: skip
+        assert isinstance(rows, DenseProjection)
+        grid = TileGrid(TILE_SIZE, *(-(-side // TILE_SIZE) for side in size))
+        # The lists are ordered by depth, as for alpha blending; the sums do not depend on the order.
+        _, ids, offsets = bin_splats(
+            rows.means2d, rows.radii, rows.depths, grid, conics=rows.conics, opacities=reach[None]
+        )
+        channels = (spherical_harmonics(gaussians.sh_degree, directions, gaussians.sh) + 0.5).clamp(min=0)
+        if depth:
+            channels = torch.cat([channels, (rows.depths[0] / values["distance"])[:, None]], 1)
+        weights = cls.weights(rows.depths[0], gaussians, values)
+        sums = weighted_sums(rows.means2d[0], rows.conics[0], channels, opacities, weights, *size, offsets[0], ids)
+        behind = values["background"]
+        total = (sums[-1] + behind).clamp(min=LEAST_TOTAL)
+        image = sums[:3] if background is None else sums[:3] + (behind * background)[:, None, None]
+        alpha = 1 - (behind / total).clamp(max=1)
+        z = torch.zeros_like(alpha)
+        if depth:
+            known = sums[-1] > LEAST_SHARE
+            z = torch.where(known, sums[3] / torch.where(known, sums[-1], 1.0), 0.0) * values["distance"]
+        return RenderOutput((image / total).permute(1, 2, 0).contiguous(), alpha, z)
+
+
+class DirectWeightedSumRenderer(WeightedSumRenderer):
+    """Variant with ω = 1."""
+
+    name: ClassVar[str] = "weighted_sum_direct"
+    rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, "background": 1e-2}
+
+    @classmethod
+    def first_values(cls, distance: float) -> dict[str, float]:
+        """See `WeightedSumRenderer.first_values`."""
+        return {"background": 0.1, "distance": distance}
+
+    @classmethod
+    def weights(cls, depths: Tensor, gaussians: Gaussians, values: Mapping[str, Tensor]) -> Tensor:
+        """See `WeightedSumRenderer.weights`."""
+        return torch.ones_like(depths)
+
+
+class ExpWeightedSumRenderer(WeightedSumRenderer):
+    """Variant with ω = exp(-σ (d/D)^β), D the distance at the start, σ and β learned for the scene."""
+
+    name: ClassVar[str] = "weighted_sum_exp"
+    rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, "sigma": 5e-3, "beta": 5e-3, "background": 1e-2}
+
+    @classmethod
+    def first_values(cls, distance: float) -> dict[str, float]:
+        """See `WeightedSumRenderer.first_values`."""
+        return {**super().first_values(distance), "sigma": 1.0, "beta": 1.0}
+
+    @classmethod
+    def weights(cls, depths: Tensor, gaussians: Gaussians, values: Mapping[str, Tensor]) -> Tensor:
+        """See `WeightedSumRenderer.weights`."""
+        return torch.exp(-values["sigma"] * (depths.clamp(min=0) / values["distance"] + 1e-12) ** values["beta"])
