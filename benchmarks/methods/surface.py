@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import statistics
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -122,6 +123,7 @@ def stereo(device: str, full: bool, choices: dict[str, tuple[str, ...]], seeds: 
                 for key, value in _accuracy(whole, load_bundle(run / "model").to(device), device).items():
                     means.setdefault(f"stereo: {name}, {key}", []).append(value)
                 means.setdefault(f"stereo: {name}, training s", []).append(seconds)
+                print({key: round(values[-1], 3) for key, values in means.items()}, file=sys.stderr, flush=True)
     return figures | {name: round(statistics.mean(values), 3) for name, values in means.items()}
 
 

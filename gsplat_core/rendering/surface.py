@@ -114,37 +114,41 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     if camera.model == "fisheye" or min(height, width) < 3:
         return depth.new_zeros(height, width, 3)
     K = camera.K
-    x = ((torch.arange(width, device=depth.device, dtype=depth.dtype) + 0.5 - K[0, 2]) / K[0, 0]).expand(height, -1)
-    y = ((torch.arange(height, device=depth.device, dtype=depth.dtype) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
-    y = y.expand(-1, width)
-    if camera.model == "ortho":
-        points = torch.stack([x, y, depth], -1)
-    else:
-        points = depth[..., None] * torch.stack([x, y, torch.ones_like(x)], -1)
-    right, right_known = _central_differences(points, depth, 1)
-    down, down_known = _central_differences(points, depth, 0)
-    normals = torch.linalg.cross(down, right)
+    across, right, right_known = _central_differences(depth, 1)
+    down, below, down_known = _central_differences(depth, 0)
     known = right_known & down_known
-    length = torch.where(known, (normals * normals).sum(-1), 1).clamp(min=1e-30).sqrt()
-    return torch.where(known[..., None], normals / length[..., None], 0)
+    if camera.model == "ortho":
+        p, q, toward = K[0, 0] * across, K[1, 1] * down, torch.ones_like(depth)
+    else:
+        # The cross product of the derivatives of depth * (x, y, 1), divided by a positive number.
+        x = (torch.arange(width, device=depth.device, dtype=depth.dtype) + 0.5 - K[0, 2]) / K[0, 0]
+        y = (torch.arange(height, device=depth.device, dtype=depth.dtype) + 0.5 - K[1, 2])[:, None] / K[1, 1]
+        one = torch.ones_like(depth)
+        p = K[0, 0] * across / torch.where(known, right, one)
+        q = K[1, 1] * down / torch.where(known, below, one)
+        toward = 1 + x * p + y * q
+    scale = torch.where(known, torch.rsqrt(p * p + q * q + toward * toward), 0)
+    return torch.stack([p * scale, q * scale, -toward * scale], -1)
 
 
-def _central_differences(points: Tensor, depth: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """Return derivatives [H, W, 3] along an axis from steps of 1 and 2 px, and the mask [H, W] where they are known."""
-    differences, masks = [], []
+def _central_differences(depth: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return derivative per pixel and mean [H, W] along an axis from steps of 1 and 2 px, and the mask where they are known."""
+    length = depth.shape[axis]
+    index = torch.arange(length, device=depth.device)
+    index = index[:, None] if axis == 0 else index
+    slopes, means, masks = [], [], []
     for step in (1, 2):
-        ahead, behind = (torch.roll(points, -way * step, axis) for way in (1, -1))
-        known = depth > 0
-        for way in (1, -1):
-            other = torch.roll(depth, -way * step, axis)
-            known = known & (other > 0) & ((other - depth).abs() <= LARGEST_JUMP * depth)
-        index = torch.arange(depth.shape[axis], device=depth.device)
-        inner = (index >= step) & (index < depth.shape[axis] - step)
-        known = known & (inner[:, None] if axis == 0 else inner)
-        differences.append((ahead - behind) / (2 * step))
+        ahead, behind = (torch.roll(depth, -way * step, axis) for way in (1, -1))
+        with torch.no_grad():
+            most = LARGEST_JUMP * depth
+            known = (torch.minimum(ahead, behind) > 0) & ((ahead - depth).abs() <= most)
+            known &= ((behind - depth).abs() <= most) & (index >= step) & (index < length - step)
+        slopes.append((ahead - behind) / (2 * step))
+        means.append(0.5 * (ahead + behind))
         masks.append(known)
-    mean = torch.where(masks[1][..., None], 0.5 * (differences[0] + differences[1]), differences[0])
-    return mean, masks[0]
+    both = masks[0] & masks[1]
+    slope, mean = (torch.where(both, 0.5 * (one + two), one) for one, two in (slopes, means))
+    return slope, mean, masks[0]
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.rendered_rays import rays_of
+from gsplat_core.training.losses.rendered_rays import EVERY, Turns, rays_of
 from gsplat_core.training.observations import Observation
 
 
@@ -18,15 +18,18 @@ class RayDepth:
 
     `depth` compares the depths of the Gaussians' centres. On tilted tissue the centres in front hide those behind, so
     they are biased towards the camera, and the fit compensates. The depth along the ray has no such bias and moves the
-    rotations and scales, too.
+    rotations and scales, too. Evaluated in one of `EVERY` steps.
     """
 
     name: ClassVar[str] = "ray_depth"
     default_weight: ClassVar[float] = 0.1
 
+    def __init__(self) -> None:
+        self._turns = Turns()
+
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
         """See `Loss`."""
-        if observation.depth is None:
+        if not self._turns.is_due() or observation.depth is None:
             return None
         rays = rays_of(scene, observation, context)
         wanted = rays.sampled(observation.depth)
@@ -34,4 +37,4 @@ class RayDepth:
         one = torch.ones((), device=wanted.device)
         inverse = torch.where(known, 1 / torch.where(known, wanted, one), 0)
         off = torch.where(known, 1 / torch.where(known, rays.depths, one), 0) - inverse
-        return off.abs().sum() / inverse.sum().clamp(min=1e-12)
+        return EVERY * off.abs().sum() / inverse.sum().clamp(min=1e-12)

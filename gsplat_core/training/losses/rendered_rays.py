@@ -10,8 +10,26 @@ from gsplat_core.rendering.surface import COVERED, SEMANTICS, render_rays
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.motion.image_motion import SMALL_PIXELS
 from gsplat_core.training.observations import Observation
+
+SMALL_PIXELS = 24_000
+"""Number of pixels up to which pictures are compared at full size."""
+
+
+EVERY = 4
+"""Number of steps of which one renders rays; its loss has this factor. All losses of rays use the same steps."""
+
+
+class Turns:
+    """Counter of a loss's evaluations."""
+
+    def __init__(self) -> None:
+        self._calls = 0
+
+    def is_due(self) -> bool:
+        """Return True in one of `EVERY` calls, from the first on."""
+        self._calls += 1
+        return (self._calls - 1) % EVERY == 0
 
 
 class RenderedRays(NamedTuple):
