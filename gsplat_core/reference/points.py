@@ -5,6 +5,8 @@ The number of points of a splat in a pixel is Poisson distributed with the integ
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -32,18 +34,27 @@ def dilogarithm(x: Tensor) -> Tensor:
     )
 
 
-def point_alphas(splats: ProjectedSplats, centres: Tensor, supersampling: int) -> Tensor:
+def point_alphas(splats: ProjectedSplats, centres: Tensor, supersampling: int, quadrature: int = QUADRATURE) -> Tensor:
     """Return the probability that each splat has a point in each sub-pixel, [M, P]."""
     limited = splats._replace(opacities=splats.opacities.clamp_max(ALPHA_MAX))
-    offsets = (torch.arange(QUADRATURE, device=centres.device, dtype=centres.dtype) + 0.5) / QUADRATURE - 0.5
+    offsets = (torch.arange(quadrature, device=centres.device, dtype=centres.dtype) + 0.5) / quadrature - 0.5
     rate = torch.zeros((), device=centres.device, dtype=centres.dtype)
     for x in offsets.tolist():
         for y in offsets.tolist():
             places = centres + torch.tensor([x, y], device=centres.device, dtype=centres.dtype) / supersampling
             rate = rate - torch.log1p(-densities(limited, places))
-    return -torch.expm1(-rate / QUADRATURE**2)
+    return -torch.expm1(-rate / quadrature**2)
 
 
-def point_moments(gaussians: Gaussians, camera: Camera, supersampling: int = 1) -> SampleMoments:
-    """Return mean and variance of one sample of point splatting, over a black background."""
-    return sample_moments(gaussians, camera, supersampling, point_alphas)
+def point_moments(
+    gaussians: Gaussians, camera: Camera, supersampling: int = 1, quadrature: int = QUADRATURE
+) -> SampleMoments:
+    """Return mean and variance of one sample of point splatting, over a black background.
+
+    Args:
+        gaussians: scene.
+        camera: camera of the picture.
+        supersampling: sub-pixels per pixel and axis.
+        quadrature: points per axis of a sub-pixel at which the rate is evaluated.
+    """
+    return sample_moments(gaussians, camera, supersampling, partial(point_alphas, quadrature=quadrature))

@@ -132,3 +132,31 @@ def _rotation_words(quats: Tensor) -> Tensor:
 
 def _as_int32(words: Tensor) -> Tensor:
     return torch.where(words >= 1 << 31, words - (1 << 32), words).to(torch.int32)
+
+
+def dequantised(scene: SplatScene) -> Gaussians:
+    """Return the Gaussians that the kernels decode from quantised splats, in the scene's order."""
+    assert scene.packed is not None and scene.chunks is not None
+    words = scene.packed.long() & 0xFFFFFFFF
+    ranges = scene.chunks[torch.arange(len(words), device=words.device) // CHUNK]
+    field = lambda word, shift, bits: (words[:, word] >> shift) & ((1 << bits) - 1)
+    scaled = lambda offset, *steps: (
+        ranges[:, offset : offset + 3] + ranges[:, offset + 3 : offset + 6] * torch.stack(steps, -1)
+    )
+    means = scaled(0, field(0, 0, 16), field(0, 16, 16), field(1, 0, 16))
+    log_scales = scaled(6, field(1, 16, 8), field(1, 24, 8), field(3, 0, 8))
+    colour = scaled(12, field(3, 16, 5), field(3, 21, 6), field(3, 27, 5))
+    others = (torch.stack([field(2, 2 + 10 * k, 10) for k in range(3)], -1) * (2 / 1022) - 1) * 0.5**0.5
+    most = (1 - others.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()
+    largest = field(2, 0, 2)[:, None]
+    places = torch.arange(4, device=words.device).expand(len(words), 4)
+    quats = torch.empty(len(words), 4, device=words.device).scatter_(1, largest, most)
+    quats.scatter_(1, places[places != largest].view(-1, 3), others)
+    sh = colour[:, None]
+    if scene.packed_sh is not None:
+        bands = [0] * 3 + [1] * 5 + [2] * 7 + [3] * 9
+        band = torch.tensor(bands[: scene.packed_sh.shape[1]], device=words.device)
+        rest = ranges[:, 18 + 2 * band, None] + ranges[:, 19 + 2 * band, None] * scene.packed_sh
+        sh = torch.cat([sh, rest], 1)
+    logits = torch.logit(field(3, 8, 8) / 255, eps=1e-6)
+    return Gaussians(means, quats, log_scales, logits, sh)

@@ -11,7 +11,7 @@ import torch
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.models.model import Model
 from gsplat_core.ops.stochastic.stochastic import new_sums, picture_of, sample_splats
-from gsplat_core.rendering.prepared import morton_codes, prepared_splats, quantised_splats, raw_splats
+from gsplat_core.rendering.prepared import dequantised, morton_codes, prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.rendering.renderer import RendererOptions
 from gsplat_core.scene.cameras import Camera
@@ -120,6 +120,13 @@ def test_quantised_splats_give_nearly_the_same_picture(degree):
     assert scene.packed.element_size() * scene.packed.shape[1] == 16
     # The random numbers are the same, so the difference is that of the values.
     assert psnr(picture(scene), picture(raw_splats(gaussians))) > 38
+
+
+@pytest.mark.parametrize("degree", [0, 3, 4])
+def test_the_kernels_decode_what_python_decodes(degree):
+    scene = quantised_splats(random_scene(6000, smallest=0.02, largest=0.1, degree=degree))
+    decoded = raw_splats(dequantised(scene))._replace(file_index=scene.file_index)
+    assert psnr(picture(scene, 4), picture(decoded, 4)) > 45
 
 
 def test_quantised_values_are_near_the_original():
