@@ -161,9 +161,9 @@ def _misfits_at_the_end(
         yield f"{kept.seq - last.seq} entries were cut off the end{cut}"
     elif kept.seq >= 0 and digests.get(kept.digest) != kept.seq:
         yield f"entry {kept.seq} is not the one that was written"
-    elif last.seq > kept.seq + 1:  # a crash leaves the head one entry behind; a running service moves the head on
-        now = read_head(path)
-        if now is None or last.seq > now.seq + 1:
+    else:
+        newest = read_head(path) or kept  # a running service has moved the head
+        if last.seq > newest.seq + 1:  # a crash leaves the head one entry behind
             yield (
                 f"{last.seq - kept.seq} entries follow the newest one that the service confirmed: it was stopped before it could, or they were"
                 " added by something else; its next start checks their chain, and an entry tells of them"

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from services.audit import AuditError, AuditLog, AuditUnwritable, verify
-from services.audit.files import Entry, digest_of_entry, head_path, parse_line
+from services.audit.files import Entry, digest_of_entry, head_path, parse_line, read_anchor
 
 ENTRIES = 12
 
@@ -80,7 +80,7 @@ def test_a_removed_line_is_found(path, line):
 @pytest.mark.parametrize("count", [1, 3, ENTRIES])
 def test_lines_cut_off_the_end_are_found(path, count):
     path.write_bytes(b"".join(lines(path)[:-count]))
-    assert f"{count} entries were cut off" in verify(path).findings[0].what
+    assert verify(path).findings[0].what == f"{count} entries were cut off the end"
 
 
 @pytest.mark.parametrize("place", [0, 4, ENTRIES])
@@ -125,6 +125,7 @@ def test_a_finished_line_that_was_cut_is_no_crash(path):
     path.write_bytes(path.read_bytes()[:-20])
     verdict = verify(path)
     assert not verdict.intact and not verdict.cut_by_a_crash
+    assert verdict.findings[0].what == "1 entries were cut off the end, the last one in the middle"
 
 
 def test_a_crash_between_the_line_and_its_head(path):
@@ -138,6 +139,70 @@ def test_a_crash_between_the_line_and_its_head(path):
     log.append("model.rollback", actor="console")
     log.close()
     assert verify(path).intact and verify(path).entries == ENTRIES + 2
+
+
+@pytest.mark.parametrize("entries", [1, 2, 3])
+def test_entries_after_the_head_are_those_of_a_crash_only_if_there_is_one(path, entries):
+    head = head_path(path).read_bytes()
+    log = AuditLog(path)
+    for _ in range(entries):
+        log.append("model.rollback", actor="console")
+    log.close()
+    head_path(path).write_bytes(head)
+    findings = verify(path).findings
+    assert len(findings) == (entries > 1)
+    if findings:
+        assert findings[0].line == ENTRIES + entries + 1
+        assert findings[0].what.startswith(f"{entries} entries follow the newest one that the service confirmed")
+
+
+def test_entries_that_are_written_during_the_verification_are_no_finding(path, monkeypatch):
+    log = AuditLog(path)
+
+    def read_anchor_late(of):
+        anchor = read_anchor(of)
+        for _ in range(3):
+            log.append("model.rollback", actor="console")
+        return anchor
+
+    monkeypatch.setattr(sys.modules["services.audit.verify"], "read_anchor", read_anchor_late)
+    verdict = verify(path)
+    log.close()
+    assert verdict.intact and verdict.entries == ENTRIES + 3
+
+
+def test_findings_name_the_entry_and_how_many_are_missing(path):
+    all_lines = lines(path)
+    path.write_bytes(b"".join([*all_lines[:3], *all_lines[6:], all_lines[4]]))
+    findings = verify(path).findings
+    assert [(each.line, each.what) for each in findings[:2]] == [
+        (4, "3 entries are missing before entry 6"),
+        (10, f"entry 4 stands after entry {ENTRIES - 1}: it was inserted, repeated or moved"),
+    ]
+    expected = [each.what for each in verify(path, 64 * "a").findings if "was expected" in each.what]
+    assert expected == [f"no entry has the digest {64 * 'a'}, which was expected"], "no entry was removed"
+
+
+@pytest.mark.parametrize("count", [99, 100, 101])
+def test_findings_are_bounded(tmp_path, count):
+    path = tmp_path / "audit.jsonl"
+    path.write_bytes(count * b"{}\n")
+    assert len(verify(path).findings) == min(count, 100)
+
+
+def test_an_empty_log_is_intact_without_a_head(tmp_path):
+    path = tmp_path / "audit.jsonl"
+    AuditLog(path).close()
+    assert verify(path).intact and verify(path).head.seq == -1
+    log = AuditLog(path)
+    log.append("x", actor="a")
+    log.close()
+    head = head_path(path).read_bytes()
+    head_path(path).unlink()
+    assert verify(path).intact, "a crash before the first head was written"
+    head_path(path).write_bytes(head)
+    path.write_bytes(replace(parse_line(path.read_bytes())[0], actor="b").line())
+    assert [each.what for each in verify(path).findings] == ["entry 0 is not the one that was written"]
 
 
 def test_a_lost_head_is_found(path):
