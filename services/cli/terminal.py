@@ -272,7 +272,6 @@ class InterruptRequest:
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
-        self._before.clear()
         signal.set_wakeup_fd(self._wakeup_before)
         os.close(self._sender)
 

@@ -1,0 +1,141 @@
+"""Tables and messages on the terminal, and the end of a run that does not react to the second signal."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from services.cli.terminal import MOST_WORD, WIDEST, sentence, size, table
+
+
+def test_the_first_column_stays_without_values_and_the_others_go():
+    columns = {"id": "ID", "empty": "EMPTY", "name": "NAME"}
+    assert table(columns, [{"name": "a"}, {"empty": None, "name": "bc"}]) == ["ID  NAME", "    a", "    bc"]
+    assert table(columns, [{"id": "x", "empty": ""}]) == ["ID", "x"]
+    assert table(columns, [{"id": "x", "empty": "y"}]) == ["ID  EMPTY", "x   y"]
+
+
+@pytest.mark.parametrize(("length", "shown"), [(WIDEST, WIDEST * "a"), (WIDEST + 1, (WIDEST - 1) * "a" + "…")])
+def test_long_cells_are_cut_except_in_the_last_column(length, shown):
+    assert table({"a": "A", "b": "B"}, [{"a": length * "a", "b": 200 * "b"}])[1] == f"{shown}  {200 * 'b'}"
+
+
+def test_cells_by_kind_of_value(monkeypatch):
+    monkeypatch.setenv("TZ", "UTC")
+    time.tzset()
+    cells = {
+        "at": ("2026-01-02T03:04:05+00:00", "2026-01-02 03:04:05 +0000"),
+        "created_at": ("2026-01-02T03:04:05.678+01:00", "2026-01-02 02:04:05 +0000"),
+        "changed_at": ("yesterday\n", "yesterday\\n"),
+        "used_bytes": (1536, "1.5 KiB"),
+        "free_bytes": ("unknown", "unknown"),
+        "is_live": (True, "yes"),
+        "is_late": (False, "no"),
+        "psnr_db": (31.26, "31.3"),
+        "error": (float("nan"), ""),
+        "options": ({"a": 1, "b": "x"}, "a 1, b x"),
+        "names": (["a", "b"], "a, b"),
+        "last_used_at": (None, "never"),
+        "streams": (None, "all"),
+        "reason": ("no\x1b[2J frame", "no\\x1b[2J frame"),
+    }
+    for field, (value, text) in cells.items():
+        # The row with a text keeps the column where the tested cell is empty.
+        assert table({"x": "X", field: "H"}, [{field: value}, {field: "text"}])[1].strip() == text, field
+    monkeypatch.undo()
+    time.tzset()
+
+
+def test_a_nested_field_of_something_else_is_empty():
+    assert table({"a": "A", "b.c.d": "D"}, [{"a": 1, "b": {"c": {"d": 2}}}, {"a": 1, "b": {"c": 3}}]) == [
+        "A  D", "1  2", "1",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (0, "0 B"), (1023, "1023 B"), (1024, "1.0 KiB"), (2**20 - 2**10, "1023.0 KiB"), (2**20, "1.0 MiB"),
+        (1.5 * 2**30, "1.5 GiB"), (2**41, "2048.0 GiB"),
+    ],
+)  # fmt: skip
+def test_sizes_are_in_binary_units(count, text):
+    assert size(count) == text
+
+
+def test_a_long_word_is_shortened_in_the_middle():
+    longest = MOST_WORD * "a"
+    assert sentence(f"cannot read {longest} ; free space") == f"cannot read {longest} ; free space"
+    assert sentence(f"cannot read /{longest}/end; free space") == (
+        f"cannot read /{159 * 'a'}...{55 * 'a'}/end; free space"
+    )
+
+
+PROGRAM = """
+import os, signal, sys, threading, time
+from services.cli import terminal
+
+class Files:
+    @staticmethod
+    def remove_unfinished():
+        os.write(1, b"removed\\n")
+
+sys.modules["gsplat_core.io.files"] = Files
+terminal.GRACE_S = float(sys.argv[1])
+signal.signal(signal.SIGUSR1, lambda number, frame: None)
+threads = []
+
+def joined(name):
+    for thread in [*threads, *threading.enumerate()]:
+        if thread.name == name:
+            thread.join(8)
+            if thread.is_alive():
+                os.write(1, f"{name} goes on\\n".encode())
+
+code = 0
+try:
+    with terminal.InterruptRequest():
+        threads = threading.enumerate()
+        try:
+            for number in sys.argv[2:]:
+                os.kill(os.getpid(), getattr(signal, number))
+        except KeyboardInterrupt:
+            if terminal.GRACE_S == 0:
+                time.sleep(8)
+            raise
+except KeyboardInterrupt:
+    code = 5
+joined("signals")
+joined("end")
+sys.exit(code)
+"""
+
+
+def interrupted(grace_s: float, *signals: str) -> tuple[int, str, str]:
+    """Return exit code, output and errors of a program that sends itself signals."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(grace_s), *signals],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_a_run_that_unwinds_in_time_ends_by_itself():
+    code, out, err = interrupted(30, "SIGINT", "SIGINT")
+    assert (code, out) == (5, "")
+    assert err.startswith("interrupted: finishing the frame") and "Traceback" not in err
+
+
+def test_repeated_hangups_are_one_request_and_other_signals_none():
+    code, out, err = interrupted(30, "SIGUSR1", "SIGHUP", "SIGUSR1", "SIGHUP", "SIGHUP")
+    assert (code, out) == (0, "") and err.count("interrupted") == 1
+    assert interrupted(30, "SIGUSR1") == (0, "", "")
+
+
+def test_a_run_that_does_not_unwind_is_ended_without_its_unfinished_files():
+    code, out, err = interrupted(0, "SIGTERM", "SIGINT")
+    assert (code, out) == (130, "removed\n")
+    assert err.count("interrupted") == 2 and "interrupted again: ending at once" in err
