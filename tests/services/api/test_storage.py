@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import shutil
@@ -70,10 +71,40 @@ def test_little_free_space_is_degraded(plane, monkeypatch, free, status):
     ready = plane.client.get("/readyz?verbose").json()
     assert ready["status"] == status and f"data: {free // 2**20} MiB free" in ready["checks"]["disk"]["detail"]
     families = text_string_to_metric_families(plane.ask("GET", "/metrics").text)
-    samples = next(family.samples for family in families if family.name == "intrasplat_disk_free_bytes")
-    assert {sample.labels["folder"]: sample.value for sample in samples} == {
-        folder: free for folder in ("data", "recordings", "replays")
-    }
+    samples = {family.name: family.samples for family in families}
+    for name, value in (("intrasplat_disk_free_bytes", free), ("intrasplat_disk_bytes", 10 * state.SPARE_BYTES)):
+        assert {sample.labels["folder"]: sample.value for sample in samples[name]} == {
+            folder: value for folder in ("data", "recordings", "replays")
+        }
+
+
+def test_one_full_or_unreadable_disk_among_others_is_degraded(tmp_path, monkeypatch):
+    """The order of the folders does not matter."""
+    audit = AuditLog(tmp_path / AUDIT_FILE)
+    audit.close()
+    free = {tmp_path / "a": 5 * state.SPARE_BYTES, tmp_path / "b": 2**20, tmp_path / "c": 5 * state.SPARE_BYTES}
+    for folder in free:
+        folder.mkdir()
+
+    def usage(folder):
+        if folder in broken:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return Usage(10 * state.SPARE_BYTES, 0, free[folder])
+
+    def disk(*names):
+        check = asyncio.run(state.Storage({name: tmp_path / name for name in names}, audit).disk())
+        return check.ok, check.detail
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    enough, broken = 5 * state.SPARE_BYTES // 2**20, set()
+    assert disk("a", "c") == (True, f"a: {enough} MiB free; c: {enough} MiB free")
+    for names in ("ab", "ba"):
+        ok, detail = disk(*names)
+        assert not ok and "b: 1 MiB free" in detail and detail.endswith("; free space on that disk")
+    broken = {tmp_path / "c"}
+    for names in ("ac", "ca"):
+        ok, detail = disk(*names)
+        assert not ok and f"c: {os.strerror(errno.EIO)}" in detail and f"a: {enough} MiB free" in detail
 
 
 def test_a_folder_of_its_own_is_looked_at(new_plane, tmp_path, monkeypatch):
