@@ -10,9 +10,11 @@ longer lists.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar, get_args
 
@@ -84,14 +86,26 @@ class CapturedSequence(Generic[Result]):
         return self.results
 
 
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def _capture(
     graph: torch.cuda.CUDAGraph,
     sequence: Callable[[], Result],
     device: torch.device,
     pool: Any,
 ) -> Result:
-    # Not `torch.cuda.graph`, which runs the garbage collector first. That takes longer than many frames.
-    with _CAPTURING:
+    # Not `torch.cuda.graph`, which runs the garbage collector first. That takes longer than many frames. The collector
+    # must not run during the capture either: freeing an earlier graph invalidates it.
+    with _CAPTURING, _without_garbage_collection():
         current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
         side.wait_stream(current)
         with torch.cuda.stream(side):

@@ -75,15 +75,15 @@ def test_captured_in_a_graph(gpu):
         blended = blend_rays(*inputs, s.width, s.height, *lists)
         return *blended, *torch.autograd.grad(blended.depths.sum() + blended.values.sum(), inputs)
 
-    wanted = [tensor.clone() for tensor in step()]
+    # One stream for all steps, because autograd warns when the node of an input was created on another one.
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
-        for _ in range(2):
-            step()
-    torch.cuda.current_stream().wait_stream(side)
+        wanted = [tensor.clone() for tensor in step()]
+        step()
+    side.synchronize()
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    with torch.cuda.graph(graph, stream=side):
         results = step()
     graph.replay()
     torch.cuda.synchronize()

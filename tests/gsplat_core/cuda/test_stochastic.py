@@ -59,7 +59,8 @@ def test_the_cpu_draws_nearly_the_same_samples(gpu, method, samples):
 
 def test_poisson_draws_are_exact(gpu):
     draws = torch.ops.gsplat_core.poisson_draws(RATES.to(gpu), 100_000, 5)
-    assert min(poisson_p_values(draws)) > 0.01
+    # Exact draws of 20 rates have a p-value below 0.01 / 20 in one of a hundred runs.
+    assert min(poisson_p_values(draws)) > 0.01 / len(RATES)
     here = torch.ops.gsplat_core.poisson_draws(RATES, 1000, 5)
     assert float((draws[:, :1000].cpu() != here).float().mean()) < 1e-3
 
