@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind
+    from gsplat_core.scene.range_sensors import RangeSensor
     from gsplat_core.training.losses.loss import LossKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
@@ -94,9 +95,20 @@ LOSSES: Registry[LossKind] = Registry(
         "normal_consistency": "gsplat_core.training.losses.normal_consistency:NormalConsistency",
         "flow": "gsplat_core.training.losses.flow:FlowLoss",
         "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
+        "range": "gsplat_core.training.losses.ranges:RangeLoss",
     },
 )
 """Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""
+
+SENSORS: Registry[type[RangeSensor]] = Registry(
+    "range sensor",
+    {
+        "time_of_flight": "gsplat_core.scene.range_sensors:TimeOfFlight",
+        "structured_light": "gsplat_core.scene.range_sensors:StructuredLight",
+        "oct_line": "gsplat_core.scene.range_sensors:OctLine",
+    },
+)
+"""Range sensors by name, whose scans the loss `range` compares."""
 
 Eyes = Literal["left", "both"]
 """Eyes of a stereo scope whose pictures are trained on."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import MEASURED, DepthOrigin
+from gsplat_core.scene.range_sensors import RangeScan
 
 
 class FrameStatus(Enum):
@@ -45,6 +46,8 @@ class Frame:
     """Confidence of each pixel's depth [H, W], 0 to 1; None for full confidence."""
     depth_origin: DepthOrigin | None = None
     """Origin of `depth`; None without depth. Depth without an origin counts as recorded with the frame (`MEASURED`)."""
+    ranges: RangeScan | None = None
+    """Scan of a range sensor at the camera's place; None without one."""
     mask: NDArray[np.uint8] | None = None
     """Tissue mask [H, W]; 1 = tissue (keep), 0 = tool."""
     pose: NDArray[np.float64] | None = None

@@ -17,6 +17,7 @@ from gsplat_core.depth.maps import believed_depth
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.range_sensors import RangeScan
 from gsplat_core.transfers import HostCopy, tensor_of
 
 
@@ -39,6 +40,8 @@ class Observation:
     """Right eye's picture taken at the same time, if the right eye is trained on (`BothEyes`)."""
     of_right: bool = False
     """True if the picture is the right eye's."""
+    ranges: RangeScan | None = None
+    """Scan of a range sensor at the camera's place; None without one."""
 
     @property
     def right(self) -> Observation | None:
@@ -89,6 +92,7 @@ class Observation:
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
             depth=learned_depth(frame, device),
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
+            ranges=frame.ranges,
         )
 
 

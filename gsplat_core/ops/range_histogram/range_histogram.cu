@@ -39,9 +39,9 @@ __global__ void __launch_bounds__(kPixels) add_to_bins(Inputs in, unsigned long 
     through = next;
     if (d.first >= d.end) continue;
     const float inverse = 1 / d.spread;
-    float below = cdf((float(d.first) - d.at) * inverse);
+    float below = normal_at((float(d.first) - d.at) * inverse).cdf;
     for (int b = d.first; b < d.end; ++b) {
-      const float above = cdf((float(b + 1) - d.at) * inverse);
+      const float above = normal_at((float(b + 1) - d.at) * inverse).cdf;
       const double units = rint(double(weight * (above - below)) / kQuantum);
       if (units > 0) atomicAdd(column + b, static_cast<unsigned long long>(units));
       below = above;

@@ -15,7 +15,7 @@ using ray_blending::kRayNumbers;
 
 constexpr int kGradients = 6 + kRayNumbers;  // means2d (2), conics (3), opacity, rays
 constexpr int64_t kMaxBins = 65536;
-constexpr float kReachSigmas = 5.5f;                   // a bin further from a splat's depth receives nothing
+constexpr float kReachSigmas = 4.5f;                   // a bin further from a splat's depth receives nothing
 constexpr double kQuantum = 1.0 / (int64_t(1) << 36);  // of the sums of weights on CUDA, which are independent of their order
 
 struct Inputs {

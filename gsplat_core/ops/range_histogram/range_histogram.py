@@ -44,7 +44,7 @@ def range_histogram(
 
     A splat with blending weight w in a pixel adds w (Φ((z₁ - t)/s) - Φ((z₀ - t)/s)) to the bin from z₀ to z₁. Its depth t and
     standard deviation s along the pixel's ray follow from `rays`. Weights are those of `rasterize_to_pixels`. Parts of a
-    splat beyond 5.5 s are left out. Differentiable in the first four arguments. The result does not depend on the number of
+    splat beyond 4.5 s are left out. Differentiable in the first four arguments. The result does not depend on the number of
     threads, and is the same in each run on CUDA.
 
     Args:

@@ -40,9 +40,9 @@ void columns(const Inputs& in, int64_t tile_column, double* scratch, float* out)
         blend(in, tile, x, y, [&](int64_t, int64_t, const Hit&, const Depth& d, float weight, float) {
           if (d.first >= d.end) return;
           const float inverse = 1 / d.spread;
-          float below = cdf((float(d.first) - d.at) * inverse);
+          float below = normal_at((float(d.first) - d.at) * inverse).cdf;
           for (int b = d.first; b < d.end; ++b) {
-            const float next = cdf((float(b + 1) - d.at) * inverse);
+            const float next = normal_at((float(b + 1) - d.at) * inverse).cdf;
             bins[b] += double(weight * (next - below));
             below = next;
           }
