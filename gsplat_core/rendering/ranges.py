@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.range_histogram.range_histogram import Bins, range_histogram
-from gsplat_core.ops.ray_blending.ray_blending import splat_rays
+from gsplat_core.ops.splat_rays.splat_rays import splat_rays
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.flow import projected
@@ -35,7 +35,7 @@ def render_ranges(gaussians: Gaussians, camera: Camera, sensor: RangeSensor, fac
         factors = None if given is None else tensor_of(given, gaussians.device)
     rows = projected(gaussians, camera)
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
-    rays = splat_rays(gaussians.means, gaussians.quats, gaussians.scales, viewmat, intrinsics, camera.model)
+    rays = splat_rays(gaussians.means, gaussians.quats, gaussians.scales, viewmat, intrinsics, camera.model).rays
     opacities = gaussians.opacities
     grid = TileGrid(TILE_SIZE, -(-camera.width_px // TILE_SIZE), -(-camera.height_px // TILE_SIZE))
     with torch.no_grad():

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.ray_blending.ray_blending import RAY_NUMBERS
+from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS
 
 MOST_BINS = 65536
 """Maximum number of bins of a histogram."""
