@@ -93,6 +93,7 @@ LOSSES: Registry[LossKind] = Registry(
         "depth": "gsplat_core.training.losses.depth:Depth",
         "ray_depth": "gsplat_core.training.losses.ray_depth:RayDepth",
         "normal_consistency": "gsplat_core.training.losses.normal_consistency:NormalConsistency",
+        "semantics": "gsplat_core.training.losses.semantics:Semantics",
         "flow": "gsplat_core.training.losses.flow:FlowLoss",
         "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
         "range": "gsplat_core.training.losses.ranges:RangeLoss",

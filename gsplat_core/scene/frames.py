@@ -67,6 +67,8 @@ class Frame:
 
     Used for highlights, which move with the light instead of the tissue.
     """
+    labels: NDArray[np.uint8] | None = None
+    """Class of each pixel uint8 [H, W] for the loss `semantics`; 255 = unknown. None for a frame without labels."""
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
     withheld: str | None = None
@@ -104,7 +106,8 @@ class Frame:
                 f"frame {self.seq}: its right camera is {right.width_px}x{right.height_px}, the image {size[1]}x{size[0]}"
             )
         planes = {
-            name: getattr(self, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
+            name: getattr(self, name)
+            for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "labels")
         }
         for name, plane in planes.items():
             if plane is not None and plane.shape != size:

@@ -38,6 +38,8 @@ class Observation:
     """Mask uint8 [H, W]; 0 = ignored when the frame is trained on again later."""
     right_eye: RightEye | None = None
     """Right eye's picture taken at the same time, if the right eye is trained on (`BothEyes`)."""
+    labels: Tensor | None = None
+    """Class of each pixel uint8 [H, W], 255 = unknown; None for a frame without labels."""
     of_right: bool = False
     """True if the picture is the right eye's."""
     ranges: RangeScan | None = None
@@ -93,6 +95,7 @@ class Observation:
             depth=learned_depth(frame, device),
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
             ranges=frame.ranges,
+            labels=None if frame.labels is None else tensor_of(frame.labels, device),
         )
 
 

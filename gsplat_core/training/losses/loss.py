@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -44,6 +44,17 @@ class Loss(Protocol):
             Scalar on the scene's device, differentiable in the scene's tensors. None if the observation has nothing
             to compare.
         """
+
+
+@runtime_checkable
+class ExtendingLoss(Protocol):
+    """Loss that trains tensors of its own in `Gaussians.extra`."""
+
+    rates: ClassVar[Mapping[str, float]]
+    """Learning rates of the loss's tensors by name."""
+
+    def extended(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians with the loss's tensors; present ones are unchanged."""
 
 
 class LossKind(Protocol):

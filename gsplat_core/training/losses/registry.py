@@ -10,7 +10,7 @@ from torch import Tensor
 from gsplat_core.choices import LOSSES
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.losses.loss import LossContext
+from gsplat_core.training.losses.loss import ExtendingLoss, LossContext
 from gsplat_core.training.observations import Observation
 
 __all__ = ["LOSSES", "WeightedLosses", "loss_weights"]
@@ -69,6 +69,19 @@ class WeightedLosses:
 
     def __bool__(self) -> bool:
         return bool(self._terms)
+
+    def extended(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians with the tensors that the losses train."""
+        for loss, _ in self._terms:
+            if isinstance(loss, ExtendingLoss):
+                gaussians = loss.extended(gaussians)
+        return gaussians
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the tensors that the losses train, by name in `Gaussians.extra`."""
+        extending = [loss for loss, _ in self._terms if isinstance(loss, ExtendingLoss)]
+        return {name: rate for loss in extending for name, rate in loss.rates.items()}
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
         """Return the weighted sum, see `Loss.__call__`; None if no loss has anything to compare."""

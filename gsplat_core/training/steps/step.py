@@ -69,7 +69,10 @@ class AutogradTraining:
     def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
         """Do one Adam step for the field's parameters and return the gradients of the canonical Gaussians."""
         assert self._canonical is not None and self._deformed is not None
-        pairs = [(tensor, gradients[name]) for name, tensor in self._deformed.tensors().items() if tensor.requires_grad]
+        tensors = self._deformed.tensors()
+        pairs = [
+            (tensor, gradients[name]) for name, tensor in tensors.items() if tensor.requires_grad and name in gradients
+        ]
         torch.autograd.backward([tensor for tensor, _ in pairs], [gradient for _, gradient in pairs])
         parameters = dict(self._field.named_parameters())
         self._adam.follow(parameters)
@@ -403,7 +406,9 @@ class TrainingStep:
         return self._pictures.renderer.picture(scene, camera, None, self._pictures.values, depth)
 
     def _extended(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians if self._pictures is None else self._pictures.renderer.extended(gaussians)
+        """Return the Gaussians with the tensors of the renderer and of the losses in `extra`."""
+        gaussians = gaussians if self._pictures is None else self._pictures.renderer.extended(gaussians)
+        return self._losses.extended(gaussians)
 
     @property
     def fixed_rows(self) -> Gaussians | None:
@@ -444,8 +449,8 @@ class TrainingStep:
         }
 
     def _extra_rate(self, name: str) -> float:
-        """Return the learning rate of a tensor in `Gaussians.extra`: of the renderer, else that of colours."""
-        own = {} if self._pictures is None else self._pictures.renderer.rates
+        """Return the learning rate of a tensor in `Gaussians.extra`: of the renderer or loss, else that of colours."""
+        own = {**self._losses.rates, **({} if self._pictures is None else self._pictures.renderer.rates)}
         return own.get(name, self._rates.sh)
 
 

@@ -1,0 +1,65 @@
+"""Classes of Gaussians trained by labels on some frames, and their bundle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core import Camera, InvalidInput, load_bundle, save_bundle
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.reconstructor import Reconstructor
+
+CAMERA = Camera.from_focal(90.0, 64, 48)
+
+
+def frames(count: int, labelled: int) -> list[Frame]:
+    """Return frames of three stripes that move to the right, with labels on one in `labelled` frames."""
+    made = []
+    for seq in range(count):
+        column = (np.arange(64) - 6 * seq / count) % 64
+        classes = np.broadcast_to((column // 22).astype(np.uint8), (48, 64)).copy()
+        image = np.array([[200, 60, 60], [60, 200, 60], [60, 60, 200]], np.uint8)[classes]
+        labels = classes if seq % labelled == 0 else None
+        depth = np.full((48, 64), 60.0, np.float32)
+        made.append(Frame(seq, seq * 100_000_000, image, depth=depth, labels=labels))
+    return made
+
+
+def intersection_over_union(shown: np.ndarray, wanted: np.ndarray) -> float:
+    return float(
+        np.mean([((shown == k) & (wanted == k)).sum() / ((shown == k) | (wanted == k)).sum() for k in range(3)])
+    )
+
+
+@pytest.mark.parametrize("field", ["basis", "hexplane"])
+def test_labels_on_some_frames_classify_the_others(field, tmp_path):
+    config = replace(ReconstructorConfig.offline(), losses=("semantics",), gaussians=800, field=field)
+    reconstructor = Reconstructor(config, CAMERA, seed=0)
+    reconstructor.fit(frames(10, 5), 60)
+    model = reconstructor.snapshot()
+    assert model.gaussians.extra["semantics"].shape[1] == 4
+    wanted = frames(10, 1)[3].labels
+    shown = model.surface(0.3).semantics.argmax(-1).numpy()
+    assert intersection_over_union(shown, wanted) > 0.85
+    save_bundle(model, tmp_path / "model")
+    again = load_bundle(tmp_path / "model")
+    assert torch.equal(again.surface(0.3).semantics, model.surface(0.3).semantics)
+
+
+def test_labels_change_neither_colours_nor_geometry():
+    models = []
+    for losses in ((), ("semantics",)):
+        config = replace(ReconstructorConfig.offline(), losses=losses, gaussians=300)
+        reconstructor = Reconstructor(config, CAMERA, seed=0)
+        reconstructor.fit(frames(4, 2), 10)
+        models.append(reconstructor.snapshot().gaussians)
+    plain, labelled = (each.tensors() for each in models)
+    assert all(torch.equal(labelled[name], tensor) for name, tensor in plain.items())
+    assert labelled["extra.semantics"].any()
+
+
+def test_labels_must_have_the_size_of_the_picture():
+    with pytest.raises(InvalidInput, match="labels is \\[2, 2\\]"):
+        Frame(0, 0, np.zeros((4, 4, 3), np.uint8), labels=np.zeros((2, 2), np.uint8))
