@@ -36,7 +36,9 @@ def viser() -> Any:
     try:
         import viser as library
     except ImportError:
-        raise InvalidSetting("the viewer needs viser; install it with: pip install 'intrasplat[viser]'") from None
+        raise InvalidSetting(
+            "the viewer needs viser; install it with: pip install 'intrasplat[viser]', or show pictures with --renderer alpha"
+        ) from None
     return library
 
 

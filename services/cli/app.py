@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gsplat_core.errors import InvalidSetting
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
 from services.cli import service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
@@ -61,6 +62,7 @@ def render(
     view: Annotated[
         str, typer.Option(help="Camera: recorded, orbit, stereo (side by side), or a camera path (.json file).")
     ] = "recorded",
+    path: CameraPathOption = None,
     baseline: Annotated[
         float | None,
         typer.Option(
@@ -74,7 +76,10 @@ def render(
     from operators.applications.render import ViewWish
     from services.cli.models import render_command
 
-    chosen = {"scale": scale, "device": device, "renderer": renderer, "view": ViewWish(view, baseline)}
+    if path is not None and view != "recorded":
+        raise InvalidSetting(f"--view is {view!r:.80} and --path {str(path)!r:.80}; give one of them")
+    wish = ViewWish(view if path is None else str(path), baseline)
+    chosen = {"scale": scale, "device": device, "renderer": renderer, "view": wish}
     chosen["options"] = renderer_options(samples, supersampling, order)
     return render_command(model, out, fps, overwrite=overwrite, as_json=json, **chosen)
 

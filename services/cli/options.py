@@ -95,7 +95,7 @@ RecordKeepOption = Annotated[
 ]
 CameraPathOption = Annotated[
     Path | None,
-    path_option("--path", "A camera path (.json), or the cameras.json of another trainer. Default: an orbit."),
+    path_option("--path", "A camera path (.json), or the cameras.json of another trainer."),
 ]
 BenchVideoOption = Annotated[Path | None, path_option("--out", "A video (name.mp4) of the measured frames.")]
 RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a folder of images.")]

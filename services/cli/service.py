@@ -7,8 +7,18 @@ from typing import Annotated
 
 import typer
 
+from gsplat_core.choices import RENDERERS
 from services.cli.ctl import ExpiresOption, KeyName, KeyStreamOption, RoleOption, ctl
-from services.cli.options import JsonOption, path_argument, path_option
+from services.cli.options import (
+    DeviceOption,
+    JsonOption,
+    OrderOption,
+    SamplesOption,
+    SupersamplingOption,
+    path_argument,
+    path_option,
+    renderer_options,
+)
 
 ConfigOption = Annotated[Path | None, path_option("--config", "Settings file (YAML). Default: built-in settings.")]
 DataOption = Annotated[Path | None, path_option("--data", "Data folder (paths.data).")]
@@ -115,11 +125,25 @@ def view(
     plaintext: Annotated[
         bool, typer.Option("--plaintext", help="Allow addresses beyond this machine, although nothing is encrypted.")
     ] = False,
+    renderer: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Show pictures of this renderer in place of Gaussians. One of: {', '.join(RENDERERS)}.",
+            show_default="drawn by the browser, extra viser",
+        ),
+    ] = None,
+    samples: SamplesOption = None,
+    supersampling: SupersamplingOption = None,
+    order: OrderOption = None,
+    device: DeviceOption = "cpu",
 ) -> int:
-    """Show a model in browsers, with free viewpoint and playback (extra `viser`)."""
+    """Show a model in browsers, with free viewpoint and playback."""
     from services.cli.view import view_command
 
-    return view_command(model, host, port, plaintext=plaintext)
+    if samples is None and renderer in RENDERERS and "samples" in RENDERERS[renderer].capabilities.options:
+        samples = 1  # the picture gains samples while the camera stands still
+    options = renderer_options(samples, supersampling, order)
+    return view_command(model, host, port, plaintext=plaintext, renderer=renderer, options=options, device=device)
 
 
 @keys.command("list")

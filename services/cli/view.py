@@ -9,25 +9,46 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from gsplat_core.errors import BundleError
+from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.io.model_sources import load_model
+from gsplat_core.models.model import Model
+from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.rendering.renderer import RendererOptions
+from operators.applications.device import check_device
 from services.cli.exit_codes import OK
 from services.cli.igtl import check_host
 from services.cli.terminal import InterruptRequest
 from services.model_view import ModelView
+from services.picture_view import Pictures, PictureView
 from services.registry.bundle_file import SUFFIX, unpack
 
 
-def view_command(model: Path, host: str, port: int, *, plaintext: bool) -> int:
-    """Serve a model to browsers until interrupted."""
+def view_command(
+    model: Path, host: str, port: int, *, plaintext: bool, renderer: str | None, options: RendererOptions, device: str
+) -> int:
+    """Serve a model to browsers until interrupted: as Gaussians, or as pictures of a renderer."""
     check_host(host, plaintext, "the viewer has no keys and shows the model to every client")
+    if renderer is None and (options.changed() or device != "cpu"):
+        raise InvalidSetting("the browser draws the model without a renderer; give --renderer with its options")
+    if renderer is not None:
+        check_device(device)
+        check_renderer(renderer, device, options=options)
     with bundle_in(model) as folder:
         loaded = load_model(folder)
-    with InterruptRequest() as interrupt, ModelView(loaded, host, port) as view:
+    with InterruptRequest() as interrupt, _server(loaded, host, port, renderer, options, device) as view:
         print(f"the model is on http://{view.address[0]}:{view.address[1]}/", file=sys.stderr, flush=True)  # noqa: T201
         view.run(interrupt)
     return OK
+
+
+def _server(
+    model: Model, host: str, port: int, renderer: str | None, options: RendererOptions, device: str
+) -> ModelView | PictureView:
+    if renderer is None:
+        return ModelView(model, host, port)
+    pictures = Pictures(model.to(device), renderer, options, device)
+    return PictureView(pictures, model.time_window_s, host, port)
 
 
 @contextmanager

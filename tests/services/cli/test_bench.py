@@ -40,7 +40,8 @@ class Recorder:
 
     def render(self, camera, time_s, outputs=("image",)):
         self.frames.append((camera, time_s))
-        return FinishedFrame({"image": torch.full((camera.height_px, camera.width_px, 3), 0.5)})
+        size = camera.height_px, camera.width_px
+        return FinishedFrame({"image": torch.full((*size, 3), 0.5), "alpha": torch.ones(size)})
 
 
 @pytest.fixture
@@ -105,6 +106,16 @@ def test_every_camera_of_the_path_is_rendered_and_measured(scene, tmp_path, reco
     assert said["parameter_bytes"] == 50 * 14 * 4 and said["host_peak_bytes"] > said["parameter_bytes"]
     with av.open(str(tmp_path / "v.mp4")) as video:
         assert sum(1 for _ in video.decode(video=0)) == 5
+
+
+def test_render_takes_the_same_path_and_options(scene, tmp_path, recorder, capsys):
+    words = ["render", str(scene), "--renderer", "recorder", "--samples", "3", "--fps", "0.1"]
+    words += ["--path", str(path_of(tmp_path)), "--scale", "0.1", "--out", str(tmp_path / "out")]
+    assert run([*words, "--view", "orbit"]) == BAD_INPUT
+    assert "give one of them" in capsys.readouterr().err
+    assert run(words) == OK
+    assert recorder.made[-1].options.samples == 3
+    assert [round(float(camera.position[0]), 6) for camera, _ in recorder.made[-1].frames] == [0, 1, 2, 3, 4]
 
 
 def test_without_a_path_the_camera_moves_around_the_scene(scene, capsys):
