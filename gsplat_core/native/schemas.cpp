@@ -157,6 +157,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // fy, cx, cy, width, height. CPU only.
   m.def("surface_motion(Tensor points, Tensor flow, float[] before, float[] after, bool arrived) -> Tensor");
 
+  // Affine motion [N, 3, 3] around points from their neighbours (int32 [N, K]) at two times, for the CPU.
+  m.def("neighbour_motion(Tensor before, Tensor after, Tensor turned, Tensor neighbours, float stiffness) -> Tensor");
+  m.def(
+      "neighbour_motion_backward(Tensor before, Tensor neighbours, float stiffness, Tensor v_out) -> (Tensor v_after, Tensor "
+      "v_turned)");
+
   // Blended optical flow of splats that carry the surface of the first picture to the second camera: [height, width, 4],
   // the sums of weight times flow x, flow y and depth in the second camera, and of the weights. intrinsics: fx, fy,
   // cx, cy of both cameras. Tiles have 16x16 pixels.

@@ -19,6 +19,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.ops.flow_blending.flow_blending import TILE_SIZE, blend_flow
+from gsplat_core.ops.neighbour_motion.neighbour_motion import neighbour_motion
 from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS, splat_rays
@@ -206,9 +207,11 @@ def deformation_gradients(first: Gaussians, second: Gaussians, neighbours: Tenso
     turned = rotations(second.quats) @ rotations(first.quats).transpose(1, 2)
     if neighbours.shape[1] == 0:
         return turned
+    if turned.is_cpu and turned.dtype == torch.float32:
+        return neighbour_motion(first.means.detach(), second.means, turned, neighbours.int(), STIFFNESS)
     count = neighbours.shape[1]
-    before = (_rows(first.means, neighbours) - first.means[:, None]).detach()
-    after = _rows(second.means, neighbours) - second.means[:, None]
+    before = (first.means[neighbours] - first.means[:, None]).detach()
+    after = second.means[neighbours] - second.means[:, None]
     spread = (before.square().sum((1, 2)) / count)[:, None, None]
     apart = spread > 0
     # In units of the neighbours' mean square distance, so that no product is too small for float32.
@@ -216,14 +219,8 @@ def deformation_gradients(first: Gaussians, second: Gaussians, neighbours: Tenso
     moments = before.transpose(1, 2) @ before / unit
     moments.diagonal(dim1=1, dim2=2).add_(STIFFNESS)
     both = after.transpose(1, 2) @ before / unit + STIFFNESS * turned
-    return torch.where(apart, both @ _inverse(moments), turned)
-
-
-def _rows(values: Tensor, indices: Tensor) -> Tensor:
-    """Return the rows [N, K, 3] of `values` [M, 3] at indices [N, K]."""
-    if values.is_cuda:
-        return values[indices]  # the gradient of index_select adds in random order on CUDA
-    return values.index_select(0, indices.flatten()).view(*indices.shape, -1)
+    # In double precision, because neighbours on a line or plane leave small determinants.
+    return torch.where(apart, both @ _inverse(moments.double()).to(both.dtype), turned)
 
 
 def rotations(quats: Tensor) -> Tensor:

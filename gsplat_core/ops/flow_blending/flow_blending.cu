@@ -203,8 +203,8 @@ void blend_backward_on_device(const Inputs& in, const float* v_out, float* v_pla
                                                                          reinterpret_cast<float*>(rows));
   }
   const compositing::Instances instances = compositing::by_splat(in, scratch, stream);
-  sum_rows<<<blocks_for(in.count * (kPlaneNumbers / 4)), kThreads, 0, stream>>>(
-      in.count, instances.positions, instances.ranges, rows, reinterpret_cast<float4*>(v_planes));
+  sum_rows<<<blocks_for(in.count * (kPlaneNumbers / 4)), kThreads, 0, stream>>>(in.count, instances.positions, instances.ranges,
+                                                                                rows, reinterpret_cast<float4*>(v_planes));
 }
 
 }  // namespace gsplat::flow_blending

@@ -84,8 +84,8 @@ static void tile(const Splats& splats, int64_t index, float* out) {
   traverse(
       splats, t,
       [&](int32_t id, int at, const Ray& ray, vfloat weight) {
-        const Moved m = moved(in.rays + int64_t(id) * kRayNumbers, in.planes + int64_t(id) * kPlaneNumbers, in.before, in.after,
-                              ray);
+        const Moved m =
+            moved(in.rays + int64_t(id) * kRayNumbers, in.planes + int64_t(id) * kPlaneNumbers, in.before, in.after, ray);
         const vfloat w = select(m.in_front, weight, vfloat{});
         const vfloat added[kChannels] = {w * m.flow_x, w * m.flow_y, w * m.p[2], w};
         for (int c = 0; c < kChannels; ++c) store(sums + c * kPixels + at, load(sums + c * kPixels + at) + added[c]);
@@ -111,8 +111,8 @@ static void tile_backward(const Splats& splats, int64_t index, const float* v_ou
   traverse(
       splats, t,
       [&](int32_t id, int at, const Ray& ray, vfloat weight) {
-        const Moved m = moved(in.rays + int64_t(id) * kRayNumbers, in.planes + int64_t(id) * kPlaneNumbers, in.before, in.after,
-                              ray);
+        const Moved m =
+            moved(in.rays + int64_t(id) * kRayNumbers, in.planes + int64_t(id) * kPlaneNumbers, in.before, in.after, ray);
         vfloat v[3], v_p[3];
         for (int c = 0; c < 3; ++c) v[c] = load(given + c * kPixels + at);
         moved_backward(m, in.after, select(m.in_front, weight, vfloat{}), v, v_p);

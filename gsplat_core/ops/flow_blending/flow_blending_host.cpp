@@ -123,8 +123,8 @@ void backward(Call&, const Inputs& in, const float* v_out, float* v_planes) {
 
 #endif
 
-Tensor blend_flow(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor planes, Tensor offsets,
-                  Tensor flatten_ids, std::vector<double> intrinsics, int64_t width, int64_t height) {
+Tensor blend_flow(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor planes, Tensor offsets, Tensor flatten_ids,
+                  std::vector<double> intrinsics, int64_t width, int64_t height) {
   Call call(means2d);
   const Arguments arguments(call, means2d, conics, opacities, rays, planes, offsets, flatten_ids, intrinsics, width, height);
   Tensor out = call.empty({height, width, kChannels});

@@ -26,7 +26,7 @@ struct Ray {
 struct Moved {
   vfloat depth_on_ray;
   vfloat p[3];
-  vint in_front;     // of the second camera
+  vint in_front;      // of the second camera
   vfloat reciprocal;  // 1 / p_z where the point is in front
   vfloat flow_x, flow_y;
 };

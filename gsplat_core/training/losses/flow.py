@@ -23,7 +23,7 @@ SMOOTH_PX = 0.1
 KEPT_PAIRS = 256
 """Number of frame pairs whose flow is kept."""
 SEARCH_EVERY = 200
-"""Number of evaluations after which the nearest splats are searched again."""
+"""Number of comparisons after which the nearest splats are searched again."""
 
 
 class FlowLoss:
@@ -41,7 +41,7 @@ class FlowLoss:
     def __init__(self) -> None:
         self._flows: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         """Flow [h, w, 2] by the numbers of both frames; NaN where unreliable."""
-        self._neighbours: Tensor | None = None
+        self._neighbours = torch.empty(0, 0, dtype=torch.int64)
         self._calls = 0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
@@ -53,12 +53,12 @@ class FlowLoss:
         other = None if observation.of_right else self._other(observation, context)
         if other is None:
             return None
+        turn, self._calls = self._calls, self._calls + 1
         target = self._flow(other, observation)
         before, after = (_compared_size(each.camera) for each in (other, observation))
         first = context.at(other.time_s)
-        if self._neighbours is None or len(self._neighbours) != scene.count or self._calls % SEARCH_EVERY == 0:
+        if len(self._neighbours) != scene.count or turn % SEARCH_EVERY == 0:
             self._neighbours = nearest_splats(first)
-        self._calls += 1
         rendered = render_flow(first, scene, before, after, neighbours=self._neighbours)
         known = target.isfinite().all(-1) & rendered.observed
         off = torch.where(known[..., None], rendered.flow - target, 0)

@@ -33,7 +33,9 @@ MOST_VIEWS = 8
 LEAST_VIEWS = 2
 """Numbers of other views that a point is matched in."""
 SIGMA = 0.01
-"""Smallest scale of the robust loss relative to a point's depth."""
+"""Scale of the robust loss relative to a point's depth."""
+FAR = 0.25
+"""Weight of the term that also attracts a distant surface."""
 MOST_REPROJECTION_PX = 1.0
 """Largest root mean square distance of a triangulated point from its matches."""
 KEPT_FRAMES = 512
@@ -60,7 +62,7 @@ class TriangulationLoss:
     """
 
     name: ClassVar[str] = "triangulation"
-    default_weight: ClassVar[float] = 0.1
+    default_weight: ClassVar[float] = 1.0
 
     def __init__(self) -> None:
         self._points: OrderedDict[tuple[int, bool], Triangulated] = OrderedDict()
@@ -115,19 +117,18 @@ def check_parallax(observation: Observation, others: Sequence[Observation]) -> N
 
 
 def consensus_loss(depth: Tensor, target: Triangulated, camera: Camera) -> Tensor:
-    """Return the mean of |X - X*|² / (|X - X*|² + σ²) over the triangulated points X* with rendered depth.
+    """Return the mean of r + `FAR` log(1 + |X - X*|² / σ²) over the triangulated points X* with rendered depth.
 
-    σ is 1 % of a point's depth, or the median of the relative distances if that is more. A surface far from all points
-    would otherwise have almost no gradient.
+    r = |X - X*|² / (|X - X*|² + σ²) with σ 1 % of a point's depth. The second term gives a surface far from all points a
+    gradient, which r alone does not.
     """
     _, K = camera.matrices(depth.device, depth.dtype)
     z = sampled(depth[..., None], target.pixels[None])[0, :, 0]
     rays = torch.cat([(target.pixels - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones_like(z)[:, None]], 1)
     known = z > 0
     squared = (rays * z[:, None] - target.points).square().sum(1) / target.points[:, 2].square()
-    with torch.no_grad():
-        typical = torch.where(known, squared, torch.nan).nanmedian().nan_to_num()
-    robust = squared / (squared + typical.clamp(min=SIGMA**2))
+    scaled = squared / SIGMA**2
+    robust = scaled / (scaled + 1) + FAR * torch.log1p(scaled)
     return torch.where(known, robust, 0).sum() / known.sum().clamp(min=1)
 
 

@@ -62,8 +62,7 @@ def test_flow_loss_moves_the_scene_as_the_pictures_show():
     wall = textured_wall()
     shift = torch.tensor([0.9, -0.5, 0.0])
     frames = [seen(wall, 0), seen(at(wall, wall.means + shift), 1)]
-    loss = FlowLoss()
-    value = lambda means: loss(at(wall, means), frames[1], LossContext(frames, lambda _: wall))
+    value = lambda means: FlowLoss()(at(wall, means), frames[1], LossContext(frames, lambda _: wall))
     still = wall.means.clone().requires_grad_()
     wrong = value(still)
     wrong.backward()
@@ -82,6 +81,22 @@ def test_flow_loss_compares_large_pictures_at_half_size():
     frames = [seen(wall, 0, camera), seen(at(wall, wall.means + shift), 1, camera)]
     value = FlowLoss()(wall, frames[1], LossContext(frames, lambda _: wall))
     assert abs(float(value) - 0.5 / 40 * 280) < 0.5
+
+
+def test_flow_loss_compares_with_both_neighbouring_frames_by_turns():
+    wall = textured_wall()
+    move = torch.tensor([0.6, 0.0, 0.0])
+    frames = [seen(at(wall, wall.means + k * move), k) for k in range(3)]
+    asked: list[float] = []
+
+    def scene_at(time_s: float) -> Gaussians:
+        asked.append(time_s)
+        return at(wall, wall.means + round(time_s * 10) * move)
+
+    loss, context = FlowLoss(), LossContext(frames, scene_at)
+    exact = at(wall, wall.means + move)
+    assert all(float(loss(exact, frames[1], context)) < 0.2 for _ in range(3))
+    assert asked == [0.0, 0.2, 0.0]
 
 
 def test_flow_loss_has_nothing_to_compare_alone_or_in_the_right_eye():
