@@ -368,6 +368,7 @@ def main() -> None:
     camera = Camera.from_focal(1500, 1920, 1080) if chosen.full else Camera.from_focal(500, 640, 360)
     figures: dict[str, Any] = {"size_px": [camera.width_px, camera.height_px]}
     figures |= statistics_of(device, chosen.samples)
+    print(figures, flush=True)
     figures["quantised"] = quantisation(device)
     figures["huge_against_small"] = huge_against_small(camera, device, repetitions)
     for size in millions:

@@ -67,9 +67,10 @@ class SampledRenderer:
         return self._drawn
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """See `Renderer.prepare`. Raises InvalidInput for a model on another device."""
+        """See `Renderer.prepare`. Raises InvalidInput for a model on another device or trained by another renderer."""
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
+        check_trained_by(self.name, model)
         check_trained_by(self.name, model)
         self._model = model.as_model()
 
