@@ -4,7 +4,8 @@
 
 Both renderers train on the same frames of a recording with equal steps. Popping is measured on these models: the camera turns
 by 0.1 degrees about its centre, the picture is warped by the exact homography of the turn, and the difference to the
-picture after the turn is taken. Its 99.9th percentile contains changes of the order of splats, and interpolation.
+picture after the turn is taken. Its 99.9th percentile contains changes of the order of splats, and interpolation, which
+vanishes in larger pictures.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ VARIANTS = {
 TURN_DEGREES = 0.1
 TURNS = 10
 MARGIN_PX = 8
+ENLARGED = (1, 2, 4)
+"""Sizes of the pictures in which popping is measured, relative to the training pictures."""
 
 
 def picture(model: Model, camera: Camera, time_s: float) -> np.ndarray:
@@ -68,9 +71,12 @@ def train(renderer: str, frames: list, camera: Camera, config: ReconstructorConf
     }
 
 
-def popping(model: Model, time_s: float) -> float:
-    """Return the 99.9th percentile of the warped difference, mean of all turns, in grey levels of 255."""
-    camera = model.camera
+def popping(model: Model, time_s: float, enlarged: int) -> float:
+    """Return the 99.9th percentile of the warped difference, mean of all turns, in grey levels of 255.
+
+    The picture is `enlarged` times the size of the training pictures. At 1, the interpolation of the warp dominates.
+    """
+    camera = model.camera.scaled(enlarged)
     intrinsics = camera.K
     found = []
     before, last_turn = None, np.eye(3)
@@ -187,12 +193,16 @@ def main() -> None:
             chosen.device,
         )
         model = result.pop("model")
-        result["popping_grey_levels"] = popping(model, frames[len(frames) // 2].time_s)
+        middle_s = frames[len(frames) // 2].time_s
+        result["popping_grey_levels"] = {f"{n}x": popping(model, middle_s, n) for n in ENLARGED}
         result["values"] = dict(model.trained_by.values)
         figures[name] = result
         print(name, result, flush=True)
     figures["heldout_minus_alpha_db"] = figures["weighted_sum"]["heldout_db"] - figures["alpha"]["heldout_db"]
-    figures["popping_ratio"] = figures["weighted_sum"]["popping_grey_levels"] / figures["alpha"]["popping_grey_levels"]
+    figures["popping_ratio"] = {
+        size: figures["weighted_sum"]["popping_grey_levels"][size] / value
+        for size, value in figures["alpha"]["popping_grey_levels"].items()
+    }
     figures["speed"] = (
         [speed(n, (1920, 1080), chosen.device, 20) for n in (100_000, 1_000_000)]
         if chosen.full

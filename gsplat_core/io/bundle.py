@@ -215,9 +215,16 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
             field.check_state()
         except InvalidInput as error:
             raise BundleCorrupt(f"{path} cannot be used: {error}") from error
-    facts = dict(training_digest=manifest.training_digest, depth_source=manifest.depth_source)
-    facts["trained_by"] = manifest.trained_by
-    return Model(manifest.version, loaded, field, manifest.camera, manifest.time_window_s, **facts)  # type: ignore[arg-type]
+    return Model(
+        manifest.version,
+        loaded,
+        field,
+        manifest.camera,
+        manifest.time_window_s,
+        training_digest=manifest.training_digest,
+        depth_source=manifest.depth_source,
+        trained_by=manifest.trained_by,
+    )
 
 
 def _check_size(path: Path, expected: dict[str, Tensor], start: bytes, size: int) -> None:

@@ -195,11 +195,11 @@ def check_trained_by(name: str, model: Model | Snapshot, shown: str = "alpha") -
     """Check that the renderer `name` can show a model, which must have been trained by the renderer `shown`.
 
     Raises:
-        InvalidInput: otherwise.
+        InvalidSetting: otherwise.
     """
     trained_by = model.trained_by.renderer if isinstance(model, Model) else TrainedBy().renderer
     if trained_by != shown:
-        raise InvalidInput(
+        raise InvalidSetting(
             f"renderer {name!r} cannot show this model, which was trained by {trained_by!r}; choose renderer {trained_by!r}"
         )
 

@@ -75,7 +75,7 @@ class WeightedSumRenderer:
         self._values: dict[str, Tensor] = {}
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """See `Renderer.prepare`. Raises InvalidInput for a model on another device or of another renderer."""
+        """See `Renderer.prepare`. Raises InvalidInput for a model on another device, InvalidSetting for one of another renderer."""
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
         check_trained_by(self.name, model, self.name)

@@ -57,6 +57,11 @@ def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool 
     times_s = wish.times_in(model.time_window_s)
     if model.gaussians.count == 0:
         raise ExportError("the model has no Gaussians; there is nothing to export")
+    if (renderer := model.trained_by.renderer) != "alpha":
+        raise ExportError(
+            f"the model was trained by renderer {renderer!r}, and viewers of {wish.format.name} blend by alpha; train with"
+            " --renderer alpha to export it"
+        )
     with PartialFile(path, overwrite=overwrite) as partial, torch.inference_mode():
         if wish.format.is_sequence:
             _write_sequence(model, partial.file, times_s)

@@ -7,8 +7,11 @@ import dataclasses
 import pytest
 import torch
 
-from gsplat_core import InvalidInput, new_renderer
+from gsplat_core import new_renderer
+from gsplat_core.errors import ExportError, InvalidSetting
 from gsplat_core.io.bundle import load_bundle, save_bundle
+from gsplat_core.io.exports.export import export_model
+from gsplat_core.io.exports.formats import FORMATS, ExportWish
 from gsplat_core.models.model import TrainedBy
 from gsplat_core.rendering.weighted_sum import OPACITY
 from gsplat_core.training.config import ReconstructorConfig
@@ -68,8 +71,14 @@ def test_a_bundle_keeps_the_renderer(trained, tmp_path):
 
 def test_other_renderers_refuse_the_model_and_this_one_refuses_others(trained):
     model = trained[0].snapshot()
-    with pytest.raises(InvalidInput, match="'alpha' cannot show this model, which was trained by 'weighted_sum'"):
+    with pytest.raises(InvalidSetting, match="'alpha' cannot show this model, which was trained by 'weighted_sum'"):
         new_renderer("alpha", model.camera).prepare(model)
     plain = dataclasses.replace(model, trained_by=TrainedBy())
-    with pytest.raises(InvalidInput, match="choose renderer 'alpha'"):
+    with pytest.raises(InvalidSetting, match="choose renderer 'alpha'"):
         new_renderer("weighted_sum", model.camera).prepare(plain)
+
+
+def test_the_model_is_not_exported_to_viewers_that_blend_by_alpha(trained, tmp_path):
+    with pytest.raises(ExportError, match="trained by renderer 'weighted_sum'"):
+        export_model(trained[0].snapshot(), tmp_path / "a.ply", ExportWish(FORMATS["ply"]))
+    assert not (tmp_path / "a.ply").exists()
