@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
+    from gsplat_core.training.growth.densification import Growth
     from gsplat_core.training.losses.loss import LossKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
@@ -100,6 +101,15 @@ LOSSES: Registry[LossKind] = Registry(
     },
 )
 """Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""
+
+GROWTHS: Registry[Growth] = Registry(
+    "growth",
+    {
+        "default": "gsplat_core.training.growth.densification:densify",
+        "birth_death": "gsplat_core.training.growth.birth_death:birth_death",
+    },
+)
+"""Changes of the Gaussians' number between offline training steps, by name."""
 
 SENSORS: Registry[type[RangeSensor]] = Registry(
     "range sensor",

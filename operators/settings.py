@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, RENDERERS, Eyes
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, GROWTHS, LOSSES, RENDERERS, Eyes
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
 from operators.graph.application import Engine
@@ -174,6 +174,15 @@ class OfflineSection(Section):
     steps: Annotated[
         int, Option("Optimiser steps over all training frames", ("reconstruct",), ge=1, le=100_000_000)
     ] = 2000
+    growth: Annotated[
+        str,
+        Option(
+            "Change of the Gaussians between steps: default splits those with large errors, birth_death draws deaths and"
+            " copies from the gradients of the opacities",
+            ("reconstruct",),
+        ),
+        Names(GROWTHS),
+    ] = "default"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import get_args
 
-from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, Eyes
+from gsplat_core.choices import FIELDS, GROWTHS, MOTION_PRIORS, RENDERERS, Eyes
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
@@ -98,6 +98,8 @@ class ReconstructorConfig:
     """Renderer that trains the scene: a name in `RENDERERS`. The pictures of a renderer without gradients are trained
     by alpha blending.
     """
+    growth: str = "default"
+    """Change of the Gaussians between offline training steps: a name in `GROWTHS`."""
     losses: tuple[str, ...] = ()
     """Losses added to those of colours and depth: names in `LOSSES`, each optionally followed by a colon and its
     weight. On a GPU, a step with further losses is not captured as a CUDA graph and therefore slower.
@@ -131,6 +133,7 @@ class ReconstructorConfig:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
         MOTION_PRIORS.check(self.motion_prior)
         RENDERERS.check(self.renderer)
+        GROWTHS.check(self.growth)
         loss_weights(self.losses)
         if self.motion_detail not in get_args(Detail):
             raise InvalidSetting(f"motion_detail is {self.motion_detail!r}; choose {' or '.join(get_args(Detail))}")

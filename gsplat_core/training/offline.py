@@ -16,12 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_core.choices import GROWTHS
 from gsplat_core.depth.maps import OfRecording
 from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.growth.densification import UNSEEN_PX, densify, on_tissue, shares_of
+from gsplat_core.training.growth.densification import UNSEEN_PX, on_tissue, shares_of
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 
@@ -159,8 +160,10 @@ class OfflineTraining:
         *,
         most_gaussians: int,
         seed: int,
+        growth: str = "default",
     ) -> None:
         self._step = step
+        self._grow = GROWTHS[growth]
         rights = [one.right for one in observations if one.right is not None]
         self._observations = [*observations, *rights]
         """Observations of both eyes."""
@@ -227,4 +230,4 @@ class OfflineTraining:
                 hidden & on_tissue(self._step, others), shares.seen_px.clamp(min=UNSEEN_PX), shares.seen_px
             )
             shares = replace(shares, seen_px=seen_px)
-        densify(self._step, shares, round(self._first_count + (self._most - self._first_count) * share))
+        self._grow(self._step, shares, round(self._first_count + (self._most - self._first_count) * share))

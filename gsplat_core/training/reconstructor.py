@@ -307,7 +307,9 @@ class Reconstructor:
             first_new = self.gaussians if number else 0
             self._covering.cover(self._step, frame, observation, first=number == 0)
             tracks.apply(self._step, number, first_new)
-        training = OfflineTraining(self._step, seen, most_gaussians=self.config.max_gaussians, seed=self._seed)
+        training = OfflineTraining(
+            self._step, seen, most_gaussians=self.config.max_gaussians, seed=self._seed, growth=self.config.growth
+        )
         loss = training(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 

@@ -8,7 +8,7 @@ error, is the error under their blending weights.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -71,6 +71,10 @@ def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor
         seen = Seen(one.camera, step.at(one.time_s).means)
         found |= seen.inside[:, 0] & (seen.read(one.mask) > 0)
     return found
+
+
+Growth = Callable[[TrainingStep, Shares, int], None]
+"""Change of the Gaussians in a round: the step, visibility and error of each Gaussian, and the wanted number."""
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from gsplat_core.training.losses.loss import LossContext
 from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import tensor_of
 
-DISTANCE_WEIGHT = 0.1
+DISTANCE_WEIGHT = 0.5
 """Weight of the Wasserstein distance in bins relative to the L1 difference."""
 KEPT_SCANS = 256
 """Number of scans whose tensors are kept on the device."""

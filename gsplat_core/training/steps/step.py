@@ -284,6 +284,10 @@ class TrainingStep:
         self._adam.first_moments["quats"][:count].div_(factor[:, None])
         self._adam.second_moments["quats"][:count].div_(factor.square()[:, None])
 
+    def mean_gradients(self, name: str) -> Tensor:
+        """Return the gradients of a tensor of the Gaussians, averaged over the last steps by Adam (its first moment)."""
+        return self._adam.first_moments[name][: self.gaussians.count]
+
     def idle(self, part: float) -> Tensor:
         """Return which Gaussians have mean squared gradients below `part` times the usual ones, bool [N]."""
         squared = self._adam.second_moments["logit_opacities"][: self.gaussians.count]

@@ -1,5 +1,6 @@
 """Densification: whose share of picture and error is whose, what is split, what is dropped, and that both halves move as one."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -7,12 +8,15 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.growth.birth_death import birth_death, relocated
 from gsplat_core.training.growth.densification import UNSEEN_PX, Shares, densify, halves, shares_of
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 
 
@@ -138,3 +142,56 @@ def test_the_same_seed_gives_the_same_gaussians(make_frame, camera):
 
     first, second = densified(), densified()
     assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), second.tensors().values(), strict=True))
+
+
+def trained(step, make_frame, camera):
+    """Give the opacities a gradient."""
+    for seq in range(4):
+        step(Observation.of(make_frame(seq, shift_px=seq), camera))
+    return step
+
+
+@pytest.mark.parametrize("more", [0, 15])
+def test_births_replace_deaths_and_growth_follows_the_schedule(step, make_frame, camera, more):
+    trained(step, make_frame, camera)
+    count = step.gaussians.count
+    seen = torch.ones(count)
+    seen[7] = UNSEEN_PX / 2
+    gone = step.gaussians.means[7].clone()
+    birth_death(step, Shares(seen, torch.zeros(count)), count + more)
+    assert step.gaussians.count == count + more
+    assert not (step.gaussians.means == gone).all(1).any()
+    assert all(tensor.isfinite().all() for tensor in step.gaussians.tensors().values())
+
+
+def test_the_same_scene_gives_the_same_births_and_deaths(step, make_frame, camera):
+    trained(step, make_frame, camera)
+    other = copy.deepcopy(step)
+    for each in (step, other):
+        birth_death(each, Shares(torch.ones(each.gaussians.count), torch.zeros(each.gaussians.count)), 120)
+    torch.testing.assert_close(step.gaussians.means, other.gaussians.means, rtol=0, atol=0)
+
+
+def test_two_copies_keep_the_opacity_and_the_brightness(device):
+    parents = Gaussians(
+        torch.zeros(2, 3),
+        torch.tensor([[1.0, 0, 0, 0]] * 2),
+        torch.zeros(2, 3),
+        torch.tensor([-1.0, 2.0]),
+        torch.zeros(2, 1, 3),
+    ).to(device)
+    first, second = relocated(parents)
+    torch.testing.assert_close(1 - (1 - first.opacities) * (1 - second.opacities), parents.opacities)
+    # The integral along a line through the common centre: o s = sum over both copies of o' s' - o'^2 s' / sqrt(2) / 2 each.
+    o, s = first.opacities, first.scales[:, 0]
+    torch.testing.assert_close(2 * o * s - o**2 * s / 2**0.5, parents.opacities * parents.scales[:, 0])
+    assert (first.means != second.means).any(1).all()
+
+
+def test_a_fit_with_birth_and_death_keeps_the_count(make_frame, camera):
+    config = ReconstructorConfig(field="basis", gaussians=100, max_gaussians=100, growth="birth_death")
+    reconstructor = Reconstructor(config, camera)
+    reconstructor.fit([make_frame(seq, shift_px=seq) for seq in range(4)], steps=20)
+    assert reconstructor.gaussians == 100
+    with pytest.raises(InvalidSetting, match="unknown growth 'none'; known are default, birth_death"):
+        ReconstructorConfig(growth="none")
