@@ -34,6 +34,7 @@ REST_COUNTS = {9: 1, 24: 2, 45: 3}
 """SH degree by number of `sh` properties."""
 MOST_SH = 4.0
 MOST_LOG_SCALE = 20.0
+MOST_BOUND = 1e30
 
 
 def read_compressed(descriptor: int, path: Path, elements: list[Element], start: int) -> Gaussians:
@@ -62,9 +63,11 @@ def read_compressed(descriptor: int, path: Path, elements: list[Element], start:
             bounds[first : first + len(rows), i] = rows[name]
 
     read_rows(descriptor, path, start, chunks.layout, chunks.count, take_bounds)
-    bad = int(np.count_nonzero(~np.isfinite(bounds)))
+    bad = int(np.count_nonzero(~(np.abs(bounds) < MOST_BOUND)))
     if bad:
-        raise BundleCorrupt(f"{path}: {bad} bounds of its chunks are NaN or infinite; export it again")
+        raise BundleCorrupt(
+            f"{path}: {bad} bounds of its chunks are NaN, infinite or beyond {MOST_BOUND:g}; export it again"
+        )
     means, quats, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
     logits, sh = np.empty(count, np.float32), np.empty((count, 1 + rest // 3, 3), np.float32)
 

@@ -31,6 +31,8 @@ MODELS = {
 PLACES = (Path("sparse/0"), Path("sparse"), Path("."))
 MOST_NAME_BYTES = 4096
 MOST_SIDE_PX = 1 << 16
+MOST_PARAMETER_PX = 1e7
+MOST_TRANSLATION = 1e9
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def _matrix(path: Path, number: int, pose: tuple[float, ...]) -> NDArray[np.floa
     """Return world to camera [4, 4] of a quaternion wxyz and a translation."""
     w, x, y, z, *translation = pose
     length = math.sqrt(w * w + x * x + y * y + z * z)
-    if not (all(math.isfinite(value) for value in pose) and 1e-6 < length < 1e6):
+    if not (all(abs(value) < MOST_TRANSLATION for value in pose) and 1e-6 < length < 1e6):
         raise RecordingInvalid(f"{path}: image {number} has the pose {pose}, which is no rotation and translation")
     w, x, y, z = w / length, x / length, y / length, z / length
     matrix = np.eye(4)
@@ -138,6 +140,10 @@ def _camera(path: Path, number: int, model: str, width_px: int, height_px: int, 
     if len(values) != wanted or not (0 < width_px <= MOST_SIDE_PX and 0 < height_px <= MOST_SIDE_PX):
         raise RecordingInvalid(
             f"{path}: camera {number} has {len(values)} parameters and {width_px}x{height_px} px; {model} has {wanted}, and a side at most {MOST_SIDE_PX}"
+        )
+    if not all(abs(value) < MOST_PARAMETER_PX for value in values):
+        raise RecordingInvalid(
+            f"{path}: camera {number} has the parameters {values}; they must be below {MOST_PARAMETER_PX:g} px"
         )
     fx, fy, cx, cy = values if wanted == 4 else (values[0], *values)
     try:

@@ -4,6 +4,7 @@ import gzip
 import struct
 import zlib
 
+import numpy as np
 import pytest
 import torch
 
@@ -232,3 +233,25 @@ def test_a_gzip_bomb_is_not_inflated(tmp_path, monkeypatch):
     monkeypatch.setattr("gsplat_core.io.model_files.available_bytes", lambda: 50_000_000)
     with pytest.raises(BundleError, match="of memory to load"):
         load_spz(path)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz"])
+def test_damaged_bytes_give_gaussians_or_an_error_of_the_file(name, tmp_path):
+    pieces = compressed_ply_pieces(cloud(40, 1)) if name == "a.ply" else spz_pieces(cloud(40, 1))
+    good, path = b"".join(pieces), tmp_path / name
+    load = load_ply if name == "a.ply" else load_spz
+    generator = np.random.default_rng(0)
+    refused = 0
+    for _ in range(300):
+        data = bytearray(good[: generator.integers(1, len(good) + 1)] if generator.random() < 0.3 else good)
+        for at in generator.integers(0, len(data), generator.integers(1, 4)):
+            data[at] = generator.integers(256)
+        path.write_bytes(data)
+        try:
+            seen = load(path)
+        except BundleError as error:
+            refused += 1
+            assert str(path) in str(error)
+        else:
+            assert all(tensor.isfinite().all() for tensor in seen.tensors().values())
+    assert refused > 50

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsplat_core import Camera
-from gsplat_core.errors import RecordingInvalid, RecordingMissing
+from gsplat_core.errors import RecordingError, RecordingInvalid, RecordingMissing
 from gsplat_core.io.recordings.colmap import read_colmap
 from tests.colmap_writer import write_scene
 
@@ -70,7 +70,8 @@ def test_no_scene(tmp_path):
         ("cameras.bin", lambda b: struct.pack("<Q", 2**60) + b[8:], "do not fit"),
         ("cameras.bin", lambda b: b[:12] + struct.pack("<i", 99) + b[16:], "number 99"),
         ("cameras.bin", lambda b: b[:16] + struct.pack("<Q", 2**40) + b[24:], "1099511627776x30"),
-        ("cameras.bin", lambda b: b[:32] + struct.pack("<d", float("nan")) + b[40:], "cannot be used"),
+        ("cameras.bin", lambda b: b[:32] + struct.pack("<d", float("nan")) + b[40:], "must be below"),
+        ("cameras.bin", lambda b: b[:32] + struct.pack("<d", -5.0) + b[40:], "cannot be used"),
         ("images.bin", lambda b: b[:-1], "cut short"),
         ("images.bin", lambda b: b[:12] + struct.pack("<4d", 0, 0, 0, 0) + b[44:], "no rotation"),
         ("images.bin", lambda b: b.replace(b"set/", b"../_"), "not inside images"),
@@ -113,3 +114,24 @@ def test_broken_points_are_refused(tmp_path, text):
     path.write_bytes(path.read_bytes()[:12])
     with pytest.raises(RecordingInvalid, match=r"points3D"):
         read_colmap(tmp_path).points()
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_damaged_bytes_give_a_scene_or_an_error_of_the_recording(tmp_path, text):
+    write_scene(tmp_path / "sparse", cameras(), text=text, points=POINTS)
+    generator = np.random.default_rng(0)
+    refused = 0
+    for path in sorted((tmp_path / "sparse").iterdir()):
+        good = path.read_bytes()
+        for _ in range(100):
+            data = bytearray(good[: generator.integers(0, len(good) + 1)] if generator.random() < 0.3 else good)
+            for at in generator.integers(0, len(data), generator.integers(1, 4)) if data else []:
+                data[at] = generator.integers(256)
+            path.write_bytes(data)
+            try:
+                read_colmap(tmp_path).points()
+            except RecordingError as error:
+                refused += 1
+                assert str(tmp_path) in str(error)
+        path.write_bytes(good)
+    assert refused > 50
