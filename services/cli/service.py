@@ -140,7 +140,8 @@ def view(
     """Show a model in browsers, with free viewpoint and playback."""
     from services.cli.view import view_command
 
-    if samples is None and renderer in RENDERERS and "samples" in RENDERERS[renderer].capabilities.options:
+    sampled = renderer is not None and renderer in RENDERERS and "samples" in RENDERERS[renderer].capabilities.options
+    if sampled and samples is None:
         samples = 1  # the picture gains samples while the camera stands still
     options = renderer_options(samples, supersampling, order)
     return view_command(model, host, port, plaintext=plaintext, renderer=renderer, options=options, device=device)
