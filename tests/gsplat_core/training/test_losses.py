@@ -127,3 +127,19 @@ def test_the_losses_of_every_step_can_be_evaluated_alone(make_step, make_frame, 
     alone = {name: LOSSES[name]()(scene, seen, context) for name in ("photometric", "depth")}
     torch.testing.assert_close(alone["photometric"] + 3.0 * alone["depth"], together, rtol=1e-4, atol=1e-6)
     assert LOSSES["depth"]()(scene, dataclasses.replace(seen, depth=None), context) is None
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("field", ["basis", "hexplane"])
+def test_a_named_loss_is_trained_on_a_gpu(gpu, small_opacities, make_frame, camera, field):
+    rates = LearningRates(0.0, 0.0, 0.0, 0.1, 0.0)
+    config = ReconstructorConfig(
+        field=field, gaussians=300, rates=rates, losses=("small_opacities:1000",), first_frame_steps=3
+    )
+    online = Reconstructor(config, camera, device=gpu)
+    online.observe(make_frame())
+    plain = Reconstructor(dataclasses.replace(config, losses=()), camera, device=gpu)
+    plain.observe(make_frame())
+    lower = plain.snapshot().gaussians.logit_opacities - online.snapshot().gaussians.logit_opacities
+    assert float(lower.mean()) > 0.1
+    assert SEEN_BY_THE_LOSS

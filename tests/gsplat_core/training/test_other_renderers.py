@@ -82,3 +82,29 @@ def test_the_model_is_not_exported_to_viewers_that_blend_by_alpha(trained, tmp_p
     with pytest.raises(ExportError, match="trained by renderer 'weighted_sum'"):
         export_model(trained[0].snapshot(), tmp_path / "a.ply", ExportWish(FORMATS["ply"]))
     assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("preallocate", [False, True])
+def test_training_on_a_gpu_gives_the_same_model_twice(gpu, make_frame, camera, preallocate):
+    config = ReconstructorConfig(
+        gaussians=300, renderer="weighted_sum", first_frame_steps=20, steps_per_frame=10, preallocate=preallocate
+    )
+    models = []
+    for _ in range(2):
+        online = Reconstructor(config, camera, device=gpu)
+        for seq in range(3):
+            online.observe(make_frame(seq))
+        models.append(online.publish().as_model())
+    assert models[0].trained_by.renderer == "weighted_sum"
+    assert models[0].trained_by == models[1].trained_by
+    assert models[0].sha256() == models[1].sha256()
+    renderer = new_renderer("weighted_sum", camera, gpu)
+    renderer.prepare(models[0])
+    image = renderer.render(camera, models[0].time_window_s[1]).result().image.cpu()
+    on_cpu = new_renderer("weighted_sum", camera)
+    on_cpu.prepare(models[0].to("cpu"))
+    torch.testing.assert_close(
+        image, on_cpu.render(camera, models[0].time_window_s[1]).result().image, rtol=0, atol=2e-4
+    )
+    assert float((image - torch.from_numpy(make_frame(2).image) / 255).abs().mean()) < 0.1
