@@ -35,6 +35,7 @@ from gsplat_core.rendering.flow import render_flow, rotations
 from operators.applications.evaluate import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings
+from operators.choices import Device
 
 CAMERA = Camera.from_focal(350.0, 320, 256)
 DISTANCE_MM, TILT_DEG, SPACING_MM = 100.0, 25.0, 1.0
@@ -102,7 +103,7 @@ def motions(device: str) -> dict[str, float]:
     return figures
 
 
-def trained(case: str, seed: int, losses: tuple[str, ...], device: str, full: bool, work: Path) -> dict[str, float]:
+def trained(case: str, seed: int, losses: tuple[str, ...], device: Device, full: bool, work: Path) -> dict[str, float]:
     """Train on one synthetic recording and return errors of followed points and depth."""
     size = (640, 512, 48, 20.0) if full else (160, 128, 24, 15.0)
     given = Namespace(
@@ -123,14 +124,15 @@ def trained(case: str, seed: int, losses: tuple[str, ...], device: str, full: bo
         SeenFromAnywhere(device), open_truth(whole, recording.frame_count),
     )  # fmt: skip
     tracking, errors = geometry.tracking, geometry.depth
-    assert tracking is not None and errors is not None
+    third = next(view for view in geometry.views if view.name == "third").model.psnr_tissue_db
+    assert tracking is not None and errors is not None and third is not None
     points = tracking.model if case == "stereo" else tracking.scaled
     return {
         "points_mm": round(points.median_mm, 4),
         "points_px": round(tracking.model.median_px, 4),
         "still_mm": round(tracking.still.median_mm, 4),
         "depth_share": round(errors.scaled_rmse_share, 5),
-        "third_view_db": round(next(v for v in geometry.views if v.name == "third").model.psnr_tissue_db, 3),
+        "third_view_db": round(third, 3),
         "train_s": round(seconds, 1),
     }
 

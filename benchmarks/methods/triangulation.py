@@ -1,6 +1,6 @@
 """Triangulation loss on a static synthetic multi-view set: Chamfer distance of the surface without and with the loss.
 
-    python benchmarks/methods/triangulation.py [--seeds 1] [--views 16] [--steps N] [--full] [--device cpu|cuda] [--out FILE]
+    python benchmarks/methods/triangulation.py [--seeds 1] [--views 9] [--steps N] [--full] [--device cpu|cuda] [--out FILE]
 
 The tissue of a synthetic recording is held still and seen by cameras on a square of 16 mm, which look at one point of it. Training
 gets pictures and poses. It starts from a plane (`plane`) or from the depth that parallax shows (`parallax`), without and with the
@@ -111,13 +111,13 @@ def main() -> None:
     """Measure and log."""
     parser = log.options(__doc__)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--views", type=int, default=16)
-    parser.add_argument("--steps", type=int, default=0, help="training steps; 0 for 500, or 3,000 with --full")
+    parser.add_argument("--views", type=int, default=9)
+    parser.add_argument("--steps", type=int, default=0, help="training steps; 0 for 250, or 3,000 with --full")
     parser.add_argument("--starts", nargs="+", choices=["plane", "parallax"], default=["plane", "parallax"])
     parser.add_argument("--weight", type=float, default=0.0, help="weight of the loss; 0 for its default")
     chosen = parser.parse_args()
     size = (640, 512) if chosen.full else (160, 128)
-    steps = chosen.steps or (3000 if chosen.full else 500)
+    steps = chosen.steps or (3000 if chosen.full else 250)
     loss = f"triangulation:{chosen.weight}" if chosen.weight else "triangulation"
     figures: dict[str, object] = {}
     for seed in range(chosen.seeds):

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.ray_blending.ray_blending import RAY_NUMBERS
+from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS
 from gsplat_core.scene.cameras import Camera
 
 PLANE_NUMBERS = 12

@@ -189,7 +189,7 @@ def triangulate(
     """
     P = np.stack([camera.K @ camera.world_to_camera[:3] for camera in cameras])
     scaled = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
-    known = np.isfinite(matches).all(-1)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(matches).all(-1))
     pixels = np.where(known[..., None], matches, 0)
     rows = pixels[..., None] * scaled[None, :, 2:3] - scaled[None, :, :2]
     rows = np.where(known[..., None, None], rows, 0).reshape(len(matches), -1, 4)
