@@ -90,6 +90,10 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "blend_rays(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
       "Tensor flatten_ids, int width, int height, float max_alpha=0.99) -> (Tensor values, Tensor alphas, Tensor depths, "
       "Tensor medians, Tensor variances, Tensor last, Tensor median_at)");
+  // Largest blending weight [N] of each splat over the pixels; arguments as above.
+  m.def(
+      "splat_contributions(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
+      "Tensor flatten_ids, int width, int height, float max_alpha=0.99) -> Tensor");
   m.def(
       "blend_rays_backward(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
       "Tensor flatten_ids, int width, int height, Tensor alphas, Tensor depths, Tensor last, Tensor median_at, Tensor v_values, "

@@ -7,6 +7,7 @@ picture.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -82,6 +83,21 @@ def render_rays(gaussians: Gaussians, camera: Camera, values: Tensor | None = No
 
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     scales, opacities = gaussians.scales, gaussians.opacities
+    means2d, conics, *lists = _projected(gaussians, scales, opacities, camera)
+    rays, normals = splat_rays(gaussians.means, gaussians.quats, scales, viewmat, intrinsics, camera.model)
+    values = normals if values is None else torch.cat([normals, values], 1)
+    size = camera.width_px, camera.height_px
+    parts = [
+        blend_rays(means2d, conics, opacities, rays, part, *size, *lists) for part in values.split(MAX_CHANNELS, 1)
+    ]
+    return parts[0] if len(parts) == 1 else parts[0]._replace(values=torch.cat([part.values for part in parts], -1))
+
+
+def _projected(
+    gaussians: Gaussians, scales: Tensor, opacities: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return means [N, 2] and conics [N, 3] of the splats, and starts and ids of the tile lists."""
+    viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     projected = fully_fused_projection(
         gaussians.means, None, gaussians.quats, scales, viewmat[None], intrinsics[None], camera.width_px,
         camera.height_px, camera_model=camera.model, opacities=opacities,
@@ -93,14 +109,30 @@ def render_rays(gaussians: Gaussians, camera: Camera, values: Tensor | None = No
             projected.means2d, projected.radii, projected.depths, grid, conics=projected.conics,
             opacities=opacities[None],
         )  # fmt: skip
-    rays, normals = splat_rays(gaussians.means, gaussians.quats, scales, viewmat, intrinsics, camera.model)
-    values = normals if values is None else torch.cat([normals, values], 1)
-    size = camera.width_px, camera.height_px
-    parts = [
-        blend_rays(projected.means2d[0], projected.conics[0], opacities, rays, part, *size, starts[0], ids)
-        for part in values.split(MAX_CHANNELS, 1)
-    ]
-    return parts[0] if len(parts) == 1 else parts[0]._replace(values=torch.cat([part.values for part in parts], -1))
+    return projected.means2d[0], projected.conics[0], starts[0], ids
+
+
+@torch.no_grad()
+def contribution(gaussians: Gaussians, cameras: Iterable[Camera]) -> Tensor:
+    """Return the largest blending weight [N] of each Gaussian over all pixels of all views; 0 if it is in none."""
+    from gsplat_core.ops.ray_blending.ray_blending import splat_contributions
+
+    scales, opacities = gaussians.scales, gaussians.opacities
+    most = torch.zeros_like(opacities)
+    for camera in cameras:
+        means2d, conics, *lists = _projected(gaussians, scales, opacities, camera)
+        size = camera.width_px, camera.height_px
+        most = torch.maximum(most, splat_contributions(means2d, conics, opacities, *size, *lists))
+    return most
+
+
+LEAST_CONTRIBUTION = 1 / 255
+"""Largest blending weight below which a Gaussian changes no pixel of an 8-bit picture."""
+
+
+def pruned(gaussians: Gaussians, cameras: Iterable[Camera], least: float = LEAST_CONTRIBUTION) -> Gaussians:
+    """Return the Gaussians whose `contribution` to at least one view is `least` or more. Synchronises on CUDA."""
+    return gaussians.select(contribution(gaussians, cameras) >= least)
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:

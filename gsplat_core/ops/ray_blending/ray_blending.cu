@@ -283,6 +283,48 @@ __global__ void convert_sums(Inputs in, const Record<0>* records, const float* s
     out.values[i * in.channels + d] = usable ? sums[i * (kSums + in.channels) + kSums + d] : 0;
 }
 
+// Raise most[i] to the largest blending weight of splat i. Positive floats order as integers, and the maximum does not
+// depend on the order of threads.
+__global__ void __launch_bounds__(kBlockThreads)
+    raise_contributions(compositing::Inputs in, const Record<0>* records, int* most) {
+  __shared__ Record<0> staged[kBlockThreads];
+  __shared__ int staged_ids[kBlockThreads];
+  const Place place(in);
+  const Window w = place.window(in);
+  const int lane = threadIdx.x & 31;
+  const float center_x = float(w.x) + 0.5f;
+  float through[kPixelsEach];
+  bool open[kPixelsEach];
+  for (int p = 0; p < kPixelsEach; ++p) through[p] = 1, open[p] = w.inside[p];
+  for (int begin = w.begin; begin < w.end; begin += kBlockThreads) {
+    if (!__syncthreads_or(open[0] || open[1])) break;
+    const bool has = begin + int(threadIdx.x) < w.end;
+    staged[threadIdx.x] = has ? record_at(in, records, begin + int(threadIdx.x)) : faint_record<0>();
+    staged_ids[threadIdx.x] = has ? in.flatten_ids[begin + int(threadIdx.x)] : 0;
+    __syncthreads();
+    for (int group = 0; group < kBlockThreads && __any_sync(kAll, open[0] || open[1]); group += 32) {
+      unsigned hits = __ballot_sync(kAll, reaches(staged[group + lane], float(w.quadrant_x) + 0.5f, float(w.quadrant_y) + 0.5f));
+      for (; hits != 0; hits &= hits - 1) {
+        const int i = group + __ffs(int(hits)) - 1;
+        int largest = 0;
+        for (int p = 0; p < kPixelsEach; ++p) {
+          const float power = falloff(staged[i], center_x, float(w.y[p]) + 0.5f).power;
+          if (!(open[p] && power >= kLog2AlphaCutoff && power <= staged[i].cap)) continue;
+          const float alpha = exp2_fast(fminf(power, in.alpha.log2_most)), behind = fmaf(-alpha, through[p], through[p]);
+          if (!(behind > kMinTransmittance)) {
+            open[p] = false;
+            continue;
+          }
+          largest = max(largest, __float_as_int(alpha * through[p]));
+          through[p] = behind;
+        }
+        largest = __reduce_max_sync(kAll, largest);
+        if (lane == 0 && largest > 0) atomicMax(most + staged_ids[i], largest);
+      }
+    }
+  }
+}
+
 // Call run with the smallest compiled number of channels that is sufficient.
 template <class Run>
 void with_channels(int channels, const Run& run) {
@@ -301,6 +343,12 @@ void blend_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, 
   with_channels(in.channels, [&](auto channels) {
     blend<decltype(channels)::value><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, out);
   });
+}
+
+void contributions_on_device(const compositing::Inputs& in, float* most, CudaScratch& scratch, cudaStream_t stream) {
+  if (in.tiles() == 0 || in.count == 0) return;
+  const Record<0>* const records = compositing::records_of<0>(in, scratch, stream);
+  raise_contributions<<<unsigned(in.tiles()), kBlockThreads, 0, stream>>>(in, records, reinterpret_cast<int*>(most));
 }
 
 void blend_backward_on_device(const Inputs& in, const PixelGradients& from, const InputGradients& out, CudaScratch& scratch,

@@ -69,10 +69,13 @@ struct Kernels {
   // Sums the rows [first[i], first[i + 1]) of each splat and converts them to gradients, for splats [begin, end).
   void (*gather)(const Inputs& in, const compositing::SplatRecord* records, const GradientRows& from, const int32_t* first,
                  int64_t begin, int64_t end, const InputGradients& out);
+  // Raises most[i] to the largest blending weight of splat i in a tile. Tiles may be processed concurrently.
+  void (*contributions)(const compositing::Splats& splats, int64_t tile, float* most);
 };
 
 // CUDA versions; all pointers are device memory.
 void blend_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream);
+void contributions_on_device(const compositing::Inputs& in, float* most, CudaScratch& scratch, cudaStream_t stream);
 void blend_backward_on_device(const Inputs& in, const PixelGradients& from, const InputGradients& out, CudaScratch& scratch,
                               cudaStream_t stream);
 

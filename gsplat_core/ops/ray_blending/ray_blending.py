@@ -93,6 +93,29 @@ def blend_rays(
     return BlendedRays(*blended[:5])
 
 
+def splat_contributions(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+) -> Tensor:
+    """Return the largest blending weight [N] of each splat over the pixels of one image; arguments as in `blend_rays`."""
+    count = len(opacities)
+    rays, values = opacities.new_zeros(count, RAY_NUMBERS), opacities.new_zeros(count, 0)
+    most: Tensor = torch.ops.gsplat_core.splat_contributions(
+        means2d, conics, opacities, rays, values, isect_offsets, flatten_ids, image_width, image_height
+    )
+    return most
+
+
+@torch.library.register_fake("gsplat_core::splat_contributions")
+def _splat_contributions_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, *rest: Any) -> Tensor:
+    return opacities.new_empty(opacities.shape)
+
+
 @torch.library.register_fake("gsplat_core::blend_rays")
 def _blend_rays_fake(
     means2d: Tensor,

@@ -321,6 +321,58 @@ void gather(const Inputs& in, const SplatRecord* records, const GradientRows& fr
   }
 }
 
-extern const Kernels kernels = {make_records, tile, tile_backward, gather};
+// Raise *to to a positive value. Positive floats order as integers, and the maximum does not depend on the order of threads.
+GSPLAT_INLINE void raise(float* to, float value) {
+  int32_t wanted, seen;
+  __builtin_memcpy(&wanted, &value, sizeof(wanted));
+  int32_t* const at = reinterpret_cast<int32_t*>(to);
+  seen = __atomic_load_n(at, __ATOMIC_RELAXED);
+  while (seen < wanted && !__atomic_compare_exchange_n(at, &seen, wanted, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  }
+}
+
+void contributions(const compositing::Splats& splats, int64_t index, float* most) {
+  constexpr int kBatch = 64;  // splats per pass over the blocks: one bit each in a block's 64-bit mask
+  const Tile tile = compositing::tile_of(splats, index);
+  alignas(64) float through[kPixels] = {};
+  uint64_t alive = 0;
+  for (int y = 0; y < tile.bottom - tile.y; ++y)
+    for (int x = 0; x < tile.right - tile.x; ++x) through[place(x, y)] = 1, alive |= uint64_t(1) << (place(x, y) / kLanes);
+  const vfloat block_x = compositing::lane_x() + (float(tile.x) + 0.5f), block_y = compositing::lane_y() + (float(tile.y) + 0.5f);
+  for (int64_t first = tile.begin; first < tile.end && alive != 0; first += kBatch) {
+    const int32_t* const ids = splats.flatten_ids + first;
+    const int count = tile.end - first < kBatch ? int(tile.end - first) : kBatch;
+    uint64_t touched[kBlocks] = {};
+    for (int i = 0; i < count; i += kLanes)
+      test_blocks(splats.records, ids + i, count - i, float(tile.x) + 0.5f, float(tile.y) + 0.5f,
+                  [&](int block, vmask hit) { touched[block] |= uint64_t(lanes_of(hit)) << i; });
+    for (uint64_t left = alive; left != 0; left &= left - 1) {
+      const int block = __builtin_ctzll(left), at = block * kLanes;
+      const vfloat x = block_x + float(block % kColumns * kBlockWidth), y = block_y + float(block / kColumns * kBlockHeight);
+      vfloat in_front = load(through + at);
+      for (uint64_t left_splats = touched[block]; left_splats != 0; left_splats &= left_splats - 1) {
+        const int32_t id = ids[__builtin_ctzll(left_splats)];
+        const SplatRecord& record = splats.records[id];
+        const vfloat power = falloff(record, x, y).power;
+        const vmask valid = at_least(power, splat(gsplat::kLog2AlphaCutoff)) & at_least(splat(record.cap), power);
+        const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(splats.alpha.log2_most))));
+        const vfloat next = fma(-alpha, in_front, in_front);
+        const vmask open = above(next, splat(gsplat::kMinTransmittance));
+        const vfloat weight = zero_unless(open, alpha * in_front);
+        float largest = 0;
+        for (int lane = 0; lane < kLanes; ++lane) largest = weight[lane] > largest ? weight[lane] : largest;
+        if (largest > 0) raise(most + id, largest);
+        in_front = next;
+        if (lanes_of(open) == 0) {
+          alive &= ~(uint64_t(1) << block);
+          break;
+        }
+      }
+      store(through + at, in_front);
+    }
+  }
+}
+
+extern const Kernels kernels = {make_records, tile, tile_backward, gather, contributions};
 
 }  // namespace GSPLAT_ISA::ray_blending

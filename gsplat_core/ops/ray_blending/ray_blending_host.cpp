@@ -69,6 +69,10 @@ struct Arguments {
 
 void forward(Call& call, const Inputs& in, const Pixels& out) { blend_on_device(in, out, call, call.stream); }
 
+void raise_contributions(Call& call, const Inputs& in, float* most) {
+  contributions_on_device(in.splats, most, call, call.stream);
+}
+
 void backward(Call& call, const Inputs& in, const PixelGradients& from, const InputGradients& out) {
   blend_backward_on_device(in, from, out, call, call.stream);
 }
@@ -99,7 +103,25 @@ void backward(Call&, const Inputs& in, const PixelGradients& from, const InputGr
   });
 }
 
+void raise_contributions(Call&, const Inputs& in, float* most) {
+  const auto records = records_of(in);
+  compositing::Splats splats;
+  static_cast<compositing::Inputs&>(splats) = in.splats;
+  splats.records = records.get();
+  compositing::for_tiles(in.splats.tiles(), 0, [&](int64_t tile, float*) { kernels().contributions(splats, tile, most); });
+}
+
 #endif
+
+Tensor splat_contributions(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor offsets,
+                           Tensor flatten_ids, int64_t width, int64_t height, double max_alpha) {
+  Call call(means2d);
+  const Arguments arguments(call, means2d, conics, opacities, rays, values, offsets, flatten_ids, width, height, max_alpha);
+  Tensor most = call.zeros({arguments.in.splats.count});
+  raise_contributions(call, arguments.in, mutable_data(most));
+  call.finish("splat_contributions");
+  return most;
+}
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> blend_rays(Tensor means2d, Tensor conics, Tensor opacities,
                                                                               Tensor rays, Tensor values, Tensor offsets,
@@ -151,6 +173,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> blend_rays_backward(Tensor me
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("blend_rays", GSPLAT_BOX(&blend_rays));
+  m.impl("splat_contributions", GSPLAT_BOX(&splat_contributions));
   m.impl("blend_rays_backward", GSPLAT_BOX(&blend_rays_backward));
 }
 

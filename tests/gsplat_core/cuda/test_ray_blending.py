@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays
-from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, ray_scene, with_bad_values
+from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
+from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contributions, ray_scene, with_bad_values
 
 pytestmark = pytest.mark.cuda
 
@@ -96,3 +96,12 @@ def test_opcheck(gpu):
     lists = [tensor.to(gpu) for tensor in s.lists()]
     splats = [getattr(s, name).to(gpu).requires_grad_() for name in INPUTS]
     torch.library.opcheck(torch.ops.gsplat_core.blend_rays.default, (*splats, *lists, s.width, s.height))
+
+
+def test_contributions_are_the_largest_weights(gpu):
+    s = ray_scene(300)
+    splats = [tensor.to(gpu) for tensor in (s.means2d, s.conics, s.opacities)]
+    lists = [tensor.to(gpu) for tensor in s.lists()]
+    seen, again = (splat_contributions(*splats, s.width, s.height, *lists) for _ in range(2))
+    assert torch.equal(seen, again)
+    torch.testing.assert_close(seen.cpu().double(), exact_contributions(s), rtol=1e-4, atol=1e-4)

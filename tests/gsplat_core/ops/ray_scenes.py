@@ -118,6 +118,14 @@ def ray_scene(
     return RayScene(*(column.float().contiguous() for column in columns), width, height, **options)  # type: ignore[arg-type]
 
 
+def exact_contributions(s: RayScene) -> Tensor:
+    """Return the largest weight of each splat in float64: the blended values of a one-hot channel per splat."""
+    count = len(s.means2d)
+    columns = [getattr(s, name).double() for name in INPUTS[:4]]
+    blended = reference.blend_rays(*columns, torch.eye(count, dtype=torch.float64), s.width, s.height, *s.lists())
+    return blended[0].reshape(-1, count).amax(0) if count else torch.zeros(0)
+
+
 def assert_close(s: RayScene, device: str = "cpu") -> dict[str, Tensor]:
     """Compare with the reference: pixels within 2e-4 of their scale, gradients within 2e-3 of their norm.
 

@@ -10,8 +10,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays
-from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, ray_scene, with_bad_values
+from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
+from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contributions, ray_scene, with_bad_values
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4, 8, 9, MAX_CHANNELS])
@@ -133,3 +133,16 @@ def test_ops_pass_opcheck(limit: tuple[float, ...]) -> None:
             *limit,
         )
         torch.library.opcheck(ops.blend_rays_backward.default, arguments)
+
+
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_contributions_are_the_largest_weights(count: int) -> None:
+    s = ray_scene(count)
+    seen = splat_contributions(s.means2d, s.conics, s.opacities, s.width, s.height, *s.lists())
+    torch.testing.assert_close(seen.double(), exact_contributions(s), rtol=1e-4, atol=1e-4, check_dtype=False)
+
+
+def test_contribution_op_passes_opcheck() -> None:
+    s = ray_scene(30, 20, 18)
+    arguments = (*(getattr(s, name) for name in INPUTS), *s.lists(), s.width, s.height)
+    torch.library.opcheck(torch.ops.gsplat_core.splat_contributions.default, arguments)

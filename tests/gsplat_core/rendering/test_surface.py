@@ -15,7 +15,15 @@ from gsplat_core.models.model import Model
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.outputs import SURFACE_OUTPUTS
 from gsplat_core.rendering.settings import EPS2D
-from gsplat_core.rendering.surface import COVERED, Surface, certainty, depth_normals, render_surface
+from gsplat_core.rendering.surface import (
+    COVERED,
+    Surface,
+    certainty,
+    contribution,
+    depth_normals,
+    pruned,
+    render_surface,
+)
 
 CAMERA = Camera.from_focal(50.0, 45, 37)
 
@@ -241,3 +249,19 @@ def test_every_output_of_the_surface_is_registered_and_offered():
         channels = OUTPUTS[name].channels
         shape = outputs[name].shape
         assert shape[:2] == (37, 45) and (channels is None or tuple(shape[2:]) == ((channels,) if channels > 1 else ()))
+
+
+def test_gaussians_that_change_no_pixel_are_pruned(device):
+    front = wall(0.0)
+    hidden = replace(wall(0.0), means=front.means + torch.tensor([0.0, 0.0, 20.0]))
+    scene = front.append(hidden).to(device)
+    aside = np.eye(4)
+    aside[0, 3] = 3
+    cameras = [CAMERA, CAMERA.with_pose(aside)]
+    most = contribution(scene, cameras)
+    assert float(most[: front.count].max()) > 0.2
+    left = pruned(scene, cameras)
+    assert int((most[front.count :] >= 1 / 255).sum()) < 0.2 * hidden.count
+    assert left.count == int((most >= 1 / 255).sum()) < scene.count
+    before, after = (render(each, CAMERA).image for each in (scene, left))
+    torch.testing.assert_close(before, after, atol=1.5 / 255, rtol=0)
