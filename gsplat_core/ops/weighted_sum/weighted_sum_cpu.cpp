@@ -11,9 +11,12 @@ using gsplat::kTileSize;
 
 namespace {
 
-typedef double vdouble __attribute__((vector_size(kLanes * 8)));
-typedef int64_t vlong __attribute__((vector_size(kLanes * 8)));
+// Half of a vector of floats, and the same number of doubles and integers.
+typedef float hfloat __attribute__((vector_size(kLanes * 2)));
+typedef double vdouble __attribute__((vector_size(kLanes * 4)));
+typedef int64_t vlong __attribute__((vector_size(kLanes * 4)));
 
+constexpr int kBatch = 64;                                   // splats per pass over a tile's rows
 constexpr int kVectors = (kTileSize + kLanes - 1) / kLanes;  // per row of a tile
 
 GSPLAT_INLINE float limited(float c) { return c > kMostChannel ? kMostChannel : c < -kMostChannel ? -kMostChannel : c; }
@@ -60,56 +63,100 @@ GSPLAT_INLINE Row row_of(const SplatRecord& r, float dy, vfloat x) {
   return row;
 }
 
-// D is the number of channels, or 0 for any number.
+// A splat listed in a tile: its record, rows of the tile, and channels in units of the quantum.
 template <int D>
-void sum_tile(const Inputs& in, const SplatRecord* splats, int64_t tile, float* sums) {
-  const int channels = D > 0 ? D : in.channel_count;
+struct Listed {
+  SplatRecord record;
+  float weight;  // with the sign of the opacity
+  int first, last;
+  double factors[D + 1];
+};
+
+// Add the terms of one row of pixels, as integers in the low bits of doubles: each adds kMagicBits as well.
+template <int D>
+GSPLAT_INLINE void add_terms(vfloat term, const double* factors, vlong (*sums)[2]) {
+  for (int half = 0; half < 2; ++half) {
+    hfloat part;
+    __builtin_memcpy(&part, (const char*)&term + half * sizeof(part), sizeof(part));
+    const vdouble wide = __builtin_convertvector(part, vdouble);
+    for (int k = 0; k <= D; ++k) sums[k][half] += (vlong)(wide * factors[k] + kMagic);
+  }
+}
+
+// Sum D channels from `first_channel` on, and the terms themselves if `total`.
+template <int D>
+void sum_tile(const Inputs& in, const SplatRecord* splats, int64_t tile, int first_channel, bool total, float* sums) {
   const int x0 = int(tile % in.tile_width) * kTileSize, y0 = int(tile / in.tile_width) * kTileSize;
   const int right = x0 + kTileSize < in.width ? x0 + kTileSize : in.width;
   const int bottom = y0 + kTileSize < in.height ? y0 + kTileSize : in.height;
-  alignas(64) int64_t added[((D > 0 ? D : kMostChannels) + 1)][kTileSize][kVectors * kLanes];
-  for (int k = 0; k <= channels; ++k)
-    for (int y = 0; y < kTileSize; ++y)
-      for (int x = 0; x < kVectors * kLanes; ++x) added[k][y][x] = 0;
+  // Sums of the doubles' bits by row, vector of pixels, channel and half, and the number of terms in each.
+  vlong added[kTileSize][kVectors][D + 1][2];
+  int64_t terms[kTileSize][kVectors] = {};
+  __builtin_memset(added, 0, sizeof(added));
   const int64_t tiles = int64_t(in.tile_width) * in.tile_height;
   const int64_t end = tile + 1 < tiles ? in.offsets[tile + 1] : in.instances;
-  for (int64_t at = in.offsets[tile]; at < end; ++at) {
-    const int64_t i = in.flatten_ids[at];
-    const SplatRecord& r = splats[i];
-    if (r.half_height < 0) continue;
-    const Range rows = range_of(r.y, r.half_height, y0, bottom);
-    if (rows.last < rows.first) continue;
-    double factors[(D > 0 ? D : kMostChannels) + 1];
-    for (int k = 0; k < channels; ++k) factors[k] = double(limited(in.channels[i * channels + k])) * kScale;
-    factors[channels] = kScale;
-    const vfloat weight = splat(in.weights[i] * r.sign);
-    for (int y = rows.first; y <= rows.last; ++y)
+  Listed<D> listed[kBatch];
+  for (int64_t at = in.offsets[tile]; at < end;) {
+    int count = 0;
+    for (; at < end && count < kBatch; ++at) {
+      const int64_t i = in.flatten_ids[at];
+      const SplatRecord& r = splats[i];
+      if (r.half_height < 0) continue;
+      const Range rows = range_of(r.y, r.half_height, y0, bottom);
+      if (rows.last < rows.first) continue;
+      Listed<D>& to = listed[count++];
+      to.record = r;
+      to.weight = in.weights[i] * r.sign;
+      to.first = rows.first;
+      to.last = rows.last;
+      const float* const channels = in.channels + i * in.channel_count + first_channel;
+      for (int k = 0; k < D; ++k) to.factors[k] = double(limited(channels[k])) * kScale;
+      to.factors[D] = kScale;
+    }
+    for (int y = y0; y < bottom; ++y)
       for (int v = 0; v < kVectors; ++v) {
-        const Row row = row_of(r, float(y) + 0.5f - r.y, ramp() + (float(x0 + v * kLanes) + 0.5f));
-        if (lanes_of(row.reached) == 0) continue;
-        const vfloat term = larger(smaller(row.size * weight, splat(kMostTerm)), splat(-kMostTerm));
-        const vdouble wide = __builtin_convertvector(term, vdouble);
-        for (int k = 0; k <= channels; ++k) {
-          vlong sum;
-          int64_t* const to = &added[k][y - y0][v * kLanes];
-          __builtin_memcpy(&sum, to, sizeof(sum));
-          sum += (vlong)(wide * factors[k] + kMagic) - kMagicBits;
-          __builtin_memcpy(to, &sum, sizeof(sum));
+        const vfloat x = ramp() + (float(x0 + v * kLanes) + 0.5f);
+        vlong row_sums[D + 1][2];
+        __builtin_memcpy(row_sums, added[y - y0][v], sizeof(row_sums));
+        int64_t row_terms = 0;
+        for (int j = 0; j < count; ++j) {
+          const Listed<D>& from = listed[j];
+          if (y < from.first || y > from.last) continue;
+          const Row row = row_of(from.record, float(y) + 0.5f - from.record.y, x);
+          if (lanes_of(row.reached) == 0) continue;
+          const vfloat term = larger(smaller(row.size * from.weight, splat(kMostTerm)), splat(-kMostTerm));
+          add_terms<D>(term, from.factors, row_sums);
+          ++row_terms;
         }
+        __builtin_memcpy(added[y - y0][v], row_sums, sizeof(row_sums));
+        terms[y - y0][v] += row_terms;
       }
   }
   const int64_t pixels = int64_t(in.width) * in.height;
-  for (int k = 0; k <= channels; ++k)
-    for (int y = y0; y < bottom; ++y)
-      for (int x = x0; x < right; ++x)
-        sums[k * pixels + int64_t(y) * in.width + x] = float(added[k][y - y0][x - x0]) * kInverseScale;
+  for (int y = y0; y < bottom; ++y)
+    for (int x = x0; x < right; ++x) {
+      const int v = (x - x0) / kLanes, lane = (x - x0) % kLanes;
+      const int64_t pixel = int64_t(y) * in.width + x;
+      const uint64_t magic = uint64_t(terms[y - y0][v]) * uint64_t(kMagicBits);
+      for (int k = 0; k < D + int(total); ++k) {
+        const uint64_t bits = uint64_t(added[y - y0][v][k][lane / (kLanes / 2)][lane % (kLanes / 2)]);
+        const int64_t plane = k < D ? first_channel + k : in.channel_count;
+        sums[plane * pixels + pixel] = float(int64_t(bits - magic)) * kInverseScale;
+      }
+    }
 }
 
 void tile(const Inputs& in, const SplatRecord* splats, int64_t at, float* sums) {
-  switch (in.channel_count) {
-    case 3: return sum_tile<3>(in, splats, at, sums);
-    case 4: return sum_tile<4>(in, splats, at, sums);
-    default: return sum_tile<0>(in, splats, at, sums);
+  for (int first = 0; first < in.channel_count;) {
+    const int left = in.channel_count - first;
+    const bool total = first == 0;
+    switch (left) {
+      case 1: sum_tile<1>(in, splats, at, first, total, sums); break;
+      case 2: sum_tile<2>(in, splats, at, first, total, sums); break;
+      case 3: sum_tile<3>(in, splats, at, first, total, sums); break;
+      default: sum_tile<4>(in, splats, at, first, total, sums);
+    }
+    first += left < 4 ? left : 4;
   }
 }
 
