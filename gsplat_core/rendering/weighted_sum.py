@@ -43,6 +43,8 @@ OPACITY, FACTOR = "opacity_sh", "distance_factor"
 """Names of the renderer's tensors in `Gaussians.extra`: harmonics of the opacity [N, 16], and v_i [N]."""
 OPACITY_DEGREE = 3
 OPACITY_BASES = (OPACITY_DEGREE + 1) ** 2
+ROWS_AT_ONCE = 1 << 22
+"""Number of Gaussians whose opacities are evaluated at once."""
 LEAST_TOTAL = 1e-2
 """Lower limit of the sum of all weights at a pixel. Opacities may be negative, and so may their sum."""
 LEAST_SHARE = 1e-4
@@ -136,9 +138,7 @@ class WeightedSumRenderer:
         viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device, gaussians.dtype))
         position = torch.as_tensor(camera.position, dtype=gaussians.dtype).to(gaussians.device, non_blocking=True)
         directions = gaussians.means - position
-        # The op evaluates three channels; two of them are unused.
-        harmonics = gaussians.extra[OPACITY][..., None].expand(-1, -1, 3)
-        opacities = spherical_harmonics(OPACITY_DEGREE, directions, harmonics)[:, 0]
+        opacities = _opacities(gaussians.extra[OPACITY], directions)
         reach = opacities.detach().abs().clamp(max=1)
         size = camera.width_px, camera.height_px
         rows = fully_fused_projection(
@@ -165,6 +165,16 @@ class WeightedSumRenderer:
             known = sums[-1] > LEAST_SHARE
             z = torch.where(known, sums[3] / torch.where(known, sums[-1], 1.0), 0.0) * values["distance"]
         return RenderOutput((image / total).permute(1, 2, 0).contiguous(), alpha, z)
+
+
+def _opacities(harmonics: Tensor, directions: Tensor) -> Tensor:
+    """Return the opacities [N] in directions [N, 3]."""
+    # The op evaluates three channels, of which two are unused. The parts limit the memory of the copies.
+    parts = zip(harmonics.split(ROWS_AT_ONCE), directions.split(ROWS_AT_ONCE), strict=True)
+    found = [
+        spherical_harmonics(OPACITY_DEGREE, along, rows[..., None].expand(-1, -1, 3))[:, 0] for rows, along in parts
+    ]
+    return found[0] if len(found) == 1 else torch.cat(found)
 
 
 class DirectWeightedSumRenderer(WeightedSumRenderer):
