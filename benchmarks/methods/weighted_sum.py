@@ -10,18 +10,25 @@ vanishes in larger pictures.
 
 from __future__ import annotations
 
+import os
 import statistics
+import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import log
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 from gsplat_core.choices import RENDERERS
 from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.rasterization import render
+from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.rendering.weighted_sum import WeightedSumRenderer
 from gsplat_core.scene.cameras import Camera
@@ -34,6 +41,9 @@ VARIANTS = {
     "weighted_sum_direct": "gsplat_core.rendering.weighted_sum:DirectWeightedSumRenderer",
     "weighted_sum_exp": "gsplat_core.rendering.weighted_sum:ExpWeightedSumRenderer",
 }
+RECORDINGS = Path(
+    os.environ.get("INTRASPLAT_RECORDINGS", Path(__file__).resolve().parents[3] / "shared" / "recordings")
+)
 TURN_DEGREES = 0.1
 TURNS = 10
 MARGIN_PX = 8
@@ -79,10 +89,11 @@ def popping(model: Model, time_s: float, enlarged: int) -> float:
     camera = model.camera.scaled(enlarged)
     intrinsics = camera.K
     found = []
-    before, last_turn = None, np.eye(3)
+    before: np.ndarray | None = None
+    last_turn: Any = np.eye(3)
     for number in range(TURNS + 1):
         angle = np.radians(TURN_DEGREES * number)
-        turn = cv2.Rodrigues(np.array([0.35 * angle, angle, 0.0]))[0]
+        turn: Any = cv2.Rodrigues(np.array([0.35 * angle, angle, 0.0]))[0]
         pose = np.eye(4)
         pose[:3, :3] = turn
         seen = picture(model, camera.with_pose(pose @ camera.world_to_camera), time_s)
@@ -115,7 +126,7 @@ def random_scene(count: int, camera: Camera, device: str) -> Gaussians:
     return Gaussians(means, quats, scales.log(), opacities, ((rand(count, 1, 3)) - 0.5) / SH_C0)
 
 
-def milliseconds(run, device: str, repeats: int) -> float:
+def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:
     """Return the median time of a call."""
     times = []
     for _ in range(repeats + 2):
@@ -142,7 +153,7 @@ def speed(count: int, size: tuple[int, int], device: str, repeats: int) -> dict:
         order = torch.randperm(count, generator=torch.Generator().manual_seed(1)).to(device)
         same = all(torch.equal(a, b) for a, b in zip(show(extended), show(extended.select(order)), strict=True))
 
-    def step(gaussians: Gaussians, draw) -> None:
+    def step(gaussians: Gaussians, draw: Callable[[Gaussians], RenderOutput]) -> None:
         leaves = gaussians.detach().requires_grad_()
         output = draw(leaves)
         (output.image.square().sum() + output.alpha.sum()).backward()
@@ -163,7 +174,7 @@ def speed(count: int, size: tuple[int, int], device: str, repeats: int) -> dict:
 
 def main() -> None:
     parser = log.options("Weighted sum rendering beside alpha blending.")
-    parser.add_argument("--recording", default="../shared/recordings/cutting")
+    parser.add_argument("--recording", default=str(RECORDINGS / "cutting"))
     parser.add_argument("--scale", type=float)
     parser.add_argument("--frames", type=int)
     parser.add_argument("--steps", type=int)
