@@ -16,6 +16,7 @@ import statistics
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,11 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.rendering.surface import render_surface
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 from operators.applications.evaluate import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
@@ -183,6 +186,72 @@ def _normal_angle(shown: np.ndarray, camera: Camera, true: np.ndarray, known: np
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
 
 
+CLASSES = ("tissue", "tool", "background")
+
+
+def semantics(device: str, full: bool) -> dict[str, Any]:
+    """Return intersection over union per class, trained from pictures, depth and labels on one frame in ten.
+
+    Tissue rises and falls by 4 mm in 2 s in front of a wall, and a tool moves by 12 mm across it. The pictures and labels are
+    rendered from exact Gaussians, which training does not see.
+    """
+    size, count = ((320, 256), 30) if full else ((96, 80), 30)
+    camera = Camera.from_focal(1.1 * size[0], *size)
+    frames, truth = [], []
+    for seq in range(count):
+        scene, classes = _scene_at(seq / 15)
+        one_hot = torch.nn.functional.one_hot(classes, 3).float()
+        picture, surface = render(scene, camera), render_surface(replace(scene, extra={"semantics": one_hot}), camera)
+        labels = surface.semantics.argmax(-1).to(torch.uint8).numpy()
+        truth.append(labels)
+        image = (picture.image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        depth = surface.ray_depth.numpy()
+        frames.append(Frame(seq, seq * 10**9 // 15, image, depth=depth, labels=labels if seq % 10 == 0 else None))
+    config = replace(ReconstructorConfig.offline(), losses=("semantics",), gaussians=20_000 if full else 3_000)
+    reconstructor = Reconstructor(config, camera, seed=0, device=device)
+    reconstructor.fit(frames, 3000 if full else 300)
+    model = reconstructor.snapshot()
+    overlaps: dict[str, list[float]] = {name: [] for name in CLASSES}
+    for frame, wanted in zip(frames, truth, strict=True):
+        if frame.labels is not None:
+            continue
+        shown = model.surface(frame.time_s).semantics.argmax(-1).cpu().numpy()
+        for number, name in enumerate(CLASSES):
+            union = ((shown == number) | (wanted == number)).sum()
+            overlaps[name].append(float(((shown == number) & (wanted == number)).sum() / max(union, 1)))
+    figures = {f"semantics: IoU of {name}": round(statistics.mean(values), 3) for name, values in overlaps.items()}
+    mean = round(statistics.mean(figures.values()), 3)
+    return {
+        "semantics: frames": f"{size[0]}x{size[1]}, {count} frames, labels on 1 in 10",
+        **figures,
+        "semantics: mean IoU": mean,
+    }
+
+
+def _scene_at(time_s: float) -> tuple[Gaussians, torch.Tensor]:
+    """Return exact Gaussians at a time and the class of each, as an index of `CLASSES`."""
+    random = torch.Generator().manual_seed(0)
+    parts = []
+    for number, (across, down, step) in enumerate(((22, 18, 1.0), (3, 30, 0.8), (60, 50, 2.0))):
+        a, b = torch.meshgrid(torch.arange(-across, across, step), torch.arange(-down, down, step), indexing="xy")
+        a, b = a.ravel(), b.ravel()
+        if number == 0:
+            rise = 4 * math.sin(math.pi * time_s)
+            means = torch.stack([a, b, 60 - (6 + rise) * torch.exp(-(a * a + b * b) / 150)], 1)
+        elif number == 1:
+            means = torch.stack([a + 0.4 * b - 6 + 6 * time_s, b - 14, 48 + 0 * a], 1)
+        else:
+            means = torch.stack([a, b, 85 + 0 * a], 1)
+        base = torch.tensor([[0.75, 0.3, 0.28], [0.55, 0.57, 0.6], [0.45, 0.25, 0.1]])[number]
+        colours = base + 0.12 * torch.randn(len(a), 3, generator=random)
+        scales = torch.tensor([0.7 * step, 0.7 * step, 0.1]).log().repeat(len(a), 1)
+        quats = torch.tensor([1.0, 0, 0, 0]).repeat(len(a), 1)
+        sh = (colours[:, None] - 0.5) / 0.28209479177387814
+        parts.append((Gaussians(means, quats, scales, torch.full((len(a),), 4.0), sh), torch.full((len(a),), number)))
+    scene = parts[0][0].append(parts[1][0]).append(parts[2][0])
+    return scene, torch.cat([classes for _, classes in parts])
+
+
 def main() -> None:
     parser = log.options(__doc__ or "")
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS])
@@ -206,7 +275,7 @@ def main() -> None:
             chosen.device, chosen.full, choices, chosen.seeds, chosen.steps or (3000 if chosen.full else 400)
         )
     if "semantics" in parts:
-        figures |= {}
+        figures |= semantics(chosen.device, chosen.full)
     log.write("surface", chosen, figures)
 
 

@@ -22,7 +22,7 @@ class NormalConsistency:
     """
 
     name: ClassVar[str] = "normal_consistency"
-    default_weight: ClassVar[float] = 0.02
+    default_weight: ClassVar[float] = 0.1
 
     def __init__(self) -> None:
         self._turns = Turns()

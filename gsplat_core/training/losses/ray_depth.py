@@ -22,7 +22,7 @@ class RayDepth:
     """
 
     name: ClassVar[str] = "ray_depth"
-    default_weight: ClassVar[float] = 0.1
+    default_weight: ClassVar[float] = 0.2
 
     def __init__(self) -> None:
         self._turns = Turns()
