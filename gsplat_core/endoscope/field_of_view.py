@@ -60,8 +60,8 @@ class FieldOfView:
         self._shape: tuple[int, ...] = ()
         self._outline: Outline | None = None
         self._reduced: NDArray[np.bool_] = np.zeros((0, 0), bool)
-        self._brightest: NDArray[np.uint8] | None = None
-        self._darkest: NDArray[np.uint8] | None = None
+        self._extremes: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
+        """Brightest and darkest level of each pixel in the current window."""
         self._frames = 0
         self._candidates: list[Outline | None] = []
 
@@ -71,17 +71,15 @@ class FieldOfView:
             self._start(image.shape)
         scale = LONG_SIDE_PX / max(image.shape[:2])
         grey = luma(reduced(image, *(max(1, round(side * scale)) for side in image.shape[1::-1])))
-        if self._brightest is None or self._darkest is None:
-            self._brightest = self._darkest = grey
-        else:
-            self._brightest, self._darkest = np.maximum(self._brightest, grey), np.minimum(self._darkest, grey)
+        brightest, darkest = (grey, grey) if self._extremes is None else self._extremes
+        self._extremes = np.maximum(brightest, grey), np.minimum(darkest, grey)
         self._frames += 1
         if self._frames > 1 and self._shows_more(grey) and find_outline(grey, grey) is None:
             self._take(None)
         if self._frames == 1 or self._frames % WINDOW_FRAMES == 0:
-            self._consider(find_outline(self._brightest, self._darkest))
+            self._consider(find_outline(*self._extremes))
             if self._frames > 1:
-                self._brightest = self._darkest = None
+                self._extremes = None
         return self.mask
 
     def _shows_more(self, grey: NDArray[np.uint8]) -> bool:
@@ -92,7 +90,7 @@ class FieldOfView:
 
     def _start(self, shape: tuple[int, ...]) -> None:
         self._shape, self._frames, self._candidates = shape, 0, []
-        self._brightest = self._darkest = None
+        self._extremes = None
         self._take(None)
         self.changes = 0
 

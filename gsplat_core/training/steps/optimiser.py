@@ -174,10 +174,9 @@ class FusedAdam:
         With zero moments, the first steps of new rows are 3 to 6 times as large as usual, increasing with the step
         count. With `usual`, their second moments are the mean of the other rows.
         """
-        self._need_rows()
+        used = self.count
         if count < 0:
             raise InvalidInput(f"cannot append {count} rows")
-        used = self.count
         self.reserve(used + count)
         self._spare_rows -= count
         if usual and used:

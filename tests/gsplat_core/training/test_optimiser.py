@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.rows import RowMoves
 from gsplat_core.training.steps.optimiser import FusedAdam
 
 RATES = {"means": 0.01, "sh": 0.002, "logit_opacities": 0.05}
@@ -124,8 +125,17 @@ def test_dense_tensors_skip_single_elements():
     gradient[0, 3] = torch.nan
     assert optimiser.step(plane, {"plane": gradient}) == 1
     assert (plane["plane"] == 0).sum() == 1
-    with pytest.raises(InvalidInput, match="rows=False"):
-        optimiser.append(1)
+    changes = (
+        lambda: optimiser.append(1),
+        lambda: optimiser.select(torch.tensor([0])),
+        lambda: optimiser.close_gaps(RowMoves.without(torch.tensor([True, False]))),
+        lambda: optimiser.restart(1),
+        lambda: optimiser.count,
+    )
+    for change in changes:
+        with pytest.raises(InvalidInput, match="rows=False"):
+            change()
+    assert optimiser.first_moments["plane"].shape == (2, 5)
 
 
 def test_no_gaussians_at_all():
