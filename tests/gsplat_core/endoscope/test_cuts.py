@@ -193,3 +193,21 @@ def test_every_fifteenth_frame_is_a_view_of_its_scene_and_four_are_kept(monkeypa
         counts.append(len(detector._views))
     assert [counts[k] for k in (13, 14, 28, 29, 59, 89)] == [0, 1, 1, 2, 4, 4]
     assert (detector._views.maxlen, detector._earlier.maxlen, detector._rate._recent.maxlen) == (4, 8, 15)
+
+
+def test_structure_is_that_of_the_blocks_up_to_a_shift_of_eight_pixels():
+    """Blocks of a shifted picture are found again, those of other tissue are not, and a flat picture has none."""
+    image = texture(1, 1, 200, 160)[0]
+    one, shifted = image[:128, :160], image[4:132, 6:166]
+    other = texture(2, 1)[0]
+    found = [cuts.likeness(cuts.View(one), cuts.View(picture)).structure for picture in (one, shifted, other)]
+    assert found[0] == pytest.approx(1, abs=1e-4)
+    assert found[1] > 0.9 > 0.6 > found[2] > 0
+    assert cuts.likeness(cuts.View(np.full_like(one, 120)), cuts.View(one)).structure == 0
+
+
+def test_a_quarter_that_moved_far_is_found_anywhere():
+    image = texture(1, 1, 260, 208)[0]
+    one, moved = cuts.View(image[:128, :160]), cuts.View(image[60:188, 76:236])
+    assert cuts.likeness(one, moved).moved == cuts.likeness(moved, one).moved > 0.8
+    assert cuts.likeness(one, cuts.View(texture(2, 1)[0])).moved < 0.6

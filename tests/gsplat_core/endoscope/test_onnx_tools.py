@@ -263,3 +263,23 @@ def test_large_pictures_are_averaged_on_reduction(tmp_path):
     network = OnnxToolFinder(write(tmp_path / "net.onnx", nodes, parts))._network
     chequers = np.repeat(((np.indices((128, 160)).sum(0) % 2) * 255)[..., None], 3, axis=2).astype(np.uint8)
     np.testing.assert_allclose(network.run(chequers), 0.5, atol=0.01)
+
+
+def test_settings_of_any_length_are_not_read(tmp_path):
+    path = grey_network(tmp_path / "net.onnx", metadata={"values": "logits", "output": 70_000 * "x"})
+    assert f"{path}: metadata" in refused(path) and "is larger than 64 KiB" in refused(path)
+
+
+@pytest.mark.parametrize(("threads", "opened"), [(1, [1]), (2, [1, 2]), (3, [1, 3])])
+def test_a_network_is_opened_again_only_for_more_threads(tmp_path, monkeypatch, threads, opened):
+    import onnxruntime
+
+    made, real = [], onnxruntime.InferenceSession
+
+    def session(data, options, *arguments, **named):
+        made.append(options.intra_op_num_threads)
+        return real(data, options, *arguments, **named)
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", session)
+    check(OnnxToolFinder(grey_network(tmp_path / "net.onnx", metadata={"threads": threads})).find(picture()))
+    assert made == opened

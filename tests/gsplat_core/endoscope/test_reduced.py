@@ -46,3 +46,13 @@ def test_averages_keep_the_colour_and_lose_noise(rng, size, samples):
 def test_quantiles_are_values_with_as_many_below(rng, count, share):
     values = rng.random(count)
     assert median_of(values, share) == np.sort(values)[int(share * count)]
+
+
+def test_averages_are_those_of_the_sampled_pixels(rng):
+    """Two samples per side of a result pixel are the upper left of every 2x2 pixels; a single one averages all of them."""
+    image = rng.integers(0, 256, (32, 48, 3), np.uint8)
+    mean = lambda some: some.reshape(8, some.shape[0] // 8, 12, some.shape[1] // 12, 3).mean(axis=(1, 3))
+    assert np.abs(averaged(image, (12, 8), 2) - mean(image[::2, ::2])).max() <= 0.5
+    assert np.abs(averaged(image, (12, 8), 4) - mean(image)).max() <= 0.5
+    assert np.abs(averaged(image, (12, 8), 9) - mean(image)).max() <= 0.5, "there are only four"
+    assert np.abs(averaged(image, (12, 8), 1) - mean(image)).max() <= 0.5

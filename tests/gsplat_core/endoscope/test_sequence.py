@@ -193,3 +193,22 @@ def test_one_colour_has_a_small_spread_in_every_channel(spread, is_one_colour):
         spotted[:, ::8, channel] += rng.integers(0, spread + 1, (128, 16), np.uint8)
         spotted[:, ::16, channel] += np.uint8(spread - 3)
         assert (SequenceCheck().fault(spotted, 0) == "one colour") == is_one_colour
+
+
+def test_a_strip_that_seldom_changes_is_no_tear():
+    """Rows are compared only if they changed in nine of ten frames; the strip changes in one of four."""
+    images = [image.copy() for image in texture(5, 40)]
+    for k, image in enumerate(images):
+        image[-40:] = images[4 * (k // 4)][-40:]
+    assert set(faults(images)) == {None}
+
+
+@pytest.mark.parametrize(("coloured", "fault"), [(False, "torn"), (True, None)])
+def test_a_new_lower_part_that_varies_in_one_channel_only_is_no_tear(coloured, fault):
+    def change(image, before):
+        image[len(image) // 2 :] = 128
+        # The last row has no content, so that the rows above it decide.
+        image[len(image) // 2 : -1, ::8, 2] += np.uint8(60 * coloured)
+        return image
+
+    assert faults(with_changed(texture(1, 20), 12, change))[12] == fault

@@ -82,3 +82,19 @@ def test_waves_begin_with_what_rests() -> None:
 def test_the_same_tracks_give_the_same_bytes() -> None:
     tracks, _ = seen()
     assert fitted(tracks, TRUE, rounds=3).terms.tobytes() == fitted(tracks, TRUE, rounds=3).terms.tobytes()
+
+
+def test_points_without_observations_get_the_usual_distance_and_stay_where_they_were_across() -> None:
+    """The median distance is that of the others. Sideways nothing is known, so that only the start counts."""
+    tracks, points = seen(breathes=0.0)
+    seen_by = tracks.seen.copy()
+    seen_by[:, :20] = False
+    tracks = GridTracks(tracks.rays, seen_by, tracks.poses, tracks.times_s, tracks.focal_px, tracks.extent)
+    middle = tracks.poses[len(tracks.poses) // 2]
+    begin = points[0].copy()
+    begin[:20] += 5 * middle[2, :3]  # farther away, along the axis of the middle pose
+    rest = fitted(tracks, (), begin, 1).at(np.zeros(1))[0]
+    found, begun = (each @ middle[:3, :3].T + middle[:3, 3] for each in (rest, begin))
+    usual = np.median(begun[:, 2])
+    np.testing.assert_allclose(found[:20, 2], usual, rtol=1e-6)
+    np.testing.assert_allclose(found[:20, :2], begun[:20, :2], rtol=1e-6, atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth.maps import measured_confidence
+from gsplat_core.depth.maps import believed_depth, measured_confidence, possible_depth
 from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
@@ -103,3 +103,35 @@ def test_recorded_depth_keeps_its_values_and_says_which_it_doubts():
     sure = np.full_like(depth, 0.7)
     frame = frame.with_fields(depth_confidence=sure)
     assert finder.with_depth(frame) is frame, "a confidence that came with it is kept"
+
+
+def square(margin_px: int) -> np.ndarray:
+    """The picture without a square of unknown depth and a margin around it."""
+    inside = np.ones((ROWS, COLUMNS), bool)
+    inside[10 - margin_px : 20 + margin_px, 15 - margin_px : 30 + margin_px] = False
+    return inside
+
+
+def test_start_values_keep_half_of_the_margin_of_depth_that_is_trained_on() -> None:
+    """Stereo has margins of 2 px around unknown pixels and 4 px around tools."""
+    depth, mask = slope(), np.ones((ROWS, COLUMNS), np.uint8)
+    mask[:, 45:] = 0
+    confidence = np.where(square(0), np.float32(0.9), np.float32(0))
+    confidence[30:] = 0.1  # only a start value
+    confidence[36:] = 0.02  # unknown
+    frame = Frame(
+        0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), mask=mask, depth=depth, depth_confidence=confidence,
+        depth_origin=DEPTH_ORIGINS["stereo"],
+    )  # fmt: skip
+    rows = np.arange(ROWS)[:, None]
+    known = square(2) & (rows < 28)
+    assert np.array_equal(believed_depth(frame), np.where(known, depth, 0))
+    known = square(1) & (rows < 35) & (np.arange(COLUMNS) < 41)
+    assert np.array_equal(possible_depth(frame), np.where(known, depth, 0))
+
+
+def test_depth_without_a_confidence_is_believed_and_no_depth_is_unknown() -> None:
+    frame = Frame(0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), depth=slope(), depth_origin=DEPTH_ORIGINS["parallax"])
+    assert np.array_equal(possible_depth(frame), slope()) and np.array_equal(believed_depth(frame), slope())
+    frame = frame.with_fields(depth=None, depth_origin=None)
+    assert not possible_depth(frame).any() and not believed_depth(frame).any()

@@ -73,7 +73,18 @@ def test_what_neither_pixel_shows_is_marked():
         ({"translation_mm": np.array([4.0, 0, 0])}, "swap the eyes"),
         ({"translation_mm": np.array([-1.0, 4, 0])}, "not to the right"),
         ({"translation_mm": np.zeros(3)}, "the eyes are 0 mm apart"),
+        ({"translation_mm": np.array([-1.01e4, 0, 0])}, "the eyes are 10100 mm apart"),
+        ({"translation_mm": np.array([-0.9e-3, 0, 0])}, r"the eyes are 0\.0009 mm apart"),
+        ({"translation_mm": np.array([-np.inf, 0, 0])}, "the eyes are inf mm apart"),
+        ({"translation_mm": np.array([-1.0, 0, -4])}, "not to the right"),
         ({"rotation": np.diag([1.0, 1, -1])}, "is not a rotation matrix"),
+        ({"rotation": 1.01 * np.eye(3)}, "is not a rotation matrix"),
+        ({"left_K": np.array([[300.0, 0, 2e6], [0, 300, 128], [0, 0, 1]])}, "the left eye's intrinsics"),
+        ({"right_K": np.array([[300.0, 0, np.nan], [0, 300, 128], [0, 0, 1]])}, "the right eye's intrinsics"),
+        ({"right_K": np.array([[300.0, 0, 160], [0, 0.9, 128], [0, 0, 1]])}, "the right eye's intrinsics"),
+        ({"left_distortion": np.array([0, 0, -1001.0, 0])}, "the left eye's distortion"),
+        ({"right_K": np.array([[300.0, 0, 160], [0, 300, 256], [0, 0, 1]])}, "the right eye's principal point"),
+        ({"right_K": np.array([[300.0, 0, 160], [0, 300, 0], [0, 0, 1]])}, "the right eye's principal point"),
         ({"left_K": np.diag([0.0, 300, 1])}, "impossible for a camera"),
         ({"right_distortion": np.array([np.nan, 0, 0, 0])}, "impossible for a lens"),
         ({"size": (640, 512)}, "is for pictures of"),
@@ -83,3 +94,20 @@ def test_what_neither_pixel_shows_is_marked():
 def test_a_calibration_that_cannot_be_is_refused(fields, sentence):
     with pytest.raises(InvalidInput, match=sentence):
         Rectification(replace(CALIBRATION, **fields), *SIZE)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"translation_mm": np.array([-0.99e4, 0, 0])},
+        {"translation_mm": np.array([-1.1e-3, 0, 0])},
+        {"translation_mm": np.array([-4.0, 4, 0])},
+        {"left_K": np.array([[300.0, 0, 0.9e6], [0, 300, 128], [0, 0, 1]])},
+        {"left_K": np.array([[1.1, 0, 160], [0, 1.1, 128], [0, 0, 1]])},
+        {"left_distortion": np.array([0, 0, -999.0, 0])},
+        {"left_distortion": np.zeros(0)},
+        {"rotation": (1 + 4e-4) * np.eye(3)},
+    ],
+)
+def test_a_calibration_within_the_limits_is_possible(fields):
+    assert replace(CALIBRATION, **fields).wrong() is None

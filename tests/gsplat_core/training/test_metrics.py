@@ -133,3 +133,12 @@ def test_wrong_shapes_and_types_are_refused(pair):
         psnr_frame_db(image[..., 0], target, mask)
     with pytest.raises(InvalidInput, match="int64"):
         psnr_frame_db(image.astype(np.int64), target, mask)
+
+
+@pytest.mark.parametrize(
+    ("error", "psnr_db"), [(1e-1, 20), (1e-3, 60), (1e-4, 80), (2e-5, 93.979), (1e-5, 100), (1e-6, 100)]
+)
+def test_psnr_is_exact_up_to_the_cap(error, psnr_db):
+    image = np.zeros((4, 4, 3))
+    assert psnr_tissue_db(image, image + error) == pytest.approx(psnr_db, abs=1e-3)
+    assert psnr_frame_db(image, image + error) == pytest.approx(psnr_db, abs=1e-3)

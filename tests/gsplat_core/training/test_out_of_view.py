@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import RowMoves
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.growth.moving_view import OutOfView
 from gsplat_core.training.growth.unseen import Archive, LastSeen, pixels_of
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
@@ -182,3 +185,18 @@ def test_a_published_model_knows_what_was_not_seen(device):
     assert model.unseen_s.shape == (model.gaussian_count,) and model.unseen_s.max() > 1.5
     assert share(here).median() > 0.99 and share(there).median() < 0.01
     assert torch.equal(first.unseen_s, before), "an earlier model stays as it was"
+
+
+@pytest.mark.parametrize("capacity", [300, 30])
+def test_visibility_is_tested_every_eighth_frame_or_in_every_one_if_there_is_no_capacity(capacity):
+    """The scope moves on after the first frame."""
+    out_of_view = OutOfView(capacity, torch.device("cpu"))
+    scene = moved(30)
+    step = SimpleNamespace(gaussians=scene, at=lambda time_s: scene)
+    unseen = []
+    for k in range(18):
+        frame = frame_at(k, 0 if k == 0 else 8 * WIDTH, time_s=k / 100)
+        out_of_view.follow(step, Observation.of(frame, CAMERA.with_pose(frame.pose)))
+        unseen.append(out_of_view.unseen_s(30).max().item())
+    expected = [8 * (k // 8) / 100 if capacity == 300 else k / 100 for k in range(18)]
+    assert unseen == pytest.approx(expected, abs=1e-6)

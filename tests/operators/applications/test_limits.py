@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
+from gsplat_core.deformation.kinds import PARAMETER_BYTES
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.training.config import ReconstructorConfig
 from operators.applications import limits
 from operators.settings import check_option
+from operators.sources.source import SourceDescription
 
 
 def camera(width_px, height_px):
@@ -82,3 +86,30 @@ def test_too_many_frames_are_refused():
     assert limits.frames_to_render((5.0, 1004.999), 1000) == 1_000_000
     with pytest.raises(InvalidSetting, match=r"from 5 to 1005 s is 1e\+06 frames at fps 1000; at most 1000000"):
         limits.frames_to_render((5.0, 1005.0), 1000)
+
+
+def test_the_memory_of_a_replay_is_the_sum_of_its_parts():
+    """Frames, Gaussians and the field: each of them counts, and only up to the window except offline."""
+    size = {"width_px": 640, "height_px": 512}
+    config = ReconstructorConfig(gaussians=10_000, max_gaussians=30_000, window_frames=60, motion_spacing_s=0.1)
+
+    def needed(frames, config=config, *, offline=False, **changed):
+        source = SourceDescription("x", fps=25.0, frame_count=frames, camera=None, **{**size, **changed})
+        return limits.replay_bytes(source, config, offline=offline)
+
+    pixels = 640 * 512
+    per_second = needed(1060) - needed(1035)
+    assert per_second > 0, "the field grows with the duration"
+    assert needed(60) - needed(35) == per_second + 25 * 26 * pixels
+    assert needed(None) == needed(60)
+    assert needed(60, width_px=1280) - needed(60) == (200 + 26 * 60) * pixels
+    more = replace(config, gaussians=20_000)
+    assert needed(60, more) > needed(60) + 10_000 * PARAMETER_BYTES
+    assert needed(60, replace(config, max_gaussians=40_000)) == needed(60)
+    assert needed(60, replace(more, gaussians=30_000)) + 40 * 26 * pixels + 40 / 25 * 3 * per_second == pytest.approx(
+        needed(100, offline=True), rel=1e-3
+    )
+
+
+def test_the_memory_of_a_render():
+    assert limits.render_bytes(640, 512, 1000) == 16 * 2**20 + 640 * 512 * 60 + 12_000

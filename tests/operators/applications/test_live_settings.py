@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from operators.applications.live_settings import LiveSettings
+from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.frame_clock import ClockSettings
 
 
@@ -39,3 +40,16 @@ def test_a_cpu_keeps_frames_waiting_for_less_long_and_uses_more_of_their_time() 
     cpu, cuda = chosen("cpu"), chosen("cuda")
     assert (cpu.catch_up_intervals or 0) < (cuda.catch_up_intervals or 0)
     assert (cpu.auto_share or 0) > (cuda.auto_share or 0)
+
+
+@pytest.mark.parametrize(
+    ("device", "pixels", "gaussians"),
+    [
+        ("cpu", 10_000, 10_000 // PIXELS_PER_GAUSSIAN), ("cpu", 640 * 512, 12_000), ("cpu", 3840 * 2160, 12_000),
+        ("cuda", 10_000, 10_000 // PIXELS_PER_GAUSSIAN), ("cuda", 640 * 512, 45_000), ("cuda", 1280 * 720, 70_892),
+        ("cuda", 1920 * 1080, 100_000), ("cpu", 100, 64), ("cuda", 100, 64),
+    ],
+)  # fmt: skip
+def test_large_pictures_get_more_gaussians_on_a_gpu_and_small_ones_fewer_on_both(device, pixels, gaussians) -> None:
+    config = LiveSettings("source", Path("out"), device=device).reconstructor_config(pixels)
+    assert (config.gaussians, config.max_gaussians) == (gaussians, 2 * gaussians)
