@@ -1,4 +1,4 @@
-"""Generate RESULTS.md, and the figures in README.md, from the logs in `benchmarks/logs`.
+"""Generate RESULTS.md, results/methods.md and the figures in README.md from the logs in `benchmarks/logs`.
 
     python benchmarks/publish.py            # writes
     python benchmarks/publish.py --check    # exit code 1 where a written figure and its log differ
@@ -20,9 +20,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parent / "methods"))
+
+from accepted import methods_text
+
 ROOT = Path(__file__).resolve().parent.parent
 LOGS = ROOT / "benchmarks" / "logs"
 RESULTS = ROOT / "benchmarks" / "RESULTS.md"
+METHODS = ROOT / "benchmarks" / "results" / "methods.md"
 README = ROOT / "README.md"
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 ENVELOPE = ("benchmark", "run", "commit", "date", "machine", "command", "seconds")
@@ -394,7 +399,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 where a file would change")
     options = parser.parse_args()
-    wanted = {RESULTS: results_text(), README: with_figures(README.read_text(encoding="utf-8"))}
+    wanted = {
+        RESULTS: results_text(),
+        METHODS: methods_text(),
+        README: with_figures(README.read_text(encoding="utf-8")),
+    }
     stale = [path for path, text in wanted.items() if not path.exists() or path.read_text(encoding="utf-8") != text]
     if options.check:
         for path in stale:

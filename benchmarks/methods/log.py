@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,7 +33,8 @@ def write(method: str, chosen: argparse.Namespace, figures: Mapping[str, Any]) -
         print(f"{name:44s} {value}")
     if chosen.out is None:
         return
-    stated = " ".join(["python", f"benchmarks/methods/{method}.py", *sys.argv[1:]])
+    stated = re.sub(r" --out \S+", "", " ".join(["python", f"benchmarks/methods/{method}.py", *sys.argv[1:]]))
+    stated = re.sub(r"\S*/recordings/", "{recordings}/", stated)
     about = {
         "benchmark": f"methods/{method}",
         "command": stated,

@@ -35,6 +35,15 @@ KEPT = {
     "training_db": "quality.training.psnr_tissue_db",
 }
 """Figures and their places in the report of the command."""
+GEOMETRY = {
+    "depth_rmse_share": "geometry.depth.rmse_share",
+    "plane_rmse_share": "geometry.depth.plane_rmse_share",
+    "normals_mean_deg": "geometry.normals.mean_deg",
+    "points_mean_mm": "geometry.tracking.model.mean_mm",
+    "points_still_mean_mm": "geometry.tracking.still.mean_mm",
+    "error": "error",
+}
+"""Figures and their places in the result of the evaluation."""
 
 
 def recordings(folder: Path, seeds: int, frames: int) -> dict[str, Path]:
@@ -79,8 +88,9 @@ def train(path: Path, variant: tuple[str, ...], device: str, steps: int, options
             return report
         figures: dict[str, Any] = {name: at(report, path) for name, path in KEPT.items()}
         figures["wall_s"] = round(time.perf_counter() - start, 1)
-        if (path / "tracks.npy").exists() if path.is_dir() else False:
-            figures["geometry"] = command("evaluate", out, str(path), "--protocol", "geometry", "--device", device)
+        if (path / "tracks.npy").exists():
+            evaluated = command("evaluate", out, str(path), "--protocol", "geometry", "--device", device)
+            figures |= {name: at(evaluated, path) for name, path in GEOMETRY.items()}
     return figures
 
 

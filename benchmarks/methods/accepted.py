@@ -1,0 +1,259 @@
+"""Text of results/methods.md: required and measured figures of each splatting method, from `logs/methods`.
+
+`publish.py` writes the file. A line whose figure is in no log says so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).resolve().parents[1] / "logs" / "methods"
+DEVICES = ("cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A required figure of one log.
+
+    Attributes:
+        what: the figure in words.
+        path: keys of the value in the log. Several paths separated by spaces are printed one after another.
+        asked: the requirement in words; empty for a figure that is only reported.
+        digits: digits after the point.
+        scale: the printed figure is the value times this.
+        unit: printed after the figure.
+        note: reason for a requirement that is not met.
+    """
+
+    what: str
+    path: tuple[str, ...]
+    asked: str = ""
+    digits: int = 2
+    scale: float = 1.0
+    unit: str = ""
+    note: str = ""
+
+
+def figure(what: str, path: str, asked: str = "", digits: int = 2, *, unit: str = "", scale: float = 1.0, note: str = "") -> Figure:  # fmt: skip
+    return Figure(what, tuple(path.split("|")), asked, digits, scale, unit, note)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A section of the page: the log's name, and its figures."""
+
+    title: str
+    log: str
+    figures: Sequence[Figure]
+
+
+SIZES = ("1M", "10M", "50M", "106M")
+TIMES = {
+    "alpha": "alpha_ms", "stochastic, 1 sample": "stochastic_1_ms", "4 samples": "stochastic_4_ms",
+    "16 samples": "stochastic_16_ms", "points": "points_1_ms", "weighted sum": "weighted_sum_ms", "gsplat": "gsplat_ms",
+    "stochastic to 35 dB": "stochastic_to_35_db.ms", "points to 35 dB": "points_to_35_db.ms",
+}  # fmt: skip
+METHODS = (
+    Method(
+        "1, 2. Stochastic transparency and points", "stochastic",
+        (
+            figure("stochastic: mean of z", "z_fragments.mean", "within ±0.02", 4),
+            figure("stochastic: variance of z", "z_fragments.variance", "0.97 to 1.03", 4),
+            figure("stochastic: share of pixels with z beyond ±5", "z_fragments.share_above_5", "at most 1e-5", 6),
+            figure("stochastic: PSNR per doubling of samples", "db_per_doubling_fragments", "3.01 ± 0.1", unit="dB"),
+            figure("points: mean of z", "z_points.mean", "within ±0.02", 4),
+            figure("points: variance of z", "z_points.variance", "0.97 to 1.03", 4),
+            figure(
+                "points: share of pixels with z beyond ±5", "z_points.share_above_5", "at most 1e-5", 6,
+                note="one of 28,796 values; a single value exceeds the bound",
+            ),
+            figure("points: PSNR per doubling of samples", "db_per_doubling_points", "3.01 ± 0.1", unit="dB"),
+            figure("points against alpha at pixel centres, S = 4", "points_to_alpha_at_pixel_centres_db|4", "at least 45", unit="dB"),
+            figure("Poisson counts: smallest p of 20 rates", "poisson_smallest_p", "above 0.01", 4),
+            figure("few huge splats, time relative to equal fragments", "huge_against_small.ratio", "at most 1.5"),
+            figure("quantised against not quantised", "quantised.psnr_to_unquantised_db", "at least 45", unit="dB"),
+            *(
+                figure(f"memory beside parameters, frame and queue at {size}", f"speed_{size}.memory_stochastic_1.peak_share", "at most 2 %", 2, scale=100, unit="%", note="negative: splats of low opacity are dropped")
+                for size in SIZES
+            ),
+        ),
+    ),
+    Method(
+        "1, 2. A file of 10 million splats on a path of 600 frames", "pretrained",
+        (
+            figure("alpha", "bench alpha|fps_p50", "", 0, unit="frames/s"),
+            figure("stochastic, 1 sample", "bench stochastic --samples 1|fps_p50", "", 0, unit="frames/s"),
+            figure("stochastic, 16 samples", "bench stochastic --samples 16|fps_p50", "", 0, unit="frames/s"),
+            figure("points, 1 sample", "bench points --samples 1|fps_p50", "", 0, unit="frames/s"),
+            figure("time to load the .ply", "load|s", "", unit="s"),
+            figure("memory while loading relative to the tensors", "load|peak_growth_over_tensors", ""),
+        ),
+    ),
+    Method(
+        "3. Weighted sum", "weighted_sum",
+        (
+            figure("trained on cutting: held out against alpha", "heldout_minus_alpha_db", "at least -1.0", unit="dB"),
+            figure("popping against alpha, turns of 0.1°", "popping_ratio|1x", "at most 0.5", note="alpha's pictures pop little on this scene of one surface; the rest of the difference is resampling, which both share"),
+            figure("popping against alpha, twice the size", "popping_ratio|2x", ""),
+            figure("time against alpha at 1 M, forward", "speed|1|time_ratio", "at most 1.3", note="no sort is needed, but every splat is summed in fixed point, and no pixel ends early"),
+        ),
+    ),
+    Method(
+        "4. Ray depth, normals, semantics", "surface",
+        (
+            figure("wall at 35°: error of ray depth", "wall 35 deg: ray depth, largest error %", "at most 0.3", 4, unit="%"),
+            figure("wall at 35°: error of centre depth", "wall 35 deg: centre depth, largest error %", "", unit="%"),
+            figure("wall at 60°: error of ray depth", "wall 60 deg: ray depth, largest error %", "", unit="%", note="splats at grazing angles end at the border of the wall; centre depth has the same border"),
+            figure("extra time of a training step", "step: extra cost of both %", "at most 25", 0, unit="%", note="the losses leave the captured CUDA graph; the captured step takes 0.5 ms"),
+            figure("stereo: depth against today", "stereo: ray_depth,normal_consistency, ray depth, RMS %", "at most 0.9 of today's", 3, unit="%"),
+            figure("stereo: depth today", "stereo: today, ray depth, RMS %", "", 3, unit="%"),
+            figure("stereo: normals", "stereo: ray_depth,normal_consistency, normals of ray depth, mean deg", "at most 4.5", unit="°"),
+            figure("stereo: normals today", "stereo: today, normals of ray depth, mean deg", "", unit="°"),
+            figure("stereo: third view against today", "stereo: ray_depth,normal_consistency, third view, dB", "at least -0.3 dB", unit="dB"),
+            figure("stereo: third view today", "stereo: today, third view, dB", "", unit="dB"),
+            figure("semantics: IoU with labels on one frame in ten", "semantics: IoU, mean", "at least 0.9"),
+        ),
+    ),
+    Method(
+        "5. Flow and occlusion", "flow",
+        (
+            figure("rigid motion: largest error", "rigid_largest_px", "at most 1e-3", 5, unit="px"),
+            figure("5 % affine: p95", "affine_p95_px", "at most 0.03", 4, unit="px"),
+        ),
+    ),
+    Method(
+        "6. Triangulation", "triangulation",
+        (
+            figure("loss of a surface displaced by 5 %", "seed0_loss_of_surface_displaced_by_5_percent", "above 0.1"),
+            figure("loss of the true surface", "seed0_loss_of_true_surface", ""),
+            figure("gradients that move it back", "seed0_gradients_that_move_it_back", "", 1, scale=100, unit="%"),
+            figure("Chamfer against today, start on a plane", "seed0_plane_chamfer_ratio", "at most 0.85", 3),
+            figure("Chamfer against today, start from parallax", "seed0_parallax_chamfer_ratio", "at most 0.85", 3),
+        ),
+    ),
+    Method(
+        "7. Range sensors", "range_sensors",
+        (
+            figure("time of flight: depth Chamfer against the camera alone", "time_of_flight_ratio", "at most 0.5", 3),
+            figure("structured light", "structured_light_ratio", "at most 0.5", 3),
+            figure("OCT line", "oct_line_ratio", "at most 0.5", 3, note="one line constrains only the splats that it crosses"),
+        ),
+    ),
+    Method(
+        "8. Splat regression and birth-death", "regression",
+        (
+            figure("closed forms against autograd", "closed_form_error", "at most 1e-10", 17),
+            figure("final loss relative to Adam: ratio of medians", "ratio_of_medians", "at most 0.1", 3, note="10 seeds; the ratio depends on the seeds that do not leave the corner"),
+            figure("final loss relative to Adam: median ratio", "median_ratio", "at most 0.1", 3),
+        ),
+    ),
+    Method(
+        "10. Cut Gaussians (experimental)", "cut_gaussians",
+        (figure("gain at equal bytes", "gain_db", "at least 0.5", unit="dB"),),
+    ),
+)  # fmt: skip
+
+
+def log_of(method: str, device: str, folder: Path) -> dict[str, Any] | None:
+    """Return the log of a method on a device, or None."""
+    path = folder / f"{method}-{device}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def value_at(log: Any, path: Sequence[str]) -> Any:
+    """Return the value at a path. A key with dots may also be a path of keys."""
+    value = log
+    for key in path:
+        if isinstance(value, list):
+            value = value[int(key)] if int(key) < len(value) else None
+        elif isinstance(value, Mapping):
+            value = value[key] if key in value else value_at(value, key.split(".")) if "." in key else None
+    return value
+
+
+def cell(figure: Figure, log: Mapping[str, Any] | None) -> str:
+    value = None if log is None else value_at(log, figure.path)
+    if not isinstance(value, int | float):
+        return "–"
+    text = f"{figure.scale * value:.{figure.digits}f}" if figure.digits < 10 else f"{value:.1e}"
+    return f"{text} {figure.unit}".strip()
+
+
+def provenance(logs: Mapping[str, Mapping[str, Any]]) -> str:
+    parts = []
+    for device, log in logs.items():
+        machine = log["machine"]
+        name = machine.get("gpu") or f"{machine['cpu']}, {machine['cores']} cores"
+        parts.append(f"{device}: commit {log['commit']}, {log['date']}, {name}, `{log['command']}`")
+    return "; ".join(parts)
+
+
+def section(method: Method, folder: Path) -> str:
+    """Return the table of one method."""
+    logs = {device: log for device in DEVICES if (log := log_of(method.log, device, folder)) is not None}
+    lines = ["| figure | required | CPU | GPU | note |", "|---|---|---|---|---|"]
+    for each in method.figures:
+        cpu, gpu = (cell(each, logs.get(device)) for device in DEVICES)
+        lines.append(f"| {each.what} | {each.asked or '–'} | {cpu} | {gpu} | {each.note} |")
+    return f"## {method.title}\n\n" + "\n".join(lines) + "\n\n" + (provenance(logs) or "Not measured yet.")
+
+
+def speed(folder: Path) -> str:
+    """Return the frame times by number of splats."""
+    log = log_of("stochastic", "cuda", folder)
+    if log is None:
+        return ""
+    lines = ["| splats | " + " | ".join(TIMES) + " | peak memory (MB) |", "|---" * (len(TIMES) + 2) + "|"]
+    for size in SIZES:
+        cells = []
+        for path in TIMES.values():
+            value = value_at(log, (f"speed_{size}", path))
+            cells.append(f"{value:.1f}" if isinstance(value, int | float) else "–")
+        peak = value_at(log, (f"speed_{size}", "memory_stochastic_1.peak_mb"))
+        lines.append(f"| {size} | " + " | ".join(cells) + f" | {'–' if peak is None else f'{peak:.0f}'} |")
+    text = (
+        "Milliseconds a frame of 1920x1080 on one GPU, of random scenes of degree 3. A dash: not measured in this run."
+    )
+    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": log})
+
+
+def training(folder: Path) -> str:
+    """Return the comparison of losses and renderers in training."""
+    log = log_of("training", "cuda", folder) or log_of("training", "cpu", folder)
+    if log is None:
+        return ""
+    lines = [
+        "| recording | trained with | held out (dB) | neighbours' mean (dB) | depth RMS (%) | plane (%) | normals (°)"
+        " | followed points (mm) | command (s) |",
+        "|---" * 9 + "|",
+    ]
+    for name, variants in log.items():
+        if not isinstance(variants, dict) or "alpha" not in variants:
+            continue
+        for variant, found in variants.items():
+            numbers = [
+                (found.get("heldout_db"), 1, 2), (found.get("neighbours_mean_db"), 1, 2),
+                (found.get("depth_rmse_share"), 100, 3), (found.get("plane_rmse_share"), 100, 2),
+                (found.get("normals_mean_deg"), 1, 2), (found.get("points_mean_mm"), 1, 3), (found.get("wall_s"), 1, 0),
+            ]  # fmt: skip
+            cells = ["–" if value is None else f"{value * scale:.{digits}f}" for value, scale, digits in numbers]
+            lines.append(f"| {name} | {variant} | " + " | ".join(cells) + " |")
+    text = (
+        f"`intrasplat reconstruct` with {log['steps']} steps, {log['together']} runs at a time. The synthetic recordings"
+        " have exact depth. Depth and followed points of weighted sums are not evaluated: they have no depth along a ray."
+    )
+    return "## Training\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"run": log})
+
+
+def methods_text(folder: Path = FOLDER) -> str:
+    """Return the text of results/methods.md."""
+    head = (
+        "# Splatting methods\n\nGenerated by `python benchmarks/publish.py` from [logs/methods](../logs/methods); do not"
+        " edit. [docs/methods.md](../../docs/methods.md) says what each method is for."
+    )
+    parts = [head, *(section(method, folder) for method in METHODS), speed(folder), training(folder)]
+    return "\n\n".join(part for part in parts if part) + "\n"
