@@ -14,6 +14,7 @@ from gsplat_core.registry import Registry
 if TYPE_CHECKING:
     from gsplat_core.deformation.kinds import FieldKind
     from gsplat_core.depth.maps import Estimator
+    from gsplat_core.experimental.cut_gaussians import GaussianKernel
     from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
@@ -110,6 +111,15 @@ GROWTHS: Registry[Growth] = Registry(
     },
 )
 """Changes of the Gaussians' number between offline training steps, by name."""
+
+KERNELS: Registry[type[GaussianKernel]] = Registry(
+    "kernel",
+    {
+        "gaussian": "gsplat_core.experimental.cut_gaussians:GaussianKernel",
+        "cut": "gsplat_core.experimental.cut_gaussians:CutKernel",
+    },
+)
+"""Falloffs of a splat by name. Renderers use `gaussian`; `cut` is experimental (`render_kernel`)."""
 
 SENSORS: Registry[type[RangeSensor]] = Registry(
     "range sensor",
