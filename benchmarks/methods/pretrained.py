@@ -126,8 +126,10 @@ def main() -> None:
     count = chosen.count or (10_000_000 if chosen.full else 200_000)
     frames = chosen.frames or (600 if chosen.full else 20)
     size = ("1920", "1080") if chosen.full else ("480", "270")
-    able = [name for name in RENDERERS if chosen.device in RENDERERS[name].capabilities.precisions]
-    names = chosen.renderers.split(",") if chosen.renderers else able
+    if chosen.renderers:
+        names = chosen.renderers.split(",")
+    else:
+        names = [name for name in RENDERERS if chosen.device in RENDERERS[name].capabilities.precisions]
     figures: dict[str, Any] = {"gaussians": count, "sh_degree": 3, "size_px": [int(side) for side in size]}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
