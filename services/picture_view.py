@@ -103,12 +103,14 @@ class Pictures:
         """Select the renderer.
 
         Raises:
-            InvalidSetting: for an unknown renderer, or an option or device that it does not have.
+            InvalidSetting: for an unknown renderer, an option or device that it does not have, or a model that it cannot show.
         """
         check_renderer(renderer, device, options=options)
         self.progressive = "progressive" in RENDERERS[renderer].capabilities.options
         self._options = replace(options, progressive=True) if self.progressive else options
         self._model, self._name, self._device = model, renderer, device
+        # A renderer that cannot show the model refuses it here, not in answers to the browser.
+        new_renderer(renderer, model.camera, device, options=self._options).prepare(model)
         self._depth = typical_depth(model, model.camera)
         self._lock = threading.Lock()
         self._renderer: Renderer | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+from dataclasses import replace
 from urllib.parse import urlencode
 
 import cv2
@@ -13,6 +14,7 @@ import torch
 
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.models.model import TrainedBy
 from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, RendererOptions
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT
@@ -125,6 +127,12 @@ def test_pages_of_other_sites_cannot_read_the_pictures():
     with served() as view:
         assert get(view, "/", host="attacker.example:80")[0] == 403
         assert get(view, "/", host="localhost:1")[0] == 200
+
+
+def test_a_renderer_that_cannot_show_the_model_refuses_it_at_the_start():
+    model = replace(uniform((0.5, 0.5, 0.5)), trained_by=TrainedBy("weighted_sum"))
+    with pytest.raises(InvalidSetting, match="choose renderer 'weighted_sum'"):
+        Pictures(model, "alpha", RendererOptions(), "cpu")
 
 
 def test_a_taken_port_is_named():
