@@ -13,7 +13,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo results mutants test test-all test-isa test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
+.PHONY: demo results mutants test test-all test-isa lint format fuzz bench native cuda compilers lock licences sbom clean always
 
 # Runs on the NVIDIA GPU if torch can use one. The CUDA kernels are built first; a failed build ends the target.
 demo: native
@@ -21,30 +21,36 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
-# Run the fast tests (`test`), or also those marked as slow (`test-all`), in two parallel groups of about equal duration. The output of a group is
-# printed when it has ended.
-PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry tests/operators tests/recipes tests/deploy
+# Run the fast tests (`test`), or also those marked as slow (`test-all`), in six groups of which two run at a time, the longest first. The output
+# of a group is printed when it has ended.
+PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/recipes tests/deploy
+TRAINING_TESTS := tests/gsplat_core/training tests/gsplat_core/experimental tests/gsplat_core/evaluation
+OP_TESTS := tests/gsplat_core/ops tests/gsplat_core/rendering tests/gsplat_core/deformation
+GROUPS := programs services operators training ops rest
+test-of-programs: TESTS = $(PROGRAM_TESTS)
+test-of-services: TESTS = tests/services
+test-of-operators: TESTS = tests/operators tests/gsplat_core/geometry
+test-of-training: TESTS = $(TRAINING_TESTS)
+test-of-ops: TESTS = $(OP_TESTS)
+test-of-rest: TESTS = $(patsubst %,--ignore=%,$(PROGRAM_TESTS) tests/services tests/operators tests/gsplat_core/geometry $(TRAINING_TESTS) $(OP_TESTS))
+.PHONY: $(GROUPS:%=test-of-%)
 BESIDE := --no-print-directory --jobs=2 --output-sync=target --keep-going
 test: native .venv/.development
-	@$(MAKE) $(BESIDE) MARKED='not slow' test-of-programs test-of-parts
+	@$(MAKE) $(BESIDE) MARKED='not slow' $(GROUPS:%=test-of-%)
 
 test-all: native .venv/.development
-	@$(MAKE) $(BESIDE) MARKED= test-of-programs test-of-parts
+	@$(MAKE) $(BESIDE) MARKED= $(GROUPS:%=test-of-%)
 
 # The numeric tests with each instruction set of this processor, in torch, its BLAS, numpy's BLAS and our own kernels.
 test-isa: native .venv/.development
 	tests/instruction_sets.sh
 
 # One thread per process, because most arrays in tests are too small for several threads. Tests of threading set the number themselves.
-test-of-programs test-of-parts: export OMP_NUM_THREADS ?= 1
-test-of-programs test-of-parts: export OPENBLAS_NUM_THREADS ?= 1
-test-of-programs test-of-parts: export OPENCV_FOR_THREADS_NUM ?= 1
-
-test-of-programs:
-	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(PROGRAM_TESTS)
-
-test-of-parts:
-	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(PROGRAM_TESTS:%=--ignore=%)
+$(GROUPS:%=test-of-%): export OMP_NUM_THREADS ?= 1
+$(GROUPS:%=test-of-%): export OPENBLAS_NUM_THREADS ?= 1
+$(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
+$(GROUPS:%=test-of-%):
+	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(TESTS)
 
 lint: .venv/.development
 	$(BIN)/ruff check .

@@ -60,6 +60,7 @@ def test_the_good_upload_is_taken(registry, payload, tmp_path):
     assert registry.check("liver", 1).state == "ready"
 
 
+@pytest.mark.slow
 def test_a_pickle_as_tensors_is_rejected_by_the_check(rejected, bundle, tmp_path):
     bundle.replace_tensors(pickle.dumps([Attack(tmp_path / "executed"), bytes(1000)]))
     assert rejected()

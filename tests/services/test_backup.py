@@ -294,6 +294,7 @@ backup.restore_backup(ServiceSettings(paths={"data": Path(sys.argv[2])}), Path(s
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["copy", "move"])
 def test_a_restore_that_was_killed_is_noticed_by_the_next_start_and_restore(service, tmp_path, when):
     make_backup(service.settings, tmp_path / "backup")

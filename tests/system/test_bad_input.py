@@ -112,6 +112,7 @@ def bundle(finished, tmp_path):
     return shutil.copytree(finished / "model", tmp_path / "model")
 
 
+@pytest.mark.slow
 def test_not_a_number_in_a_model(bundle, tmp_path, refused):
     rewrite_tensors(
         bundle, lambda data, start: data.__setitem__(slice(start, start + 4), struct.pack("<f", float("nan")))

@@ -93,6 +93,7 @@ def test_the_gradient_is_that_of_the_field_that_keeps_everything():
         torch.testing.assert_close(mine, theirs[:, -ring.bumps :], rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_no_tensor_moves_and_centres_stay_exact_in_a_stream_of_ten_thousand_columns():
     field = online(3, history_s=1.0)
     field.cover(0.0, 0.0)

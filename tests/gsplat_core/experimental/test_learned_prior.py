@@ -49,11 +49,13 @@ def causal_db(prior: str, shift_px: Callable[[int], float], frames: int, scored_
     return float(np.mean(scores))
 
 
+@pytest.mark.slow
 def test_a_beat_is_predicted_better_than_by_the_last_motion() -> None:
     flow, of_beat = (causal_db(prior, beat, 46, 9) for prior in ("flow", "learned"))
     assert of_beat > flow + 3.0
 
 
+@pytest.mark.slow
 def test_a_constant_velocity_is_predicted_no_worse_than_by_the_last_motion() -> None:
     flow, of_velocity = (causal_db(prior, lambda frame: 0.8 * frame, 12, 5) for prior in ("flow", "learned"))
     assert of_velocity > flow - 0.2
@@ -81,6 +83,7 @@ def test_it_is_said_about_the_next_frame_only() -> None:
     torch.testing.assert_close(next_means, model.at(newest_s + 5.0).means)
 
 
+@pytest.mark.slow
 def test_a_camera_that_moves_has_the_motion_of_the_flow_prior() -> None:
     models = []
     for prior in ("flow", "learned"):

@@ -110,6 +110,7 @@ def test_what_a_tool_hides_is_believed_less():
     assert found.confidence[:, 150:].max() < 0.5
 
 
+@pytest.mark.slow
 def test_the_answer_is_steady_and_the_same_twice():
     first, second = LightDepth(), LightDepth()
     rng = np.random.default_rng(0)
@@ -124,6 +125,7 @@ def test_the_answer_is_steady_and_the_same_twice():
     assert 0 < error(depths[40], depths[30]) < 0.01
 
 
+@pytest.mark.slow
 def test_another_scene_size_or_pose_begins_anew():
     estimator = LightDepth()
     estimator.estimate(Frame(0, 0, picture(bowl())), CAMERA)

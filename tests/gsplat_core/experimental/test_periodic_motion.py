@@ -26,6 +26,7 @@ def relative_errors(motion: PeriodicMotion, tracks: GridTracks, points: np.ndarr
     return np.abs(found[..., 2] / true[..., 2] - 1)
 
 
+@pytest.mark.slow
 def test_distances_of_breathing_tissue() -> None:
     tracks, points = seen()
     moving = fitted(tracks, TRUE)
@@ -36,6 +37,7 @@ def test_distances_of_breathing_tissue() -> None:
     assert moving.cost < 0.3 * still.cost
 
 
+@pytest.mark.slow
 def test_distances_are_not_shortened_by_noise() -> None:
     tracks, points = seen(noise_px=0.5)
     found = in_cameras(fitted(tracks, TRUE).at(tracks.times_s), tracks.poses)[..., 2]
@@ -52,6 +54,7 @@ def test_what_a_tool_pulls_now_and_then_decides_nothing() -> None:
     assert np.median(off) < 0.5
 
 
+@pytest.mark.slow
 def test_frequencies_are_found() -> None:
     tracks, _ = seen()
     found = found_in(tracks)

@@ -83,6 +83,7 @@ def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
     assert np.isfinite(off_px(motion.at(TIMES_S), tracks)).all()
 
 
+@pytest.mark.slow
 def test_a_refit_leaves_out_the_pull() -> None:
     """With few points, errors near the pulled point shrink and the remaining motion is unchanged."""
     points, poses = places(TIMES_S, count=90), swaying(TIMES_S)

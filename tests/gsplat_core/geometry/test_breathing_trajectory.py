@@ -30,6 +30,7 @@ def breathing():
     return sightings, true, found_in(sightings)
 
 
+@pytest.mark.slow
 def test_breathing_and_heart_are_told_from_the_way(breathing):
     sightings, true, found = breathing
     assert found is not None

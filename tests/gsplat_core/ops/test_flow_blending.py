@@ -86,6 +86,7 @@ def test_splats_with_values_that_are_not_finite_are_skipped():
     assert not gradient[bad].any()
 
 
+@pytest.mark.slow
 def test_reference_gradcheck():
     scene = flow_scene(12, Camera.from_focal(60.0, 18, 17)).converted(torch.float64)
     camera = Camera.from_focal(60.0, 18, 17)

@@ -113,6 +113,7 @@ def test_prepared_splats_are_the_same_without_invisible_ones():
     assert whole.file_index is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 3, 4])
 def test_quantised_splats_give_nearly_the_same_picture(degree):
     gaussians = random_scene(5000, smallest=0.02, largest=0.1, degree=degree)

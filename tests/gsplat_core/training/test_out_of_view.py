@@ -68,6 +68,7 @@ def there_and_on(first, columns):
     return [frame_at(first + k, column) for k, column in enumerate(columns)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [6000, 700])
 def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
     """Cover capacity for the whole scene, and capacity for two pictures, where most of the scene is archived."""

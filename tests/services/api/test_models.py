@@ -98,6 +98,7 @@ def test_another_digest_is_refused_and_nothing_is_kept(plane, header, status):
     assert plane.parts.models.kept == {} and list(plane.control.uploads_dir.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_refused_uploads(new_plane):
     plane = new_plane(limits={"model_bytes": 2**20})
     assert put(plane, b"").status_code == 422

@@ -133,6 +133,7 @@ raise KeyError("uncaught")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["info", "error"])
 def test_every_line_of_the_log_is_json(level):
     done = subprocess.run([sys.executable, "-W", "always", "-c", NOISY, level], capture_output=True, text=True)

@@ -30,6 +30,7 @@ def digest_with(**environment: str) -> str:
     return done.stdout.split()[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", ["2", "3"])
 def test_the_environment_makes_no_difference(threads):
     assert digest_with(OPENBLAS_NUM_THREADS=threads) == digest_with(OPENBLAS_NUM_THREADS="1")

@@ -13,6 +13,7 @@ from services.registry.models import ModelRegistry
 from tests.services.registry.made import save_model, sha256
 
 
+@pytest.mark.slow
 def test_a_packed_model_can_be_uploaded(tmp_path, capsys):
     model, file = save_model(tmp_path / "model"), tmp_path / "liver.isplat"
     assert run(["pack", str(model), str(file), "--json"]) == 0
