@@ -36,7 +36,7 @@ from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_traject
 from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.rasterization import render
+from gsplat_core.rendering.registry import picture_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
@@ -198,7 +198,7 @@ def evaluate_geometry(
                 flow.begin(frame, own(frame), picture.depth, _tissue(frame))
             views.add(frame, own(frame), picture.depth)
         if parts is not None and _is_chosen(frame, frame_count, PART_FRAMES):
-            parts.add(frame, _picture_from(own(frame), frame))
+            parts.add(frame, _picture_from(model, own(frame), frame))
     errors = depth.errors
     scale = 1.0 if errors is None else errors.scale
     scaled = views
@@ -238,16 +238,16 @@ def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:
     return evaluate_trajectory(np.stack([found for found, _ in ways]), np.stack([true for _, true in ways]))
 
 
-def _picture_from(camera: Camera, frame: Frame) -> Callable[[Gaussians], NDArray[np.float32]]:
+def _picture_from(model: Model, camera: Camera, frame: Frame) -> Callable[[Gaussians], NDArray[np.float32]]:
     """Return a function that renders Gaussians from a camera with a frame's exposure."""
 
-    def picture_of(gaussians: Gaussians) -> NDArray[np.float32]:
+    def shown(gaussians: Gaussians) -> NDArray[np.float32]:
         with torch.inference_mode():
-            image = render(gaussians, camera, depth=False).image
+            image = picture_of(model, gaussians, camera, depth=False).image
             image = (image * image.new_tensor(frame.exposure)).clamp(0, 1)
         return np.asarray(image.cpu().numpy())
 
-    return picture_of
+    return shown
 
 
 def _is_chosen(frame: Frame, frame_count: int, most: int) -> bool:

@@ -165,7 +165,7 @@ class Model:
     def render(
         self, time_s: float, camera: Camera | None = None, background: Tensor | None = None, depth: bool = True
     ) -> RenderOutput:
-        """Render the scene at `time_s` without autograd, by default from the recording's camera."""
+        """Render the scene at `time_s` by alpha blending without autograd, by default from the recording's camera."""
         with torch.no_grad():
             return render(self.at(time_s), camera or self.camera, background, depth)
 

@@ -28,7 +28,6 @@ from gsplat_core.rendering.frame_renderer import (
     GraphMemory,
     capacity_for,
 )
-from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, Gaussians
@@ -272,7 +271,7 @@ class Placement:
     ) -> None:
         """Move the scene at one time towards a frame's depth [H, W] (0 = unknown)."""
         rows, captured = step.fixed_rows, step.capabilities.captured_motion
-        if rows is None or rows.device.type != "cuda" or captured is None:
+        if rows is None or rows.device.type != "cuda" or captured is None or not step.is_trained_by_alpha:
             _correct_at(step, motion, observation, depth, shown_s)
             return
         if self._captured is None or not self._captured.fits(rows, captured, observation.camera):
@@ -320,7 +319,7 @@ def _correct_at(
     """Apply the correction of `CapturedCorrection` with separate launches, on any device."""
     camera = observation.camera
     now = step.at(observation.time_s)
-    shown = render(now, camera, depth=True)
+    shown = step.picture(now, camera)
     known = (depth > 0) & (observation.mask > 0) & (shown.alpha >= UNCOVERED_ALPHA)
     factor = smooth_factor(depth, shown.depth, known, Seen(camera, now.means).pixels)
     deltas = motion.deltas(shown_s)
