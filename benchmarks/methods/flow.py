@@ -116,7 +116,7 @@ def trained(case: str, seed: int, losses: tuple[str, ...], device: Device, full:
     depth = "light" if case == "fixed" else "auto"
     settings = ReplaySettings(copied, run, device=device, sinks=(), seed=seed, depth=depth, losses=losses)
     begun = time.perf_counter()
-    reconstruct(settings, 2500 if full else 300)
+    reconstruct(settings, 2500 if full else 250)
     seconds = time.perf_counter() - begun
     recording = open_recording(whole)
     geometry = measure_geometry(

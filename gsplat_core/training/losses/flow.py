@@ -36,7 +36,7 @@ class FlowLoss:
     """
 
     name: ClassVar[str] = "flow"
-    default_weight: ClassVar[float] = 0.02
+    default_weight: ClassVar[float] = 0.05
 
     def __init__(self) -> None:
         self._flows: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
