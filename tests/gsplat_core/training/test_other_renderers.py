@@ -104,7 +104,7 @@ def test_training_on_a_gpu_gives_the_same_model_twice(gpu, make_frame, camera, p
     image = renderer.render(camera, models[0].time_window_s[1]).result().image.cpu()
     on_cpu = new_renderer("weighted_sum", camera)
     on_cpu.prepare(models[0].to("cpu"))
-    torch.testing.assert_close(
-        image, on_cpu.render(camera, models[0].time_window_s[1]).result().image, rtol=0, atol=2e-4
-    )
+    difference = (image - on_cpu.render(camera, models[0].time_window_s[1]).result().image).abs()
+    # A pixel at the edge of a splat may belong to it on one device only.
+    assert float(difference.max()) < 0.01 and float(difference.mean()) < 1e-4
     assert float((image - torch.from_numpy(make_frame(2).image) / 255).abs().mean()) < 0.1
