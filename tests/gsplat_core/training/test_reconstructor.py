@@ -276,3 +276,21 @@ def test_one_frame_is_enough_for_both_ways(make_frame, device):
         learning.fit([frame], 2)
         learning.observe(frame)
         assert bool(learning.snapshot().render(0.0).image.isfinite().all())
+
+
+def test_another_scene_is_not_compared_with_the_loss_of_the_one_before():
+    """A frame whose loss jumps gets four times its steps in addition; the frames of another scene get none."""
+    flat = np.full((40, 48, 3), 120, np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (40, 48, 3), np.uint8)
+    camera = Camera.from_focal(50.0, 48, 40)
+
+    def steps(new_scene):
+        learning = Reconstructor(dataclasses.replace(CONFIG, first_frame_steps=2, steps_per_frame=2), camera)
+        for seq in range(4):
+            learning.observe(Frame(seq, seq * 10**8, flat))
+        if new_scene:
+            learning.begin_scene(Frame(4, 4 * 10**8, noise))
+        return [learning.observe(Frame(seq, seq * 10**8, noise)).steps for seq in (4, 5)]
+
+    assert steps(new_scene=False)[0] == 10
+    assert steps(new_scene=True) == [2, 2]
