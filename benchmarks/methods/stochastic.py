@@ -2,10 +2,11 @@
 
     python benchmarks/methods/stochastic.py [--out FILE]                              # statistics and small scenes, CPU
     python benchmarks/methods/stochastic.py --full --device cuda [--millions 1 10 50 106] [--out FILE]
+    python benchmarks/methods/stochastic.py --bundle DIR --recording DIR [--scale 0.5] [--frames 5] [--out FILE]
 
 Statistics: z test of the mean of 4,096 samples against the expectation in float64, chi-square test of the Poisson draws, growth of
 the PSNR per doubling of the samples, PSNR of the expected point picture to alpha blending, and PSNR of quantised splats. Speed:
-random scenes of degree 3, generated on the device, at 1920x1080 (640x360 on the CPU). Each time is the median of the repetitions.
+random scenes of degree 3, generated on the device, at 1920x1080 (320x180 on the CPU). Each time is the median of the repetitions.
 `peak_share` is peak memory less parameters, frame buffer and queue, as a share of the parameters.
 """
 
@@ -29,6 +30,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.recordings import open_recording
 from gsplat_core.models.model import Model, TrainedBy
 from gsplat_core.ops.stochastic.stochastic import QUEUE_BYTES, Method, SplatScene, new_sums, picture_of, sample_splats
 from gsplat_core.reference.points import point_moments
@@ -172,6 +175,40 @@ def quantisation(device: str) -> dict[str, Any]:
     }
 
 
+def on_recording(folder: Path, recording: Path, scale: float, frames: int, device: str) -> dict[str, Any]:
+    """Return the PSNR to the last frame of a recording: alpha blending, sampled pictures and quantised splats."""
+    model = load_bundle(folder).to(device)
+    *_, frame = open_recording(recording, scale=scale, max_frames=frames)
+    camera = model.camera
+    truth = torch.from_numpy(frame.image.copy()).to(device).float() / 255
+    seen = torch.ones(truth.shape[:2], dtype=torch.bool, device=device)
+    if frame.mask is not None:
+        seen = torch.from_numpy(frame.mask.copy()).to(device) != 0  # tissue
+    gaussians = model.at(frame.time_s)
+    score = lambda image: round(psnr(image.clamp(0, 1)[seen], truth[seen]), 3)
+    alpha = render(gaussians, camera).image
+    figures: dict[str, Any] = {"splats": gaussians.count, "alpha_db": score(alpha)}
+    scene, quantised = raw_splats(gaussians), quantised_splats(gaussians)
+    figures["alpha_of_quantised_db"] = score(render(dequantised(quantised), camera).image)
+    for samples in (1, 4, 16, 64, 256):
+        image = picture_of(sampled(scene, camera, "fragments", samples), samples).image
+        figures[f"stochastic_{samples}"] = {"to_frame_db": score(image), "to_alpha_db": round(psnr(image, alpha), 2)}
+    for supersampling in (1, 2, 4):
+        image = picture_of(sampled(scene, camera, "points", 16, supersampling), 16 * supersampling**2).image
+        figures[f"points_16_x{supersampling}"] = {
+            "to_frame_db": score(image),
+            "to_alpha_db": round(psnr(image, alpha), 2),
+        }
+    times = 5 if device == "cpu" else 50
+    for samples in (1, 16):
+        figures[f"stochastic_{samples}_ms"] = try_ms(
+            partial(sampled, scene, camera, "fragments", samples), device, times
+        )
+    figures["points_1_ms"] = try_ms(partial(sampled, scene, camera, "points", 1), device, times)
+    figures["alpha_ms"] = try_ms(partial(render, gaussians, camera), device, times)
+    return figures
+
+
 # ---- Speed and memory -----------------------------------------------------------------------------------------------------
 
 
@@ -251,7 +288,7 @@ def peak_share(scene: SplatScene, camera: Camera, method: Method, samples: int) 
 def time_to_target(scene: SplatScene, camera: Camera, method: Method, wanted: Tensor, device: str) -> dict[str, Any]:
     """Return samples and time that reach TARGET_DB against alpha blending, from the error of 64 samples."""
     probe = 64 if device == "cuda" else 8
-    supersampling = 4 if method == "points" else 1
+    supersampling = 1 if method == "fragments" else 4 if device == "cuda" else 2
     picture = picture_of(sampled(scene, camera, method, probe, supersampling), probe * supersampling**2).image
     floor = psnr(picture, wanted)
     needed = max(1, math.ceil(probe * 10 ** ((TARGET_DB - floor) / 10)))
@@ -261,7 +298,7 @@ def time_to_target(scene: SplatScene, camera: Camera, method: Method, wanted: Te
         "samples": needed,
         "supersampling": supersampling,
     }
-    if needed > 4096:
+    if needed > (4096 if device == "cuda" else 64):
         return result
     picture = picture_of(sampled(scene, camera, method, needed, supersampling), needed * supersampling**2).image
     result["db"] = round(psnr(picture, wanted), 2)
@@ -367,21 +404,27 @@ def main() -> None:
     parser.add_argument("--millions", type=float, nargs="+", help="sizes of the scenes; 1, 10, 50 and 106 with --full")
     parser.add_argument("--samples", type=int, default=4096, help="samples of the z test")
     parser.add_argument("--repetitions", type=int, help="frames of each timing")
+    parser.add_argument("--bundle", type=Path, help="model of a replay, to score on its recording")
+    parser.add_argument("--recording", type=Path, help="recording of the bundle")
+    parser.add_argument("--scale", type=float, default=1.0, help="scale of the recording in the replay")
+    parser.add_argument("--frames", type=int, default=5, help="frames of the replay")
     chosen = parser.parse_args()
     device = chosen.device
-    millions = chosen.millions or ([1, 10, 50, 106] if chosen.full else [0.05, 0.5])
-    repetitions = chosen.repetitions or (10 if chosen.full else 3)
-    camera = Camera.from_focal(1500, 1920, 1080) if chosen.full else Camera.from_focal(500, 640, 360)
+    millions = chosen.millions or ([1, 10, 50, 106] if chosen.full else [0.01, 0.1])
+    repetitions = chosen.repetitions or (10 if chosen.full else 2)
+    camera = Camera.from_focal(1500, 1920, 1080) if chosen.full else Camera.from_focal(250, 320, 180)
+    if chosen.bundle is not None:
+        scored = on_recording(chosen.bundle, chosen.recording, chosen.scale, chosen.frames, device)
+        log.write("stochastic", chosen, {"recording": chosen.recording.name, **scored})
+        return
     figures: dict[str, Any] = {"size_px": [camera.width_px, camera.height_px]}
     figures |= statistics_of(device, chosen.samples)
-    print(figures, flush=True)
     figures["quantised"] = quantisation(device)
     figures["huge_against_small"] = huge_against_small(camera, device, repetitions)
     for size in millions:
         figures[f"speed_{size:g}M"] = speed(round(size * 1e6), camera, device, repetitions)
-        print(figures[f"speed_{size:g}M"], flush=True)
         gc.collect()
-    log.write("stochastic", chosen, figures)
+        log.write("stochastic", chosen, figures)  # after each size, because a larger one may fail
 
 
 if __name__ == "__main__":

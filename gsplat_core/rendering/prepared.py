@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
-from gsplat_core.ops.stochastic.stochastic import CHUNK, CHUNK_FLOATS, SplatScene
+from gsplat_core.ops.stochastic.stochastic import CHUNK, CHUNK_FLOATS, COLOUR_CHUNK, SplatScene
 from gsplat_core.scene.gaussians import Gaussians
 
 ALPHA_CUTOFF = 1.0 / 255.0
@@ -49,9 +49,10 @@ def prepared_splats(gaussians: Gaussians) -> SplatScene:
 def quantised_splats(gaussians: Gaussians) -> SplatScene:
     """Quantise Gaussians to 16 bytes each, plus one byte per further spherical-harmonics coefficient.
 
-    Splats with an opacity below 1/255 are dropped. The others are sorted along a Morton curve. Positions, log-scales and
-    colours are stored relative to their ranges in chunks of `CHUNK` neighbours, higher bands relative to one range per
-    band and chunk. Rows keep the random numbers of their index in `gaussians`.
+    Splats with an opacity below 1/255 are dropped. The others are sorted along a Morton curve. Positions and log-scales
+    are stored relative to their ranges in chunks of `CHUNK` neighbours, colours relative to those of `COLOUR_CHUNK`
+    neighbours, and higher bands relative to one range per band and chunk. Rows keep the random numbers of their index
+    in `gaussians`.
     """
     kept = (gaussians.opacities >= ALPHA_CUTOFF).nonzero()[:, 0]
     order = kept[morton_codes(gaussians.means[kept]).argsort(stable=True)]
@@ -67,7 +68,8 @@ def quantised_splats(gaussians: Gaussians) -> SplatScene:
         position = _steps_of(some.means, 65535, ranges, 0)
         scales = _steps_of(some.log_scales, 255, ranges, 6)
         most = torch.tensor([31, 63, 31], device=device)
-        colour = _steps_of(some.sh[:, 0], most, ranges, 12)
+        colours = _to_brightness(some.sh[:, 0]).split(COLOUR_CHUNK)
+        colour = torch.cat([_steps_of(few, most, ranges, 20 + 6 * k) for k, few in enumerate(colours)])
         opacity = (some.opacities * 255).round().long().clamp(1, 255)
         words = [
             position[:, 0] | position[:, 1] << 16,
@@ -80,7 +82,7 @@ def quantised_splats(gaussians: Gaussians) -> SplatScene:
             values = some.sh[:, band * band : (band + 1) ** 2]
             low, high = values.amin(), values.amax()
             step = (high - low).clamp_min(1e-12) / 255
-            ranges[18 + 2 * (band - 1)], ranges[19 + 2 * (band - 1)] = low, step
+            ranges[10 + 2 * band], ranges[11 + 2 * band] = low, step
             assert packed_sh is not None
             packed_sh[rows, band * band - 1 : (band + 1) ** 2 - 1] = ((values - low) / step).round().to(torch.uint8)
     return SplatScene(file_index=order.to(torch.int32), packed=packed, chunks=chunks, packed_sh=packed_sh)
@@ -130,6 +132,18 @@ def _rotation_words(quats: Tensor) -> Tensor:
     return largest[:, 0] | steps[:, 0] << 2 | steps[:, 1] << 12 | steps[:, 2] << 22
 
 
+def _to_brightness(colours: Tensor) -> Tensor:
+    """Return (green - red) / 2, the mean, and blue / 2 - (red + green) / 4 of colours [n, 3]."""
+    red, green, blue = colours.unbind(-1)
+    return torch.stack([(green - red) / 2, colours.mean(-1), blue / 2 - (red + green) / 4], -1)
+
+
+def _from_brightness(values: Tensor) -> Tensor:
+    """Invert `_to_brightness`."""
+    grey = values[:, 1] - values[:, 2] * (2 / 3)
+    return torch.stack([grey - values[:, 0], grey + values[:, 0], values[:, 1] + values[:, 2] * (4 / 3)], -1)
+
+
 def _as_int32(words: Tensor) -> Tensor:
     return torch.where(words >= 1 << 31, words - (1 << 32), words).to(torch.int32)
 
@@ -138,25 +152,28 @@ def dequantised(scene: SplatScene) -> Gaussians:
     """Return the Gaussians that the kernels decode from quantised splats, in the scene's order."""
     assert scene.packed is not None and scene.chunks is not None
     words = scene.packed.long() & 0xFFFFFFFF
-    ranges = scene.chunks[torch.arange(len(words), device=words.device) // CHUNK]
+    rows = torch.arange(len(words), device=words.device)
+    ranges = scene.chunks[rows // CHUNK]
     field = lambda word, shift, bits: (words[:, word] >> shift) & ((1 << bits) - 1)
     scaled = lambda offset, *steps: (
         ranges[:, offset : offset + 3] + ranges[:, offset + 3 : offset + 6] * torch.stack(steps, -1)
     )
     means = scaled(0, field(0, 0, 16), field(0, 16, 16), field(1, 0, 16))
     log_scales = scaled(6, field(1, 16, 8), field(1, 24, 8), field(3, 0, 8))
-    colour = scaled(12, field(3, 16, 5), field(3, 21, 6), field(3, 27, 5))
+    places = 20 + 6 * (rows % CHUNK // COLOUR_CHUNK)[:, None] + torch.arange(6, device=words.device)
+    low, step = ranges.gather(1, places).split(3, 1)
+    colour = _from_brightness(low + step * torch.stack([field(3, 16, 5), field(3, 21, 6), field(3, 27, 5)], -1))
     others = (torch.stack([field(2, 2 + 10 * k, 10) for k in range(3)], -1) * (2 / 1022) - 1) * 0.5**0.5
     most = (1 - others.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()
     largest = field(2, 0, 2)[:, None]
-    places = torch.arange(4, device=words.device).expand(len(words), 4)
+    components = torch.arange(4, device=words.device).expand(len(words), 4)
     quats = torch.empty(len(words), 4, device=words.device).scatter_(1, largest, most)
-    quats.scatter_(1, places[places != largest].view(-1, 3), others)
+    quats.scatter_(1, components[components != largest].view(-1, 3), others)
     sh = colour[:, None]
     if scene.packed_sh is not None:
         bands = [0] * 3 + [1] * 5 + [2] * 7 + [3] * 9
         band = torch.tensor(bands[: scene.packed_sh.shape[1]], device=words.device)
-        rest = ranges[:, 18 + 2 * band, None] + ranges[:, 19 + 2 * band, None] * scene.packed_sh
+        rest = ranges[:, 12 + 2 * band, None] + ranges[:, 13 + 2 * band, None] * scene.packed_sh
         sh = torch.cat([sh, rest], 1)
     logits = torch.logit(field(3, 8, 8) / 255, eps=1e-6)
     return Gaussians(means, quats, log_scales, logits, sh)

@@ -1,7 +1,9 @@
 // Decoding of quantised splats: 16 bytes of geometry and colour, relative to the ranges of a chunk of kChunk splats.
 //
 // Bits of the four words, from the lowest: position 3 x 16, log-scales 3 x 8, rotation 2 + 3 x 10 (index of the largest
-// component and the others), opacity 8, colour 5 + 6 + 5. rendering/prepared.py writes them.
+// component and the others), opacity 8, colour 5 + 6 + 5. The colour is stored as (green - red) / 2, the mean, and
+// blue / 2 - (red + green) / 4, because the colours of neighbours mostly differ in brightness; its ranges belong to
+// kColourChunk splats. rendering/prepared.py writes them.
 #pragma once
 
 #include "simd.h"
@@ -12,7 +14,7 @@ namespace GSPLAT_ISA::stochastic {
 using namespace gsplat::stochastic;
 
 // Offsets of a chunk's ranges: minimum and step.
-enum ChunkRange { kPosition = 0, kLogScale = 6, kColour = 12, kBands = 18 };
+enum ChunkRange { kPosition = 0, kLogScale = 6, kBands = 12, kColour = 20 };
 
 struct Decoded {
   float mean[3], quat[4], log_scales[3], opacity;
@@ -61,12 +63,18 @@ GSPLAT_INLINE void decode_sh(const Scene& scene, int64_t row, float* sh) {
   const float* chunk = scene.chunks + row / kChunk * kChunkFloats;
   const uint32_t colour = scene.packed[4 * row + 3] >> 16;
   const uint32_t steps[3] = {colour & 31, (colour >> 5) & 63, colour >> 11};
-  for (int k = 0; k < 3; ++k) sh[k] = chunk[kColour + k] + chunk[kColour + 3 + k] * float(steps[k]);
+  const float* range = chunk + kColour + 6 * (row % kChunk / kColourChunk);
+  float c[3];
+  for (int k = 0; k < 3; ++k) c[k] = range[k] + range[3 + k] * float(steps[k]);
+  const float grey = c[1] - c[2] * (2.0f / 3.0f);
+  sh[0] = grey - c[0];
+  sh[1] = grey + c[0];
+  sh[2] = c[1] + c[2] * (4.0f / 3.0f);
   const uint8_t* rest = scene.packed_sh + row * (scene.bases - 1) * 3;
   for (int n = 1; n < scene.bases; ++n) {
     const int band = n < 4 ? 0 : n < 9 ? 1 : n < 16 ? 2 : 3;
-    const float* range = chunk + kBands + 2 * band;
-    for (int k = 0; k < 3; ++k) sh[3 * n + k] = range[0] + range[1] * float(rest[3 * (n - 1) + k]);
+    const float* of_band = chunk + kBands + 2 * band;
+    for (int k = 0; k < 3; ++k) sh[3 * n + k] = of_band[0] + of_band[1] * float(rest[3 * (n - 1) + k]);
   }
 }
 

@@ -21,7 +21,8 @@ enum Method : int32_t {
 constexpr int kMaxSlots = 4;         // samples per pass; one call of the random generator gives as many numbers
 constexpr int kInlineFragments = 4;  // splats with at most so many fragments are drawn without the queue
 constexpr int kChunk = 4096;         // splats that share the ranges of quantised values
-constexpr int kChunkFloats = 28;     // floats per chunk: see quantised.h
+constexpr int kColourChunk = 256;    // splats that share the range of quantised colours
+constexpr int kChunkFloats = 20 + 6 * (kChunk / kColourChunk);  // floats per chunk: see quantised.h
 constexpr uint64_t kEmpty = ~uint64_t(0);
 constexpr int64_t kMaxSubpixels = int64_t(1) << 31;
 

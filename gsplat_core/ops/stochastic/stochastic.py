@@ -23,8 +23,10 @@ QUEUE_BYTES = 64 << 20
 """Default memory of the queue of large splats, which limits the memory of a frame."""
 CHUNK = 4096
 """Splats that share the ranges of quantised values."""
-CHUNK_FLOATS = 28
-"""Ranges of a chunk: minima and steps of positions, log-scales and colour [3 each], and of the four bands."""
+COLOUR_CHUNK = 256
+"""Splats that share the range of quantised colours."""
+CHUNK_FLOATS = 20 + 6 * (CHUNK // COLOUR_CHUNK)
+"""Ranges of a chunk: minima and steps of positions and log-scales [3 each], of the four bands, and of each colour chunk."""
 MOST_PIXELS = 1 << 16
 """Largest width and height of a picture in sub-pixels."""
 
