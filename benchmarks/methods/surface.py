@@ -119,12 +119,22 @@ def stereo(device: str, full: bool, choices: dict[str, tuple[str, ...]], seeds: 
     for seed in range(seeds):
         with tempfile.TemporaryDirectory() as folder:
             whole = Path(folder) / "whole"
-            made = dict(frames=36, width_px=width, height_px=height, fps=15.0, seed=seed, camera="fixed")
-            synthesize(whole, **made, extras=Extras(third=True))
+            synthesize(
+                whole, frames=36, width_px=width, height_px=height, fps=15.0, seed=seed, camera="fixed",
+                extras=Extras(third=True),
+            )  # fmt: skip
             given = _without_truth(whole, Path(folder) / "given")
             for name, losses in choices.items():
                 run = Path(folder) / f"run-{len(means)}-{name}".replace(":", "_").replace(",", "-")
-                settings = ReplaySettings(given, run, device=device, sinks=(), seed=seed, depth="stereo", losses=losses)
+                settings = ReplaySettings(
+                    given,
+                    run,
+                    device="cpu" if device == "cpu" else "cuda",
+                    sinks=(),
+                    seed=seed,
+                    depth="stereo",
+                    losses=losses,
+                )
                 begun = time.perf_counter()
                 reconstruct(settings, steps)
                 seconds = time.perf_counter() - begun
@@ -158,6 +168,7 @@ def _accuracy(whole: Path, model: Any, device: str) -> dict[str, float]:
         if not _is_chosen(frame, recording.frame_count, 12):
             continue
         true = truth.depth_of(frame)
+        assert true is not None
         surface, picture = model.surface(frame.time_s, recording.camera), model.render(frame.time_s, recording.camera)
         angle = _normal_angle(surface.normals.cpu().numpy(), recording.camera, true, _known(frame, true))
         own.append(angle)
@@ -173,6 +184,7 @@ def _accuracy(whole: Path, model: Any, device: str) -> dict[str, float]:
     pictures = SeenFromAnywhere(device)
     geometry = measure_geometry(recording, recording.frame_count, recording.camera, model, pictures, truth, None)
     third = next(view for view in geometry.views if view.name == "third")
+    assert third.model.psnr_tissue_db is not None
     figures["third view, dB"] = third.model.psnr_tissue_db
     return figures
 
