@@ -119,6 +119,7 @@ def main() -> None:
         {
             "size": chosen.size, "steps": chosen.steps, "bytes": 4 * numbers, "splats_by_curves": counts,
             "db_by_curves": db, "step_ms_by_curves": ms, "mean_gain_db_by_curves": gains,
+            "gain_db": max(gains.values()),
         },
     )  # fmt: skip
 
