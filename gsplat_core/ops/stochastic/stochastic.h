@@ -107,7 +107,7 @@ void poisson_on_device(const double* rates, int64_t rate_count, int64_t count, u
 // Number of splats whose fragments can be counted in the 42 bits that the queue has for them.
 constexpr int64_t most_in_queue(int64_t bytes, int64_t subpixels) {
   const int64_t by_memory = bytes / int64_t(sizeof(Splat) + sizeof(uint64_t));
-  const int64_t by_bits = (int64_t(1) << 42) / (8 * (subpixels > 64 ? subpixels : 64));
+  const int64_t by_bits = (int64_t(1) << 42) / (2 * (subpixels > 64 ? subpixels : 64));
   const int64_t most = by_memory < by_bits ? by_memory : by_bits;
   const int64_t limit = (int64_t(1) << 21) - 1;
   return most < 1 ? 1 : (most < limit ? most : limit);

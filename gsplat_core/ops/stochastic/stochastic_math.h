@@ -20,7 +20,7 @@ constexpr float kBoxMarginPx = 0.01f;  // more than the rounding of a box, whose
 constexpr float kLog2e = 1.44269504f;
 constexpr float kCutoffDilogarithm = 0.0039254184f;  // Li2(kAlphaCutoff)
 constexpr double kInversionLimit = 30;               // rates from which PTRS draws
-constexpr float kPointsPerFragment = 4;              // splats with more points than that are drawn fragment by fragment
+constexpr float kPointsPerFragment = 1;              // splats with more points than that are drawn fragment by fragment
 constexpr float kMostPoints = 1e9f;
 
 // Kinds of random numbers, in the upper bits of a counter's last word.
