@@ -92,7 +92,7 @@ class _Side(torch.autograd.Function):
         return inside.to(points.dtype)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:
         inside, which, shift = ctx.saved_tensors
         near = (shift.abs() <= FARTHEST_FLIP) & shift.isfinite()
         size = shift.abs().clamp(min=SMALLEST_FLIP)

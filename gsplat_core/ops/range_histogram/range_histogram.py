@@ -23,7 +23,7 @@ class Bins(NamedTuple):
     """Depth at the first edge, in the scene's unit."""
     width: float
     """Width of a bin in the scene's unit."""
-    count: int
+    number: int
 
 
 def range_histogram(
@@ -62,7 +62,7 @@ def range_histogram(
         max_alpha: upper limit of alpha, from 1/255 to below 1.
 
     Returns:
-        float32 [image_width, bins.count].
+        float32 [image_width, bins.number].
 
     Raises:
         InvalidInput: for wrong shapes, dtypes, bins or limits.
@@ -88,8 +88,8 @@ def range_histogram(
         )
     if factors is not None and tuple(factors.shape) != (image_height, image_width):
         raise InvalidInput(f"factors must be [{image_height}, {image_width}], got {list(factors.shape)}")
-    if not (1 <= bins.count <= MOST_BINS and bins.width > 0):
-        raise InvalidInput(f"bins must be 1 to {MOST_BINS} of positive width, got {bins.count} of {bins.width}")
+    if not (1 <= bins.number <= MOST_BINS and bins.width > 0):
+        raise InvalidInput(f"bins must be 1 to {MOST_BINS} of positive width, got {bins.number} of {bins.width}")
     if not 1 / 255 <= max_alpha < 1:
         raise InvalidInput(f"max_alpha must be from 1/255 to below 1, got {max_alpha}")
     return torch.ops.gsplat_core.range_histogram(

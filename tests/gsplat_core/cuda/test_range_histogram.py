@@ -39,7 +39,7 @@ def test_a_graph_sees_new_splats(gpu):
     s = ray_scene(200, 64, 48)
     inputs = [getattr(s, name).to(gpu) for name in TENSORS]
     lists = [tensor.to(gpu) for tensor in s.lists()]
-    rest, gradient = (*BINS, 64, 48, 0.99), torch.rand(64, BINS.count, device=gpu)
+    rest, gradient = (*BINS, 64, 48, 0.99), torch.rand(64, BINS.number, device=gpu)
 
     def both():
         return (
@@ -66,7 +66,7 @@ def test_indices_out_of_range_are_skipped(gpu):
     rest = (*BINS, 40, 30, 0.99)
     out = torch.ops.gsplat_core.range_histogram(*inputs, offsets, ids, None, *rest)
     gradients = torch.ops.gsplat_core.range_histogram_backward(
-        *inputs, offsets, ids, None, torch.ones(40, BINS.count, device=gpu), *rest
+        *inputs, offsets, ids, None, torch.ones(40, BINS.number, device=gpu), *rest
     )
     assert all(t.isfinite().all() for t in (out, *gradients))
 
@@ -79,5 +79,5 @@ def test_opcheck(gpu):
     rest = (*BINS, 40, 30, 0.99)
     torch.library.opcheck(torch.ops.gsplat_core.range_histogram, (*inputs, *lists, None, *rest))
     plain = [t.detach() for t in inputs]
-    gradient = torch.ones(40, BINS.count, device=gpu)
+    gradient = torch.ones(40, BINS.number, device=gpu)
     torch.library.opcheck(torch.ops.gsplat_core.range_histogram_backward, (*plain, *lists, None, gradient, *rest))
