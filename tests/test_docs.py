@@ -262,10 +262,13 @@ def test_the_training_program_in_the_guide_works(tmp_path):
 
 
 def test_guides_state_no_measured_quality():
-    """Measured figures belong in RESULTS.md, which is generated from logs, or in benchmarks/results."""
+    """Measured figures belong in RESULTS.md, which is generated from logs, or in benchmarks/results. methods.md is a
+    table of figures, each with its log.
+    """
     found = []
     for document in GUIDES:
-        if "docs" in document.relative_to(ROOT).parts and "adr" not in document.parts:
+        is_guide = "docs" in document.relative_to(ROOT).parts and "adr" not in document.parts
+        if is_guide and document.name != "methods.md":
             for figure in re.findall(r"\d+(?:\.\d+)? dB\b", document.read_text(encoding="utf-8")):
                 if figure != "100 dB":  # the score of equal pictures
                     found.append(f"{document.name}: {figure}")
