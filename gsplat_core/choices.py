@@ -14,7 +14,6 @@ from gsplat_core.registry import Registry
 if TYPE_CHECKING:
     from gsplat_core.deformation.kinds import FieldKind
     from gsplat_core.depth.maps import Estimator
-    from gsplat_core.experimental.cut_gaussians import GaussianKernel
     from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
@@ -112,7 +111,7 @@ GROWTHS: Registry[Growth] = Registry(
 )
 """Changes of the Gaussians' number between offline training steps, by name."""
 
-KERNELS: Registry[type[GaussianKernel]] = Registry(
+KERNELS: Registry[type[Any]] = Registry(
     "kernel",
     {
         "gaussian": "gsplat_core.experimental.cut_gaussians:GaussianKernel",
