@@ -399,7 +399,7 @@ class RecordedCalls(Training):
                     return line
                 self._miss(line.seq)
             elif isinstance(line, ReconstructorMade):
-                # The learner starts with the first reconstructor.
+                # The learner is constructed with a reconstructor, so only later lines replace it.
                 if self._has_reconstructor:
                     learner.renew()
                 self._has_reconstructor = True

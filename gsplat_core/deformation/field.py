@@ -155,7 +155,7 @@ class Capabilities:
     continuation: Continuable | None = None
     """Extrapolation after the newest frame."""
     frame_deltas: FrameDeltas | None = None
-    """Pictures and training steps in a CUDA graph."""
+    """Computation of the deltas that a CUDA graph can capture, for rendering and training."""
     slot: Callable[[int], FieldSlot] | None = None
     """Function that creates a slot for a number of Gaussians, for published snapshots."""
     add_colours: Callable[[float, Tensor], None] | None = None

@@ -160,7 +160,7 @@ def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
 
 
 def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Select the distance label with the lowest cost for each pixel.
+    """Select the distance label with the lowest cost for each pixel, and measure how unique it is.
 
     Args:
         total: aggregated costs float32 [H, W, D].

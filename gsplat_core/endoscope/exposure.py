@@ -193,7 +193,7 @@ class ExposureEstimator:
         due = self._since_reference >= REFERENCE_EVERY
         if self._changed(sample, [self._previous], DEAD_ZONE, LEAST_CLEAR_JUMP):
             self._references.extend(self._young)
-        # Slow changes need not be tested in every frame.
+        # Slow drift of the gain is compared with older frames only every `REFERENCE_EVERY` frames.
         elif not due or not self._changed(sample, self._references, DRIFT_ZONE, LEAST_CLEAR_DRIFT):
             self._forget(pts_ns)
             if due:

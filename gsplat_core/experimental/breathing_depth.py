@@ -255,7 +255,7 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
     tracks = window.tracks
     after = int(np.clip(np.searchsorted(tracks.times_s, time_s), 1, len(tracks.times_s) - 1))
     share = (time_s - tracks.times_s[after - 1]) / (tracks.times_s[after] - tracks.times_s[after - 1])
-    # A frame between two samples gets the points visible in both, and their interpolated error.
+    # A frame between two samples uses the points visible in both. Their ray errors (observed minus predicted by the motion) are interpolated.
     ends = [each for each, weight in ((after - 1, 1 - share), (after, share)) if weight > 1e-6]
     seen = np.logical_and.reduce([tracks.seen[each] for each in ends])
     off = np.average(window.off[ends], axis=0, weights=[each for each in (1 - share, share) if each > 1e-6])

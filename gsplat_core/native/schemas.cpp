@@ -189,8 +189,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // changes by grey_step grey values or more.
   m.def("smooth_within_edges(Tensor planes, Tensor guide, float strength, float grey_step) -> Tensor");
 
-  // Histograms [width, bins] of depth along the rays, per column of the picture; splats, lists and rays [N, 10] as in
-  // blend_rays. factors [height, width] multiply the depth of a pixel; 0 excludes it.
+  // Histograms [width, bins] of the depth along the pixels' rays, summed over each picture column. A splat adds its
+  // blending weight. Splats, lists and rays [N, 10] are those of blend_rays. factors [height, width] multiply the depth
+  // of a pixel; 0 excludes the pixel.
   m.def(
       "range_histogram(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor isect_offsets, Tensor flatten_ids, "
       "Tensor? factors, float nearest, float bin, int bins, int width, int height, float max_alpha=0.99) -> Tensor");

@@ -224,7 +224,7 @@ def position_of(pose: Tensor) -> NDArray[np.float64]:
 
 
 FEWEST_POINTS = 20
-"""Fewest points of a key frame that must be found at their predicted positions."""
+"""Fewest points of a key frame that must be searched, found and agree on a pose for it to be recognised."""
 SHOWN = 0.4
 """Share of a key frame's points that must be inside the picture for it to be searched."""
 FOUND = 0.3

@@ -125,7 +125,7 @@ class _Smoothness:
     factor: Tensor
     """Cholesky factor of the kernel matrix [C, C]."""
     triangle: Tensor
-    """Triangular QR factor of the whitened constant and waves."""
+    """Triangular QR factor of the columns [1, waves], whitened by `factor`, [1 + B, 1 + B]."""
     scale: Tensor
     """Variance of each coordinate, [6]."""
 

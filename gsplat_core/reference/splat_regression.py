@@ -21,7 +21,10 @@ def densities(points: Tensor, centres: Tensor, factors: Tensor) -> Tensor:
 
 
 def splat_regression(points: Tensor, centres: Tensor, factors: Tensor, values: Tensor) -> Tensor:
-    """Evaluate Σ v g(x) at points; see `gsplat_core.ops.splat_regression`. Differentiable by autograd."""
+    """Evaluate Σ v g(x) at points. g is the normal density with mean `centres` and covariance A Aᵀ, A = `factors`.
+
+    Differentiable by autograd. Counterpart of `gsplat_core.ops.splat_regression`.
+    """
     return densities(points, centres, factors).mT @ values
 
 

@@ -202,7 +202,7 @@ ROTATION = slice(3, 7)
 """Quaternion as w, x, y, z."""
 LOG_SCALE = slice(7, 10)
 COLOUR = slice(10, 13)
-"""Red, green, blue of the first spherical-harmonics coefficient."""
+"""Columns of the delta of the degree-0 spherical-harmonics coefficient: red, green, blue."""
 OPACITY = slice(13, 14)
 """Column of the opacity logit in a raw row."""
 

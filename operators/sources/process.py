@@ -166,7 +166,7 @@ def finite_counts(content: Any) -> dict[str, int]:
 
 IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _REPORT_S = 0.1
-"""Period of state messages to the parent while no frame arrives, in seconds."""
+"""Period of state messages to the parent while no frame arrives, and their minimum interval otherwise, in seconds."""
 _EXIT_WITHIN_S = 0.6
 """Time limit in seconds to exit after the parent has closed the connection, even if the source blocks."""
 
@@ -482,7 +482,7 @@ class ProcessSource(LiveSource):
 
     @property
     def state_sentence(self) -> str:
-        """See `LiveSource`."""
+        """See `ReportingSource`. A reason reported by the child process takes precedence."""
         reported, state = self._child_state, self.state
         if reported is not None and state is reported[0] and reported[1]:
             return reported[1]

@@ -135,7 +135,7 @@ class NormalFacts(Part):
     median_deg: float
     plane_mean_deg: float
     level_mean_deg: float | None = None
-    """None in older reports without this measurement."""
+    """Baseline: mean normal error of a plane perpendicular to the optical axis. None in older reports."""
     frames: Count
 
 

@@ -231,7 +231,7 @@ class FrameEntry(Part):
     age_ms: float | None = None
     """Age of the displayed picture at display, in milliseconds; only in live runs."""
     steps: Count | None = None
-    """Live runs: optimiser steps before the display."""
+    """Number of optimiser steps on the frame of the displayed picture, which may be an older frame."""
 
 
 class BinEntry(FrameEntry):

@@ -32,8 +32,8 @@ __device__ inline Record<D> faint_record() {
   return r;
 }
 
-// Set all fields but the colours from the mean (x, y), the conic (a, b, c) and log2 of the opacity. Without a cap the
-// conic is positive definite.
+// Set all fields except the colours from the mean (x, y), the conic (a, b, c) and log2 of the opacity. Pixels with log2
+// alpha above `cap` are skipped. The default `cap` requires a positive definite conic.
 template <int D>
 __device__ inline void set_shape(Record<D>& r, float x, float y, const float* conic, float log2_opacity, float cap = INFINITY) {
   r.xyab = make_float4(x, y, -0.5f * kLog2E * conic[0], -kLog2E * conic[1]);

@@ -13,8 +13,8 @@ namespace {
 
 constexpr int kTileThreads = 512, kTileRows = 32;
 
-// The tiles of all space planes. `borders` has copies of the rows and columns on both sides of the boundaries between
-// tiles.
+// Tiles of all space planes. `borders` holds copies, taken before the update, of the rows and columns on both sides of
+// each tile boundary. Blocks read neighbour values from them, because other blocks update the planes concurrently.
 struct Tiles {
   PlaneBlocks blocks;
   int32_t nodes;                        // nodes per tile along U
