@@ -32,8 +32,9 @@ N = 10
 
 ROOT = Path(native.__file__).resolve().parent
 SCHEMAS = re.findall(r"\bm\.def\(\s*\"(\w+)\(", (ROOT.parent / "native" / "schemas.cpp").read_text())
-WITHOUT_CUDA = {"active_isa", "surface_motion"}
-"""The first has nothing to do with a device; the other is for the start from motion, which a GPU does in plain torch. Another op without a CUDA
+WITHOUT_CUDA = {"active_isa", "surface_motion", "neighbour_motion", "neighbour_motion_backward"}
+"""`active_isa` has nothing to do with a device. On a GPU plain torch computes the other ones: `surface_motion` for the start from motion, and
+`neighbour_motion` for optical flow. Another op without a CUDA
 kernel was forgotten."""
 
 
