@@ -26,7 +26,7 @@ demo: native
 PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/recipes tests/deploy
 TRAINING_TESTS := tests/gsplat_core/training tests/gsplat_core/experimental tests/gsplat_core/evaluation
 OP_TESTS := tests/gsplat_core/ops tests/gsplat_core/rendering tests/gsplat_core/deformation
-GROUPS := programs services operators training ops rest
+GROUPS := services programs operators rest training ops
 test-of-programs: TESTS = $(PROGRAM_TESTS)
 test-of-services: TESTS = tests/services
 test-of-operators: TESTS = tests/operators tests/gsplat_core/geometry
