@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.tiles.grid import TileGrid
+from gsplat_core.reference import ray_blending
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -56,9 +58,19 @@ def bin_splats_within(
     return tiles_per_gauss, torch.cat([unused, flatten_ids[listed]]), offsets, needed
 
 
+def splat_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
+    """Return ray coefficients and normals of Gaussians seen by a pinhole camera."""
+    *tensors, camera_model = arguments
+    if camera_model != "pinhole":
+        raise InvalidInput(f"the reference has rays of pinhole cameras only, got {camera_model!r}")
+    return ray_blending.splat_rays(*tensors)
+
+
 rasterization = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
+    splat_rays=splat_rays,
+    blend_rays=ray_blending.blend_rays,
 ).rasterization

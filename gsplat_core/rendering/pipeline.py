@@ -6,13 +6,15 @@ compiled operations, tests with those in plain torch. On CUDA, `single_call.py` 
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
@@ -46,6 +48,9 @@ class StepOperations:
     bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
     rasterize_to_pixels: Callable[..., tuple[Tensor, ...]]
     """Returns colours, alphas, and further values that `render_splats` passes on to its caller."""
+    splat_rays: Callable[..., tuple[Tensor, Tensor]] | None = None
+    blend_rays: Callable[..., tuple[Tensor, ...]] | None = None
+    """Distance along rays and normals, as `gsplat_core.ops.splat_rays` and `gsplat_core.ops.ray_blending`."""
     zero_gradients_stay_zero: bool = False
     """True if a zero gradient stays zero in backward operations, even times NaN, as on CUDA."""
 
@@ -80,6 +85,8 @@ class RenderedSplats(NamedTuple):
     tiles_per_gauss: Tensor
     flatten_ids: Tensor
     isect_offsets: Tensor
+    nearness: Tensor
+    """Values [rows] by which the splats of a tile are sorted: z, or distance from the camera."""
     rest: tuple[Tensor, ...]
     """Values returned by `rasterize_to_pixels` after image and alphas."""
 
@@ -123,16 +130,19 @@ def render_splats(
         channels = None if channels is None else channels.reshape(-1, channels.shape[-1])[picked]
     if rows.compensations is not None:
         opacities = opacities * rows.compensations
-    if settings.has_depth:
+    if settings.has_depth or channels is None:
         depth = rows.depths[..., None]
         channels = depth if channels is None else torch.cat([channels, depth], -1)
-        if backgrounds is not None:
-            zeros = backgrounds.new_zeros(*backgrounds.shape[:-1], 1)
-            backgrounds = torch.cat([backgrounds, zeros], -1) if settings.has_colors else zeros
-    assert channels is not None
+    if backgrounds is not None:
+        # Depth and further signals have no background.
+        backgrounds = pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1])) if settings.has_colors else None
+    nearness = rows.depths
+    if not settings.global_z_order:
+        nearness = _distances_of_centres(means.detach(), viewmats.detach())
+        nearness = nearness.reshape(-1)[picked] if settings.packed else nearness
     grid = TileGrid(settings.tile_size, *settings.tile_grid)
     tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(
-        rows.means2d, rows.radii, rows.depths, grid, conics=rows.conics, opacities=opacities, **packing
+        rows.means2d, rows.radii, nearness, grid, conics=rows.conics, opacities=opacities, **packing
     )
     isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, *reversed(settings.tile_grid))
     image, alphas, *rest = ops.rasterize_to_pixels(
@@ -140,8 +150,14 @@ def render_splats(
         flatten_ids, backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad, max_alpha=max_alpha,
     )  # fmt: skip
     return RenderedSplats(
-        image, alphas, rows, channels, opacities, tiles_per_gauss, flatten_ids, isect_offsets, tuple(rest)
+        image, alphas, rows, channels, opacities, tiles_per_gauss, flatten_ids, isect_offsets, nearness, tuple(rest)
     )
+
+
+def _distances_of_centres(means: Tensor, viewmats: Tensor) -> Tensor:
+    """Return the distances [..., C, N] of Gaussians from the cameras."""
+    local = means[..., None, :, :] @ viewmats[..., :3, :3].mT + viewmats[..., None, :3, 3]
+    return torch.linalg.vector_norm(local, dim=-1)
 
 
 def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, tiles_of_image: int) -> Tensor:
@@ -157,35 +173,58 @@ def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, til
     return torch.repeat_interleave(keys, counts, output_size=length) | bits
 
 
+class Signal(NamedTuple):
+    """Values of Gaussians to blend: plain [..., (C,) N, D], or spherical harmonics [..., (C,) N, K, D]."""
+
+    values: Tensor
+    degree: int | None
+    """Degree of the spherical harmonics; None for plain values."""
+    clamped: bool = True
+    """False for harmonics with values below 0."""
+
+    def seen(self, ops: StepOperations, means: Tensor, viewmats: Tensor, visible: Tensor) -> Tensor:
+        """Return the values [..., C, N, D] seen by each camera, before shift and clamp."""
+        per_camera = self.values.dim() - (1 if self.degree is None else 2) == visible.dim()
+        if self.degree is None:
+            values = self.values if per_camera else self.values[..., None, :, :]
+            return values.expand(*visible.shape, values.shape[-1])
+        directions = means[..., None, :, :] - camera_centers(viewmats)[..., None, :]
+        # The extra dimension is broadcast by the op, which saves one copy of the coefficients per camera.
+        coefficients = self.values if per_camera or means.dim() == 2 else self.values[..., None, :, :, :]
+        width = coefficients.shape[-1]
+        if width == 3:
+            return ops.spherical_harmonics(self.degree, directions, coefficients, masks=visible)
+        triples = pad(coefficients, (0, -width % 3)).split(3, -1)
+        parts = [ops.spherical_harmonics(self.degree, directions, triple, masks=visible) for triple in triples]
+        return torch.cat(parts, -1)[..., :width]
+
+    def shown(self, values: Tensor) -> Tensor:
+        """Return seen values shifted and clamped as in 3DGS; plain values are unchanged."""
+        if self.degree is None:
+            return values
+        return (values + 0.5).clamp_min(0) if self.clamped else values + 0.5
+
+
 def view_colors(
-    ops: StepOperations,
-    means: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    dense: DenseProjection,
-    settings: RenderSettings,
+    ops: StepOperations, means: Tensor, signals: Sequence[Signal], viewmats: Tensor, dense: DenseProjection
 ) -> tuple[Tensor, DenseProjection]:
-    """Return the colours [..., C, N, D] seen by each camera; cull Gaussians with non-finite colour.
+    """Return the channels [..., C, N, D] of all signals seen by each camera; cull Gaussians with non-finite ones.
 
     On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They have no effect: culled
     Gaussians are in no tile list, compositing skips non-finite values, and a zero colour gradient adds nothing to the
     coefficients' gradient.
     """
-    shape = dense.depths.shape
     visible = dense.radii[..., 0] > 0
 
     def evaluate(visible: Tensor) -> Tensor:
-        per_camera = colors.dim() - (1 if settings.sh_degree is None else 2) == len(shape)
-        if settings.sh_degree is None:
-            values = colors if per_camera else colors[..., None, :, :]
-            return values.expand(*shape, values.shape[-1])
-        directions = means[..., None, :, :] - camera_centers(viewmats)[..., None, :]
-        # The extra dimension is broadcast by the op, which saves one copy of the coefficients per camera.
-        coefficients = colors if per_camera or means.dim() == 2 else colors[..., None, :, :, :]
-        return ops.spherical_harmonics(settings.sh_degree, directions, coefficients, masks=visible)
+        parts = [signal.seen(ops, means, viewmats, visible) for signal in signals]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
     def shown(values: Tensor) -> Tensor:
-        return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
+        if len(signals) == 1:
+            return signals[0].shown(values)
+        parts = values.split([signal.values.shape[-1] for signal in signals], -1)
+        return torch.cat([signal.shown(part) for signal, part in zip(signals, parts, strict=True)], -1)
 
     # Check before clamping, which would turn minus infinity into black.
     values = evaluate(visible)
@@ -237,7 +276,7 @@ class Operations(StepOperations):
         quats: Tensor | None,
         scales: Tensor | None,
         opacities: Tensor,
-        colors: Tensor,
+        colors: Tensor | None,
         viewmats: Tensor,
         Ks: Tensor,
         width: int,
@@ -268,14 +307,25 @@ class Operations(StepOperations):
         rolling_shutter: Any = None,
         viewmats_rs: Tensor | None = None,
         *,
+        return_normals: bool = False,
+        global_z_order: bool = True,
+        rays: Tensor | None = None,
+        ut_params: Any = None,
+        lidar_coeffs: Any = None,
+        external_distortion_coeffs: Any = None,
+        extra_signals: Tensor | None = None,
+        extra_signals_sh_degree: int | None = None,
+        renderer_config: Any = None,
         constants: GsplatVersion = "1.6",
     ) -> tuple[Tensor, Tensor, Meta]:
         """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments, in its order, and its results.
 
+        Arguments of gsplat 1.6 that 1.5.3 does not have are given by name.
+
         Shapes, where `...` are any batch dimensions, common to all arguments:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
             colors [..., N, D] or [..., C, N, D] when `sh_degree` is None, else coefficients [..., N, K, 3] or
-            [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as max(0, 0.5 + sum);
+            [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as max(0, 0.5 + sum). None if `render_mode` has no RGB;
             viewmats [..., C, 4, 4] world to camera, OpenCV axes; Ks [..., C, 3, 3] in pixels.
 
         Args:
@@ -286,8 +336,10 @@ class Operations(StepOperations):
             packed: `meta` holds one row per visible Gaussian and camera; the image is the same.
             tile_size: side of the square tiles in pixels; None = 16.
             backgrounds: [..., C, D], blended behind the colours; the depth channel has background 0.
-            render_mode: "RGB", "D" (depth z, weighted by alpha), "ED" (divided by alpha), "RGB+D" or "RGB+ED"
-                (depth is the last channel).
+            render_mode: "RGB", "D" (depth z of the centres, weighted by alpha), "ED" (divided by alpha), "RGB+D" or "RGB+ED"
+                (depth is the last channel). "d", "Ed", "RGB-d" and "RGB-Ed" have the distance along the pixel's ray from the
+                camera to the highest density of each Gaussian in place of z. They need quats, scales and tiles of 16 px.
+                With a fisheye camera it is the distance to the Gaussian's centre.
             absgrad: after backward, `meta["means2d"].absgrad` holds the sum of absolute gradients (Ye et al. 2024).
             rasterize_mode: "antialiased" scales the opacity by sqrt(det Σ / det (Σ + blur)) (Yu et al. 2024).
             camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
@@ -295,7 +347,14 @@ class Operations(StepOperations):
             constants: gsplat version whose constants are used. "1.6" limits alpha to at most 0.99, and the factor of
                 "antialiased" to at least 0.005. "1.5.3" limits them to 0.999 and 0. A value at its limit has no gradient.
                 All other constants are equal.
-            channel_chunk, segmented: accepted for compatibility with gsplat; without effect.
+            return_normals: `meta["normals"]` [..., C, H, W, 3] holds the sum of weight times shortest axis of the Gaussians in
+                world axes, towards the camera. Needs quats, scales and tiles of 16 px.
+            global_z_order: False blends the splats of a tile in the order of the distance of their centre, not of its z.
+            extra_signals: further values [..., (C,) N, E], blended with the weights of the colours into
+                `meta["render_extra_signals"]` [..., C, H, W, E]; or [..., (C,) N, K, E] with `extra_signals_sh_degree`, blended
+                as 0.5 + sum. Their background is 0.
+            channel_chunk, segmented, renderer_config: accepted for compatibility with gsplat; without effect. Colours may
+                have any number of channels.
 
         On CUDA, one native call per pass renders pictures with tiles of 16 px, the constants of 1.6, and spherical harmonics
         or at most 3 plain colour channels. Other arguments use the chain of operations. In both cases the host synchronises
@@ -316,29 +375,34 @@ class Operations(StepOperations):
         """
         asked_for = (
             sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
-            ftheta_coeffs, rolling_shutter, viewmats_rs,
+            ftheta_coeffs, rolling_shutter, viewmats_rs, ut_params, rays, lidar_coeffs, external_distortion_coeffs,
         )  # fmt: skip
         if any(value is not None and value is not False for value in asked_for):
             refuse_unsupported(
                 sparse_grad=sparse_grad, distributed=distributed, with_ut=with_ut, with_eval3d=with_eval3d,
                 radial_coeffs=radial_coeffs, tangential_coeffs=tangential_coeffs, thin_prism_coeffs=thin_prism_coeffs,
-                ftheta_coeffs=ftheta_coeffs, rolling_shutter=rolling_shutter, viewmats_rs=viewmats_rs,
+                ftheta_coeffs=ftheta_coeffs, rolling_shutter=rolling_shutter, viewmats_rs=viewmats_rs, ut_params=ut_params,
+                rays=rays, lidar_coeffs=lidar_coeffs, external_distortion_coeffs=external_distortion_coeffs,
             )  # fmt: skip
         settings = RenderSettings(
             width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
             sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
             render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
-            constants=constants,
+            constants=constants, global_z_order=bool(global_z_order), extra_degree=extra_signals_sh_degree,
+            normals=bool(return_normals),
         )  # fmt: skip
-        arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
-        check_tensors(arguments)
+        arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals)
+        check_tensors(arguments, settings.has_colors)
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
         if rendered is not None:
             return _named_as_in_gsplat(rendered, arguments, settings)
-        image, splats = _step_by_step(self, arguments, settings)
+        image, splats, extra, normals = _step_by_step(self, arguments, settings)
         ids = splats.rows[:3] if isinstance(splats.rows, PackedProjection) else (None, None, None)
-        keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.rows.depths, math.prod(settings.tile_grid))
+        keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.nearness, math.prod(settings.tile_grid))
         meta = _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])
+        for name, values in (("render_extra_signals", extra), ("normals", normals)):
+            if values is not None:
+                meta[name] = values
         return image, splats.alphas, meta
 
     def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
@@ -346,7 +410,7 @@ class Operations(StepOperations):
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
         if rendered is not None:
             return rendered.image, rendered.alphas
-        image, splats = _step_by_step(self, arguments, settings)
+        image, splats, *_ = _step_by_step(self, arguments, settings)
         return image, splats.alphas
 
 
@@ -360,25 +424,117 @@ def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderS
     return out.image, out.alphas, meta
 
 
-def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, RenderedSplats]:
-    """Return colours and depth [..., C, H, W, X], and the intermediate results."""
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
-    batch_dims, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
+class Stepped(NamedTuple):
+    """Result of the chain of operations."""
+
+    image: Tensor
+    """Colours and depth [..., C, H, W, X]."""
+    splats: RenderedSplats
+    extra: Tensor | None
+    """Blended `extra_signals`."""
+    normals: Tensor | None
+
+
+def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> Stepped:
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals = arguments
+    batch_dims, n_gaussians = _check_shapes(arguments, settings)
     if covars is not None:
         require_shape("covars", covars, (*batch_dims, n_gaussians, 3, 3), "[..., N, 3, 3]")
         # Indexing with lists would synchronise on CUDA.
         covars = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
         quats = scales = None
-    coloring = None
-    if settings.has_colors:
-        coloring = lambda dense: view_colors(ops, means, colors, viewmats, dense, settings)
+    signals = []
+    if settings.has_colors and colors is not None:
+        signals.append(Signal(colors, settings.sh_degree))
+    if extra_signals is not None:
+        signals.append(Signal(extra_signals, settings.extra_degree, clamped=False))
+    coloring = (lambda dense: view_colors(ops, means, signals, viewmats, dense)) if signals else None
     geometry = Geometry(means, covars, quats, scales, opacities, viewmats, Ks)
     splats = render_splats(ops, geometry, coloring, backgrounds, settings)
-    image = splats.image
-    if settings.render_mode.endswith("ED"):
-        expected = image[..., -1:] / splats.alphas.clamp(min=1e-10)
-        image = torch.cat([image[..., :-1], expected], -1) if settings.has_colors else expected
-    return image, splats
+    widths = [signal.values.shape[-1] for signal in signals]
+    colored = splats.image[..., : widths[0]] if settings.has_colors else splats.image[..., :0]
+    extra = None if extra_signals is None else splats.image[..., sum(widths) - widths[-1] : sum(widths)]
+    depth = splats.image[..., -1:] if settings.has_depth else None
+    normals = None
+    if settings.has_distance or settings.normals:
+        distance, normals = blended_along_rays(ops, geometry, splats, settings)
+        depth = distance[..., None] if settings.has_distance else depth
+    if depth is None:
+        image = splats.image if extra is None else colored
+    else:
+        if settings.divides_depth:
+            depth = depth / splats.alphas.clamp(min=1e-10)
+        image = torch.cat([colored, depth], -1) if settings.has_colors else depth
+    return Stepped(image, splats, extra, normals if settings.normals else None)
+
+
+def blended_along_rays(
+    ops: StepOperations, geometry: Geometry, splats: RenderedSplats, settings: RenderSettings
+) -> tuple[Tensor, Tensor]:
+    """Blend the distance [..., C, H, W] along the rays and the normals [..., C, H, W, 3] in world axes.
+
+    With several pictures the host reads where their tile lists start.
+    """
+    means, covars, quats, scales, _, viewmats, Ks = geometry
+    wanted = f"render_mode {settings.render_mode!r}" if settings.has_distance else "return_normals"
+    if covars is not None or quats is None or scales is None or settings.tile_size != TILE_SIZE:
+        raise InvalidInput(
+            f"{wanted} needs quats and scales, and tile_size {TILE_SIZE}; got covars or another tile_size"
+        )
+    if viewmats.requires_grad or Ks.requires_grad:
+        raise InvalidInput(
+            f"{wanted} has no gradient with respect to viewmats and Ks; detach them, or use depth z ('D')"
+        )
+    assert ops.splat_rays is not None and ops.blend_rays is not None
+    n, dims = means.shape[-2], viewmats.shape[:-2]
+    images, tiles = math.prod(dims), math.prod(settings.tile_grid)
+    starts = splats.isect_offsets.reshape(images, tiles)
+    length = splats.flatten_ids.shape[0]
+    bounds = [0, length] if images == 1 else [*starts[:, 0].tolist(), length]
+    rows, first_rows = splats.rows, [0, n]
+    ids = None
+    if isinstance(rows, PackedProjection):
+        ids = rows.gaussian_ids
+        of_image = rows.batch_ids * dims[-1] + rows.camera_ids
+        counts = [len(ids)] if images == 1 else torch.bincount(of_image.long(), minlength=images).tolist()
+        first_rows = [0, *itertools.accumulate(counts)]
+    else:
+        first_rows = [n * image for image in range(images + 1)]
+    flat = lambda values, trailing: values.reshape(-1, *values.shape[values.dim() - trailing :])
+    means2d, conics, opacities = flat(rows.means2d, 1), flat(rows.conics, 1), splats.opacities.reshape(-1)
+    max_alpha = CONSTANTS[settings.constants].max_alpha
+    distances, normals = [], []
+    for image in range(images):
+        scene = image // dims[-1]
+        view, K = flat(viewmats, 2)[image], flat(Ks, 2)[image]
+        centres, turned, sizes = flat(means, 2)[scene], flat(quats, 2)[scene], flat(scales, 2)[scene]
+        rays, axes = ops.splat_rays(centres, turned, sizes, view, K, settings.camera_model)
+        if settings.camera_model == "fisheye":
+            local = centres @ view[:3, :3].T + view[:3, 3]
+            rays = torch.cat([torch.linalg.vector_norm(local, dim=-1, keepdim=True), rays[:, 1:]], 1)
+        axes = axes @ view[:3, :3]
+        mine = slice(first_rows[image], first_rows[image + 1])
+        if ids is not None:
+            picked = ids[mine].long()
+            rays, axes = rays[picked], axes[picked]
+        listed = splats.flatten_ids[bounds[image] : bounds[image + 1]] - first_rows[image]
+        values, alphas, mean, *_ = ops.blend_rays(
+            means2d[mine], conics[mine], opacities[mine], rays, axes, settings.width, settings.height,
+            (starts[image] - bounds[image]).reshape(*reversed(settings.tile_grid)), listed, max_alpha=max_alpha,
+        )  # fmt: skip
+        distances.append(mean * alphas * _length_of_rays(K, settings, mean))
+        normals.append(values)
+    size = settings.height, settings.width
+    return torch.stack(distances).reshape(*dims, *size), torch.stack(normals).reshape(*dims, *size, 3)
+
+
+def _length_of_rays(K: Tensor, settings: RenderSettings, like: Tensor) -> Tensor:
+    """Return the length [H, W] of each pixel's ray per unit of the blended depth."""
+    if settings.camera_model != "pinhole":
+        return like.new_ones(())
+    x = (torch.arange(settings.width, device=like.device, dtype=like.dtype) + 0.5 - K[0, 2]) / K[0, 0]
+    y = (torch.arange(settings.height, device=like.device, dtype=like.dtype) + 0.5 - K[1, 2]) / K[1, 1]
+    return torch.sqrt(1 + x * x + (y * y)[:, None])
 
 
 def _meta(
@@ -414,33 +570,39 @@ def _meta(
     }
 
 
-def _check_shapes(
-    means: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    backgrounds: Tensor | None,
-    settings: RenderSettings,
-) -> tuple[tuple[int, ...], int]:
+def _check_shapes(arguments: Arguments, settings: RenderSettings) -> tuple[tuple[int, ...], int]:
     """Check shapes and return the batch dimensions and number of Gaussians.
 
     The projection checks the remaining arguments.
     """
+    means, opacities, colors, backgrounds = (
+        arguments.means,
+        arguments.opacities,
+        arguments.colors,
+        arguments.backgrounds,
+    )
+    viewmats, extra = arguments.viewmats, arguments.extra_signals
     if means.dim() < 2 or means.shape[-1] != 3:
         raise InvalidInput(f"means must be [..., N, 3], got {list(means.shape)}")
     if viewmats.dim() < 3:
         raise InvalidInput(f"viewmats must be [..., C, 4, 4], got {list(viewmats.shape)}")
     batch_dims, n, c = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
     require_shape("opacities", opacities, (*batch_dims, n), "[..., N]")
-    trailing = 1 if settings.sh_degree is None else 2
-    form = "[..., (C,) N, D]" if settings.sh_degree is None else "[..., (C,) N, K, 3]"
-    leading = tuple(colors.shape[: colors.dim() - trailing])
-    if leading not in ((*batch_dims, n), (*batch_dims, c, n)):
-        raise InvalidInput(f"colors must be {form} with N = {n}, C = {c}, got {list(colors.shape)}")
-    if settings.sh_degree is None and settings.has_colors and colors.shape[-1] < 1:
-        raise InvalidInput(f"colors must be {form} with at least one channel, got {list(colors.shape)}")
-    require_same_kind(means=means, colors=colors, backgrounds=backgrounds)
-    if backgrounds is not None:
+    for name, values, degree in (
+        ("colors", colors, settings.sh_degree),
+        ("extra_signals", extra, settings.extra_degree),
+    ):
+        if values is None:
+            continue
+        last = "D" if name == "colors" and degree is None else "3" if name == "colors" else "E"
+        form = f"[..., (C,) N, {last}]" if degree is None else f"[..., (C,) N, K, {last}]"
+        leading = tuple(values.shape[: values.dim() - (1 if degree is None else 2)])
+        if leading not in ((*batch_dims, n), (*batch_dims, c, n)):
+            raise InvalidInput(f"{name} must be {form} with N = {n}, C = {c}, got {list(values.shape)}")
+        if degree is None and (settings.has_colors or name != "colors") and values.shape[-1] < 1:
+            raise InvalidInput(f"{name} must be {form} with at least one channel, got {list(values.shape)}")
+    require_same_kind(means=means, colors=colors, backgrounds=backgrounds, extra_signals=extra)
+    if backgrounds is not None and colors is not None:
         depth_only = not settings.has_colors
         d = backgrounds.shape[-1] if depth_only else 3 if settings.sh_degree is not None else colors.shape[-1]
         require_shape("backgrounds", backgrounds, (*batch_dims, c, d), "[..., C, D]")

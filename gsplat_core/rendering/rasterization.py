@@ -27,11 +27,27 @@ from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
+
+def _splat_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
+    # The op is loaded when it is first needed, so that pictures alone do not depend on it.
+    from gsplat_core.ops.splat_rays.splat_rays import splat_rays
+
+    return splat_rays(*arguments)
+
+
+def _blend_rays(*arguments: Any, **options: Any) -> tuple[Tensor, ...]:
+    from gsplat_core.ops.ray_blending.ray_blending import blend_rays
+
+    return blend_rays(*arguments, **options)
+
+
 step_by_step = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
+    splat_rays=_splat_rays,
+    blend_rays=_blend_rays,
     zero_gradients_stay_zero=True,
 )
 """Chain of compiled operations, on any supported device."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED", "d", "Ed", "RGB-d", "RGB-Ed"]
 RasterizeMode = Literal["classic", "antialiased"]
 GsplatVersion = Literal["1.6", "1.5.3"]
 _RENDER_MODES, _RASTERIZE_MODES = get_args(RenderMode), get_args(RasterizeMode)
@@ -48,11 +48,13 @@ class Arguments(NamedTuple):
     quats: Tensor | None
     scales: Tensor | None
     opacities: Tensor
-    colors: Tensor
+    colors: Tensor | None
+    """None if `render_mode` has no colours."""
     viewmats: Tensor
     Ks: Tensor
     backgrounds: Tensor | None
     covars: Tensor | None
+    extra_signals: Tensor | None = None
 
 
 _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -65,6 +67,7 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "Ks": ("[..., C, 3, 3]", (3, 3)),
     "backgrounds": ("[..., C, D]", ()),
     "covars": ("[..., N, 3, 3]", (3, 3)),
+    "extra_signals": ("[..., N, E], or harmonics [..., N, K, E]", ()),
 }
 """Expected shape of each tensor, for error messages, and its trailing dimensions."""
 
@@ -87,6 +90,11 @@ class RenderSettings:
     rasterize_mode: RasterizeMode = "classic"
     camera_model: str = "pinhole"
     constants: GsplatVersion = "1.6"
+    global_z_order: bool = True
+    """False sorts splats by the distance of their centre from the camera instead of by z."""
+    extra_degree: int | None = None
+    """Degree of the spherical harmonics of `extra_signals`; None for plain values."""
+    normals: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("width", 1), ("height", 1), ("tile_size", 1)):
@@ -99,10 +107,13 @@ class RenderSettings:
             number = getattr(self, name)
             if isinstance(number, bool) or not isinstance(number, int | float) or number != number:
                 raise InvalidInput(f"{name} must be a number, got {_shown(number)}")
-        if self.sh_degree is not None and (
-            isinstance(self.sh_degree, bool) or not hasattr(self.sh_degree, "__index__")
-        ):
-            raise InvalidInput(f"sh_degree must be None or 0 to {MAX_SH_DEGREE}, got {_shown(self.sh_degree)}")
+        for name, degree in (("sh_degree", self.sh_degree), ("extra_signals_sh_degree", self.extra_degree)):
+            if degree is None:
+                continue
+            if isinstance(degree, bool) or not hasattr(degree, "__index__"):
+                raise InvalidInput(f"{name} must be None or 0 to {MAX_SH_DEGREE}, got {_shown(degree)}")
+            if not 0 <= degree <= MAX_SH_DEGREE:
+                raise InvalidInput(f"{name} must be None or 0 to {MAX_SH_DEGREE}, got {degree}")
         for name, value, known in (
             ("render_mode", self.render_mode, _RENDER_MODES),
             ("rasterize_mode", self.rasterize_mode, _RASTERIZE_MODES),
@@ -111,8 +122,6 @@ class RenderSettings:
                 raise InvalidInput(f"unknown {name} {value!r}; the modes are {', '.join(known)}")
         if self.constants not in tuple(CONSTANTS):
             raise InvalidInput(f"unknown constants {self.constants!r}; the versions are {', '.join(CONSTANTS)}")
-        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
-            raise InvalidInput(f"sh_degree must be None or 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
 
     @property
     def has_colors(self) -> bool:
@@ -126,16 +135,28 @@ class RenderSettings:
 
     @property
     def has_depth(self) -> bool:
-        """True if depth is the last output channel."""
+        """True if z of the splats' centres is the last output channel."""
         return self.render_mode.endswith("D")
 
+    @property
+    def has_distance(self) -> bool:
+        """True if distance along the rays is the last output channel."""
+        return self.render_mode.endswith("d")
 
-def check_tensors(arguments: Arguments) -> None:
+    @property
+    def divides_depth(self) -> bool:
+        """True if depth or distance is divided by alpha."""
+        return self.render_mode.endswith(("ED", "Ed"))
+
+
+def check_tensors(arguments: Arguments, has_colors: bool = True) -> None:
     """Raise InvalidInput for a missing, non-floating or wrongly shaped argument of `rasterization`."""
     by_covars = arguments.covars is not None
     for name, value in arguments._asdict().items():
         if value is None:
-            if name in ("backgrounds", "covars") or (by_covars and name in ("quats", "scales")):
+            if name in ("backgrounds", "covars", "extra_signals") or (by_covars and name in ("quats", "scales")):
+                continue
+            if name == "colors" and not has_colors:
                 continue
             also = ", or covars in place of quats and scales" if name in ("quats", "scales") else ""
             raise InvalidInput(f"{name} is None; it must be a tensor {_SHAPES[name][0]}{also}")
@@ -158,6 +179,30 @@ def _shown(value: object) -> str:
     return f"{value!r:.80} ({type(value).__name__})"
 
 
+REFUSED: dict[str, str] = {
+    "sparse_grad": "use packed=True, whose gradients are dense",
+    "distributed": "render with one process",
+    "with_ut": "leave it out to project with the camera models pinhole, ortho and fisheye",
+    "with_eval3d": "leave it out to blend projected splats",
+    "radial_coeffs": "undistort the pictures, or use camera_model='fisheye' without coefficients",
+    "tangential_coeffs": "undistort the pictures, or use camera_model='fisheye' without coefficients",
+    "thin_prism_coeffs": "undistort the pictures, or use camera_model='fisheye' without coefficients",
+    "ftheta_coeffs": "use camera_model='fisheye'",
+    "rolling_shutter": "use a global shutter",
+    "viewmats_rs": "use a global shutter",
+    "ut_params": "leave it out",
+    "rays": "give viewmats and Ks, which define the rays",
+    "lidar_coeffs": (
+        "use the camera models pinhole, ortho and fisheye, or gsplat_core.rendering.ranges.render_ranges for a range sensor"
+    ),
+    "external_distortion_coeffs": (
+        "distortion by a windshield is not modelled; undistort the pictures and use the camera models pinhole, ortho and"
+        " fisheye"
+    ),
+}
+"""Advice for each unsupported argument of gsplat."""
+
+
 def refuse_unsupported(**arguments: Any) -> None:
     """Raise NotImplementedError for the first argument that is neither None nor False.
 
@@ -166,5 +211,5 @@ def refuse_unsupported(**arguments: Any) -> None:
     for name, value in arguments.items():
         if value is None or value is False or getattr(value, "name", None) == "GLOBAL":
             continue
-        shown = f"a tensor {list(value.shape)}" if hasattr(value, "shape") else repr(value)
-        raise NotImplementedError(f"{name} is not supported, got {shown}; leave it out")
+        shown = f"a tensor {list(value.shape)}" if hasattr(value, "shape") else f"{value!r:.80}"
+        raise NotImplementedError(f"{name} is not supported, got {shown}; {REFUSED.get(name, 'leave it out')}")

@@ -45,9 +45,14 @@ def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Ras
 def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
     if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or torch.compiler.is_compiling():
         return False
+    if settings.has_distance or settings.normals or not settings.global_z_order:
+        return False
+    if arguments.extra_signals is not None or arguments.colors is None:
+        return False
     if settings.constants != NATIVE_CONSTANTS or not _are_plain_cuda_floats(arguments):
         return False
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, _ = arguments
+    assert colors is not None
     if means.dim() < 2 or viewmats.dim() < 3 or settings.camera_model not in CAMERA_MODELS:
         return False
     batch, n, c = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
@@ -94,7 +99,8 @@ def _has_fitting_colors(
 
 
 def _rasterize(arguments: Arguments, settings: RenderSettings) -> Rasterized:
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, _ = arguments
+    assert colors is not None
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in arguments)
     triangles = centers = None
     if covars is not None:
