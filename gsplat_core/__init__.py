@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+    from gsplat_core.ops.ssim.ssim import fused_ssim
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
     from gsplat_core.rendering.frame_renderer import FrameRenderer
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
@@ -31,25 +32,34 @@ if TYPE_CHECKING:
     from gsplat_core.scene.gaussians import Gaussians
     from gsplat_core.training.config import ReconstructorConfig
     from gsplat_core.training.reconstructor import Reconstructor
+    from gsplat_core.training.steps.selective_adam import SelectiveAdam
+    from gsplat_core.training.strategies.adc import DefaultStrategy
+    from gsplat_core.training.strategies.mcmc import MCMCStrategy
+    from gsplat_core.training.strategies.strategy import Strategy
 
 __all__ = [
     "RENDERERS",
     "Camera",
     "CoreError",
+    "DefaultStrategy",
     "DeformationField",
     "Frame",
     "FrameRenderer",
     "FrameStatus",
     "Gaussians",
     "InvalidInput",
+    "MCMCStrategy",
     "Model",
     "Reconstructor",
     "ReconstructorConfig",
     "RenderOutput",
     "Renderer",
+    "SelectiveAdam",
     "Snapshot",
     "SnapshotSlots",
+    "Strategy",
     "fully_fused_projection",
+    "fused_ssim",
     "isect_offset_encode",
     "isect_tiles",
     "load_bundle",
@@ -69,20 +79,25 @@ _HOME = {
     "RENDERERS": "rendering.registry",
     "Camera": "scene.cameras",
     "CoreError": "errors",
+    "DefaultStrategy": "training.strategies.adc",
     "DeformationField": "deformation",
     "Frame": "scene.frames",
     "FrameRenderer": "rendering.frame_renderer",
     "FrameStatus": "scene.frames",
     "Gaussians": "scene.gaussians",
     "InvalidInput": "errors",
+    "MCMCStrategy": "training.strategies.mcmc",
     "Model": "models.model",
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",
     "Renderer": "rendering.renderer",
+    "SelectiveAdam": "training.steps.selective_adam",
     "Snapshot": "models.snapshots",
     "SnapshotSlots": "models.snapshots",
+    "Strategy": "training.strategies.strategy",
     "fully_fused_projection": "ops.projection.projection",
+    "fused_ssim": "ops.ssim.ssim",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
     "load_bundle": "io.bundle",

@@ -9,6 +9,8 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 MAX_CHANNELS = 32
+WINDOW_RADIUS_PX = 5
+"""Pixels at each border whose window contains padding."""
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
@@ -38,6 +40,40 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
                 f"{name} must be float32, got {tensor.dtype}; gsplat_core.reference has ssim_map for other types"
             )
     return torch.ops.gsplat_core.ssim_map(image, target)
+
+
+def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
+    """Compute the mean structural similarity of pictures, with the signature of the package `fused-ssim`.
+
+    Args:
+        img1: pictures float32 [B, C, H, W] in 0..1; differentiable.
+        img2: pictures of the same shape; differentiable.
+        padding: "same" averages all pixels, "valid" those at least 5 pixels from the border.
+        train: False computes no gradient.
+
+    Returns:
+        Mean over all pictures, channels and pixels, [].
+
+    Raises:
+        InvalidInput: for other shapes, dtypes or paddings, or pictures without a valid pixel.
+    """
+    if padding not in ("same", "valid"):
+        raise InvalidInput(f"padding is {padding!r}; choose 'same' or 'valid'")
+    border = 0 if padding == "same" else WINDOW_RADIUS_PX
+    if img1.dim() != 4 or img1.shape != img2.shape or min(img1.shape[2:]) <= 2 * border or not img1.numel():
+        raise InvalidInput(
+            f"fused_ssim takes two tensors [B, C, H, W] larger than {2 * border} pixels, got {list(img1.shape)} and"
+            f" {list(img2.shape)}"
+        )
+    if not train:
+        img1, img2 = img1.detach(), img2.detach()
+    total = img1.new_zeros(())
+    pairs = zip(*(each.flatten(0, 1).split(MAX_CHANNELS) for each in (img1, img2)), strict=True)
+    for one, other in pairs:
+        found = ssim_map(one.movedim(0, -1).contiguous(), other.movedim(0, -1).contiguous())
+        inner = found[border : found.shape[0] - border, border : found.shape[1] - border]
+        total = total + inner.sum() / (inner.shape[0] * inner.shape[1])
+    return total / (img1.shape[0] * img1.shape[1])
 
 
 @torch.library.register_fake("gsplat_core::ssim_map")

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ssim.ssim import ssim_map
+from gsplat_core.ops.ssim.ssim import fused_ssim, ssim_map
 from gsplat_core.reference.ssim import gaussian_window
 from gsplat_core.reference.ssim import ssim_map as reference_ssim_map
 
@@ -119,3 +119,21 @@ def test_what_it_cannot_take_is_refused():
         ssim_map(image, target[:, :4])
     with pytest.raises(InvalidInput, match="32 channels"):
         ssim_map(torch.zeros(2, 2, 33), torch.zeros(2, 2, 33))
+
+
+def test_fused_ssim_is_the_mean_of_the_map_of_every_picture():
+    first = torch.rand(3, 11, 14, 17, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    second = torch.rand(3, 11, 14, 17, generator=torch.Generator().manual_seed(1))
+    expected = torch.stack(
+        [reference_ssim_map(a.movedim(0, -1), b.movedim(0, -1)) for a, b in zip(first, second, strict=True)]
+    )
+    for padding, inner in (("same", expected), ("valid", expected[:, 5:-5, 5:-5])):
+        torch.testing.assert_close(fused_ssim(first, second, padding), inner.mean())
+    (gradient,) = torch.autograd.grad(fused_ssim(first, second, padding="valid"), first)
+    (wanted,) = torch.autograd.grad(expected[:, 5:-5, 5:-5].mean(), first)
+    torch.testing.assert_close(gradient, wanted)
+    assert not fused_ssim(first, second, train=False).requires_grad
+    with pytest.raises(InvalidInput, match="'same' or 'valid'"):
+        fused_ssim(first, second, "full")
+    with pytest.raises(InvalidInput, match="larger than 10 pixels"):
+        fused_ssim(first[..., :10], second[..., :10], "valid")

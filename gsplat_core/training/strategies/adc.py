@@ -1,0 +1,193 @@
+"""Adaptive density control (Kerbl et al. 2023, section 5): Gaussians with large gradients in the picture are multiplied."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from gsplat_core.training.strategies.operations import duplicate, remove, reset_opa, split
+from gsplat_core.training.strategies.strategy import GEOMETRY, InvalidParameters, Optimizers, Params, Strategy
+
+
+@dataclass
+class DefaultStrategy(Strategy):
+    """Multiply Gaussians with large gradients of their projected centre, remove transparent ones, and reset opacities.
+
+    Every `refine_every` steps, a Gaussian whose mean gradient exceeds `grow_grad2d` is duplicated if it is small, and split
+    if it is large. Gradients are those of the loss by the centre in units of half the picture, times the number of cameras.
+    """
+
+    prune_opa: float = 0.005
+    """Opacity below which a Gaussian is removed."""
+    grow_grad2d: float = 0.0002
+    """Mean gradient above which a Gaussian is multiplied. 0.0008 suits `absgrad`."""
+    grow_scale3d: float = 0.01
+    """Largest scale, relative to the scene, of a Gaussian that is duplicated instead of split."""
+    grow_scale2d: float = 0.05
+    """Radius relative to the picture above which a Gaussian is split, until `refine_scale2d_stop_iter`."""
+    prune_scale3d: float = 0.1
+    """Scale relative to the scene above which a Gaussian is removed after the first reset."""
+    prune_scale2d: float = 0.15
+    """Radius relative to the picture above which a Gaussian is removed, until `refine_scale2d_stop_iter`."""
+    refine_scale2d_stop_iter: int = 0
+    """Step at which tests of the radius end; 0 for no tests."""
+    refine_start_iter: int = 500
+    """Step after which refinement begins."""
+    refine_stop_iter: int = 15_000
+    """Step at which refinement and resets end."""
+    reset_every: int = 3000
+    """Steps between two resets of the opacities to twice `prune_opa`."""
+    refine_every: int = 100
+    """Steps between two refinements."""
+    pause_refine_after_reset: int = 0
+    """Steps after a reset without refinement."""
+    absgrad: bool = False
+    """Use sums of absolute gradients (Ye et al. 2024); `rasterization` needs `absgrad=True`, too."""
+    revised_opacity: bool = False
+    """Give split Gaussians opacities that keep the picture (Rota Bulò et al. 2024)."""
+    verbose: bool = False
+    """Print the numbers of added and removed Gaussians."""
+    key_for_gradient: Literal["means2d", "gradient_2dgs"] = "means2d"
+    """Entry of `info` whose gradient counts: `gradient_2dgs` for `rasterization_2dgs`."""
+    compat: Literal["1.5.3", "1.6"] = field(default="1.6", kw_only=True)
+    """Version of gsplat to follow. 1.5.3 never resets opacities, because of the precedence of its operators."""
+    generator: torch.Generator | None = field(default=None, kw_only=True)
+    """Source of the random numbers; None for torch's default generator of the device."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = GEOMETRY
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """Return empty statistics for a scene of size `scene_scale`, to which the limits of scales are relative."""
+        state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": scene_scale}
+        if self.refine_scale2d_stop_iter > 0:
+            state["radii"] = None
+        return state
+
+    def step_pre_backward(
+        self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
+    ) -> None:
+        """Keep the gradient of the projected centres; call before `loss.backward()`.
+
+        Raises:
+            InvalidParameters: if `info` lacks the centres.
+        """
+        self._needed(info, self.key_for_gradient).retain_grad()
+
+    def step_post_backward(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
+    ) -> None:
+        """Update the statistics, and refine and reset if it is time; call after `loss.backward()`.
+
+        Args:
+            params: tensors of the Gaussians.
+            optimizers: optimisers by the same names.
+            state: result of `initialize_state`.
+            step: number of the training step, from 0.
+            info: third result of `rasterization`.
+            packed: True if `rasterization` was called with `packed=True`.
+
+        Raises:
+            InvalidParameters: if `info` lacks an entry.
+        """
+        if step >= self.refine_stop_iter:
+            return
+        self._update_state(params, state, info, packed=packed)
+        paused = step % self.reset_every < self.pause_refine_after_reset
+        if step > self.refine_start_iter and step % self.refine_every == 0 and not paused:
+            duplicated, divided = self._grow_gs(params, optimizers, state, step)
+            removed = self._prune_gs(params, optimizers, state, step)
+            if self.verbose:
+                print(  # noqa: T201
+                    f"step {step}: {duplicated} Gaussians duplicated, {divided} split, {removed} removed;"
+                    f" {len(params['means'])} now"
+                )
+            for name in ("grad2d", "count", "radii"):
+                if state.get(name) is not None:
+                    state[name].zero_()
+        if self.compat == "1.6" and step > 0 and step % self.reset_every == 0:
+            reset_opa(params, optimizers, state, value=2 * self.prune_opa)
+
+    def _update_state(self, params: Params, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
+        """Add the gradients of one step to the statistics."""
+        centres, width, height, cameras, radii = (
+            self._needed(info, name) for name in (self.key_for_gradient, "width", "height", "n_cameras", "radii")
+        )
+        gradients = centres.absgrad if self.absgrad else centres.grad
+        if gradients is None:
+            raise InvalidParameters(
+                f"{self.key_for_gradient} has no gradient; call step_pre_backward before backward, and render with absgrad"
+                " if the strategy uses it"
+            )
+        scale = gradients.new_tensor([width / 2 * cameras, height / 2 * cameras])
+        norms = (gradients * scale).norm(dim=-1)
+        count = len(next(iter(params.values())))
+        for name in ("grad2d", "count", *(("radii",) if self.refine_scale2d_stop_iter > 0 else ())):
+            if state.get(name) is None:
+                state[name] = torch.zeros(count, device=norms.device)
+        extent = radii if radii.dim() == norms.dim() else radii.amax(-1)
+        extent = extent / float(max(width, height))
+        if packed:
+            rows = self._needed(info, "gaussian_ids")
+            state["grad2d"].index_put_((rows,), norms, accumulate=True)
+            state["count"].index_put_((rows,), torch.ones_like(norms), accumulate=True)
+        else:
+            # Sums over the cameras have a fixed order, unlike additions by index.
+            visible = radii > 0 if radii.dim() == norms.dim() else (radii > 0).all(-1)
+            visible, norms, extent = (each.reshape(-1, count) for each in (visible, norms, extent))
+            state["grad2d"] += torch.where(visible, norms, 0).sum(0)
+            state["count"] += visible.sum(0)
+        if self.refine_scale2d_stop_iter > 0:
+            if packed:
+                state["radii"].scatter_reduce_(0, rows, extent, "amax")
+            else:
+                torch.maximum(state["radii"], torch.where(visible, extent, 0).amax(0), out=state["radii"])
+
+    @torch.no_grad()
+    def _grow_gs(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
+        """Duplicate and split Gaussians. Returns both numbers; synchronises."""
+        copied, divided = self._to_grow(params, state, step)
+        copies, splits = int(torch.count_nonzero(copied)), int(torch.count_nonzero(divided))
+        if copies:
+            duplicate(params, optimizers, state, copied)
+            # The new rows of the duplicates are not split.
+            divided = torch.cat([divided, divided.new_zeros(copies)])
+        if splits:
+            split(params, optimizers, state, divided, self.revised_opacity, generator=self.generator)
+        return copies, splits
+
+    def _to_grow(self, params: Params, state: dict[str, Any], step: int) -> tuple[Tensor, Tensor]:
+        """Return the Gaussians to duplicate and those to split, bool [N] each."""
+        steep = state["grad2d"] / state["count"].clamp(min=1) > self.grow_grad2d
+        small = params["scales"].exp().amax(-1) <= self.grow_scale3d * state["scene_scale"]
+        divided = steep & ~small
+        if step < self.refine_scale2d_stop_iter:
+            divided |= state["radii"] > self.grow_scale2d
+        return steep & small, divided
+
+    @torch.no_grad()
+    def _prune_gs(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> int:
+        """Remove transparent and, after the first reset, oversized Gaussians. Returns their number; synchronises."""
+        leaving = params["opacities"].flatten().sigmoid() < self.prune_opa
+        if step > self.reset_every:
+            leaving |= params["scales"].exp().amax(-1) > self.prune_scale3d * state["scene_scale"]
+            if step < self.refine_scale2d_stop_iter:
+                leaving |= state["radii"] > self.prune_scale2d
+        removed = int(torch.count_nonzero(leaving))
+        if removed:
+            remove(params, optimizers, state, leaving)
+        return removed
+
+    @staticmethod
+    def _needed(info: dict[str, Any], name: str) -> Any:
+        if name not in info:
+            raise InvalidParameters(f"info lacks {name!r}; pass the third result of rasterization")
+        return info[name]

@@ -1,0 +1,119 @@
+"""Training as a Markov chain (Kheradmand et al. 2024): transparent Gaussians move to visible places, and positions diffuse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gsplat_core.training.strategies.operations import inject_noise_to_position, relocate, sample_add
+from gsplat_core.training.strategies.relocation import binomials
+from gsplat_core.training.strategies.strategy import GEOMETRY, Optimizers, Params, Strategy
+
+GROWTH = 1.05
+"""Factor of the number of Gaussians per refinement."""
+
+
+class NoLiveGaussians(RuntimeError):
+    """All Gaussians are too transparent to be copied: the training has failed."""
+
+
+@dataclass
+class MCMCStrategy(Strategy):
+    """Move dead Gaussians to visible places, add copies up to a cap, and add noise to positions in every step.
+
+    The training loss should contain 0.01 times the mean opacity and 0.01 times the mean scale, which let Gaussians die.
+    """
+
+    cap_max: int = 1_000_000
+    """Largest number of Gaussians."""
+    noise_lr: float = 5e5
+    """Factor of the noise, multiplied by the learning rate of the positions."""
+    refine_start_iter: int = 500
+    """Step after which Gaussians move and grow in number."""
+    refine_stop_iter: int = 25_000
+    """Step at which that ends."""
+    refine_every: int = 100
+    """Steps between two refinements."""
+    min_opacity: float = 0.005
+    """Opacity up to which a Gaussian is dead."""
+    verbose: bool = False
+    """Print the numbers of moved and added Gaussians."""
+    noise_injection_stop_iter: int = field(default=-1, kw_only=True)
+    """Step at which the noise ends; below 0: never."""
+    noise_opacity_t: float = field(default=0.005, kw_only=True)
+    """Opacity at which the noise is halved."""
+    noise_opacity_k: float = field(default=100.0, kw_only=True)
+    """Slope of the decrease of noise with opacity."""
+    generator: torch.Generator | None = field(default=None, kw_only=True)
+    """Source of the random numbers; None for torch's default generator of the device."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = GEOMETRY
+
+    def initialize_state(self) -> dict[str, Any]:
+        """Return the table of binomial coefficients that `compute_relocation` needs."""
+        return {"binoms": binomials()}
+
+    def step_post_backward(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        lr: float,
+    ) -> None:
+        """Move and add Gaussians if it is time, and add noise; call after `loss.backward()`.
+
+        Args:
+            params: tensors of the Gaussians.
+            optimizers: optimisers by the same names.
+            state: result of `initialize_state`.
+            step: number of the training step, from 0.
+            info: not used.
+            lr: learning rate of the positions.
+
+        Raises:
+            NoLiveGaussians: if all Gaussians are dead.
+        """
+        binoms = state["binoms"] = state["binoms"].to(params["means"].device)
+        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
+            moved = self._relocate_gs(params, optimizers, binoms)
+            added = self._add_new_gs(params, optimizers, binoms)
+            if self.verbose:
+                print(f"step {step}: {moved} Gaussians moved, {added} added; {len(params['means'])} now")  # noqa: T201
+        if self.noise_injection_stop_iter < 0 or step < self.noise_injection_stop_iter:
+            inject_noise_to_position(
+                params, optimizers, {}, lr * self.noise_lr, opacity_at_half=self.noise_opacity_t,
+                steepness=self.noise_opacity_k, generator=self.generator,
+            )  # fmt: skip
+
+    @torch.no_grad()
+    def _relocate_gs(self, params: Params, optimizers: Optimizers, binoms: Tensor) -> int:
+        """Move dead Gaussians to visible places. Returns their number; synchronises."""
+        dead = params["opacities"].flatten().sigmoid() <= self.min_opacity
+        count = int(torch.count_nonzero(dead))
+        self._check_alive(len(dead) - count)
+        if count:
+            relocate(params, optimizers, {}, dead, binoms, self.min_opacity, generator=self.generator)
+        return count
+
+    @torch.no_grad()
+    def _add_new_gs(self, params: Params, optimizers: Optimizers, binoms: Tensor) -> int:
+        """Add copies of visible Gaussians. Returns their number."""
+        present = len(params["means"])
+        added = max(0, min(self.cap_max, int(GROWTH * present)) - present)
+        if added:
+            opacities = params["opacities"].sigmoid()
+            self._check_alive(int(torch.count_nonzero(opacities > self.min_opacity)))
+            sample_add(params, optimizers, {}, added, binoms, self.min_opacity, generator=self.generator)
+        return added
+
+    def _check_alive(self, count: int) -> None:
+        if not count:
+            raise NoLiveGaussians(
+                f"no live Gaussians: all opacities are at most min_opacity={self.min_opacity}; lower the learning rates or"
+                " the weight of the mean opacity"
+            )

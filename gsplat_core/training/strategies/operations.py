@@ -1,0 +1,309 @@
+"""Row operations of strategies: Gaussians are added, removed or changed together with the state of their optimisers.
+
+All functions change `params`, the optimisers and `state` in place. Tensors in `state` have a row for each Gaussian, other
+entries are left alone. Random numbers come from torch's default generator of the device, or from `generator`, so a seed gives
+the same Gaussians. Signatures are gsplat's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, MutableMapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+from gsplat_core.training.strategies.relocation import compute_relocation
+from gsplat_core.training.strategies.strategy import InvalidParameters, Optimizers, Params
+
+State = MutableMapping[str, Any]
+"""Statistics of a strategy by name."""
+SHRINK = 1.6
+"""Factor by which the samples of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
+LARGEST_MULTINOMIAL = 1 << 24
+"""Largest number of categories of `torch.multinomial`."""
+
+
+@torch.no_grad()
+def update_rows(
+    param_fn: Callable[[str, Tensor], Tensor],
+    optimizer_fn: Callable[[str, Tensor], Tensor],
+    params: Params,
+    optimizers: Optimizers,
+    names: Iterable[str] | None = None,
+) -> None:
+    """Replace parameters, and move the state of their optimisers to the new ones.
+
+    Args:
+        param_fn: returns the new parameter for a name and the old parameter.
+        optimizer_fn: returns the new value for the name and the value of an entry of the optimiser's state, `step` excepted.
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        names: parameters to replace; None for all.
+
+    Raises:
+        InvalidParameters: if a trainable parameter has no optimiser.
+    """
+    for name in list(params.keys() if names is None else names):
+        old = params[name]
+        new = params[name] = param_fn(name, old)  # type: ignore[assignment]
+        if name not in optimizers:
+            if old.requires_grad:
+                raise InvalidParameters(f"{name} is trainable but has no optimizer; give it one, or freeze it")
+            continue
+        optimizer = optimizers[name]
+        moments = optimizer.state.pop(old, {})
+        for group in optimizer.param_groups:
+            group["params"] = [new]
+        if moments:
+            kept = {key: value if key == "step" else optimizer_fn(key, value) for key, value in moments.items()}
+            optimizer.state[new] = kept
+
+
+@torch.no_grad()
+def duplicate(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
+    """Append a copy of each Gaussian in `mask`, bool [N]. Copies start with zero moments."""
+    chosen = mask.nonzero()[:, 0]
+    _append(params, optimizers, chosen, lambda name, tensor: tensor[chosen])
+    for name, rows in _rows_of(state):
+        state[name] = torch.cat([rows, rows[chosen]])
+
+
+@torch.no_grad()
+def split(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    mask: Tensor,
+    revised_opacity: bool = False,
+    *,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Replace each Gaussian in `mask`, bool [N], by two smaller ones drawn from it (Kerbl et al. 2023, section 5.2).
+
+    The others come first, then the first samples, then the second ones. Samples start with zero moments.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        state: statistics; samples inherit those of their Gaussian.
+        mask: Gaussians to split.
+        revised_opacity: give the samples the opacity 1 - √(1 - o), which keeps the picture (Rota Bulò et al. 2024).
+        generator: source of the random numbers, on the device of `mask`.
+    """
+    chosen, rest = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+    scales = params["scales"][chosen].exp()
+    noise = torch.randn(2, len(chosen), 3, device=mask.device, dtype=scales.dtype, generator=generator)
+    axes = rotation_matrices(params["quats"][chosen])
+    offsets = torch.einsum("nij,nj,bnj->bni", axes, scales, noise)
+
+    def samples(name: str, tensor: Tensor) -> Tensor:
+        parents = tensor[chosen]
+        if name == "means":
+            return (parents + offsets).reshape(-1, 3)
+        if name == "scales":
+            parents = (scales / SHRINK).log()
+        elif name == "opacities" and revised_opacity:
+            parents = torch.logit(1 - (1 - parents.sigmoid()).sqrt())
+        return torch.cat([parents, parents])
+
+    def moments(_: str, values: Tensor) -> Tensor:
+        return torch.cat([values[rest], values.new_zeros(2 * len(chosen), *values.shape[1:])])
+
+    update_rows(
+        lambda name, tensor: Parameter(torch.cat([tensor[rest], samples(name, tensor)]), tensor.requires_grad),
+        moments, params, optimizers,
+    )  # fmt: skip
+    for name, rows in _rows_of(state):
+        state[name] = torch.cat([rows[rest], rows[chosen], rows[chosen]])
+
+
+@torch.no_grad()
+def remove(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
+    """Remove the Gaussians in `mask`, bool [N]; the others keep their order and moments."""
+    rest = (~mask).nonzero()[:, 0]
+    update_rows(
+        lambda _, tensor: Parameter(tensor[rest], tensor.requires_grad),
+        lambda _, values: values[rest],
+        params,
+        optimizers,
+    )
+    for name, rows in _rows_of(state):
+        state[name] = rows[rest]
+
+
+@torch.no_grad()
+def reset_opa(params: Params, optimizers: Optimizers, state: State, value: float) -> None:
+    """Reduce opacities above `value` (0 to 1) to it, and reset the moments of all opacities."""
+    most = torch.logit(torch.tensor(value)).item()
+    update_rows(
+        lambda _, tensor: Parameter(tensor.clamp(max=most), tensor.requires_grad),
+        lambda _, values: torch.zeros_like(values),
+        params,
+        optimizers,
+        ["opacities"],
+    )
+
+
+@torch.no_grad()
+def relocate(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    mask: Tensor,
+    binoms: Tensor,
+    min_opacity: float = 0.005,
+    *,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Move the Gaussians in `mask`, bool [N], to places of others, drawn in proportion to their opacity.
+
+    The copies at one place share its opacity by `compute_relocation`. Moments and statistics of the chosen places are reset.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        state: statistics.
+        mask: Gaussians to move, the dead ones.
+        binoms: see `compute_relocation`.
+        min_opacity: smallest opacity after the move.
+        generator: source of the random numbers, on the device of `mask`.
+    """
+    dead, alive = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+    weights = params["opacities"][alive].sigmoid().flatten()
+    places = alive[draw(weights, len(dead), generator)]
+    shared = _shared(params, places, binoms, min_opacity)
+
+    def moved(name: str, tensor: Tensor) -> Tensor:
+        if name in shared:
+            tensor[places] = shared[name].to(tensor.dtype)
+        tensor[dead] = tensor[places]
+        return Parameter(tensor, tensor.requires_grad)
+
+    update_rows(moved, lambda _, values: values.index_fill_(0, places, 0), params, optimizers)
+    for _, rows in _rows_of(state):
+        rows[places] = 0
+
+
+@torch.no_grad()
+def sample_add(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    n: int,
+    binoms: Tensor,
+    min_opacity: float = 0.005,
+    *,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Append `n` copies of Gaussians that are drawn in proportion to their opacity.
+
+    The copies at one place share its opacity by `compute_relocation`. Copies start with zero moments and statistics; those of
+    the chosen places stay.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        state: statistics.
+        n: number of copies.
+        binoms: see `compute_relocation`.
+        min_opacity: smallest opacity of the copies.
+        generator: source of the random numbers, on the device of the Gaussians.
+    """
+    places = draw(params["opacities"].sigmoid().flatten(), n, generator)
+    shared = _shared(params, places, binoms, min_opacity)
+
+    def copies(name: str, tensor: Tensor) -> Tensor:
+        if name in shared:
+            tensor[places] = shared[name].to(tensor.dtype)
+        return tensor[places]
+
+    _append(params, optimizers, places, copies)
+    for name, rows in _rows_of(state):
+        state[name] = torch.cat([rows, rows.new_zeros(len(places), *rows.shape[1:])])
+
+
+@torch.no_grad()
+def inject_noise_to_position(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    scaler: float,
+    *,
+    opacity_at_half: float = 0.005,
+    steepness: float = 100.0,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Move each Gaussian by Σ ε times `scaler`, fading out with opacity (Kheradmand et al. 2024, equation 10).
+
+    Σ is its covariance and ε standard normal noise. The factor sigmoid(-k (o - t)) spares visible Gaussians.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: not used.
+        state: not used.
+        scaler: learning rate of the positions times the noise's rate.
+        opacity_at_half: the opacity t at which the factor is a half.
+        steepness: the slope k of the factor.
+        generator: source of the random numbers, on the device of the Gaussians.
+    """
+    means = params["means"]
+    noise = torch.randn(means.shape, dtype=means.dtype, device=means.device, generator=generator)
+    opacities = params["opacities"].detach().flatten().sigmoid()
+    share = torch.sigmoid(-steepness * (opacities - opacity_at_half))
+    covars, _ = quat_scale_to_covar_preci(
+        params["quats"].detach(), params["scales"].detach().exp(), compute_covar=True, compute_preci=False
+    )
+    means.add_(torch.einsum("nij,nj->ni", covars, noise * (share * scaler)[:, None]))
+
+
+def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
+    """Draw `count` indices with replacement in proportion to `weights` [N], int64 [count]."""
+    if len(weights) <= LARGEST_MULTINOMIAL:
+        return torch.multinomial(weights, count, replacement=True, generator=generator)
+    total = weights.double().cumsum(0)
+    draws = torch.rand(count, dtype=total.dtype, device=total.device, generator=generator) * total[-1]
+    return torch.searchsorted(total, draws, right=True).clamp(max=len(weights) - 1)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Return the rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any norm."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def _append(params: Params, optimizers: Optimizers, parents: Tensor, copies: Callable[[str, Tensor], Tensor]) -> None:
+    """Append a row for each of `parents`, made by `copies` of a name and its tensor, with zero moments."""
+
+    def moments(_: str, values: Tensor) -> Tensor:
+        return torch.cat([values, values.new_zeros(len(parents), *values.shape[1:])])
+
+    def appended(name: str, tensor: Tensor) -> Tensor:
+        # `copies` may change rows of the tensor, which the result contains.
+        added = copies(name, tensor)
+        return Parameter(torch.cat([tensor, added]), tensor.requires_grad)
+
+    update_rows(appended, moments, params, optimizers)
+
+
+def _shared(params: Params, places: Tensor, binoms: Tensor, min_opacity: float) -> dict[str, Tensor]:
+    """Return logits and log-scales at `places` after each has been copied as often as it was drawn, by parameter name."""
+    opacities, scales = compute_relocation(
+        params["opacities"][places].sigmoid(),
+        params["scales"][places].exp(),
+        torch.bincount(places, minlength=len(params["opacities"]))[places] + 1,
+        binoms,
+    )
+    most = 1 - torch.finfo(torch.float32).eps
+    return {"opacities": torch.logit(opacities.clamp(min_opacity, most)), "scales": scales.log()}
+
+
+def _rows_of(state: State) -> list[tuple[str, Tensor]]:
+    return [(name, value) for name, value in state.items() if isinstance(value, Tensor)]
