@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from gsplat_core.errors import InvalidSetting, RecordingInvalid
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.model_sources import load_model
-from gsplat_core.io.recordings.colmap import PosedImage, read_colmap
-from gsplat_core.io.recordings.plain_files import UnreadableFile, decode_picture
+from gsplat_core.io.recordings.colmap import HELD_OUT_EVERY, read_colmap
 from gsplat_core.rendering.registry import check_renderer, new_renderer
 from gsplat_core.rendering.renderer import Renderer, RendererOptions
-from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.metrics import frame_quality
 from operators.applications.device import check_device
-from operators.applications.limits import check_picture, check_shown_size, render_bytes, require_memory
+from operators.applications.limits import check_picture, render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.rasterize import displayed
 from operators.settings import check_option
 from operators.sinks.images import write_png
 from operators.storage import write_whole
 
-SAME_SHAPE = 0.01
-"""Largest relative difference of the aspect ratios of a camera and its image file."""
 RESULT_FILE = "evaluation.json"
 
 
@@ -45,7 +39,7 @@ class SceneSettings:
     """Folder of the scene."""
     images: str = "images"
     """Folder of the images inside the scene, such as `images_4` for smaller ones."""
-    every: int = 8
+    every: int = HELD_OUT_EVERY
     """The images 0, k, 2k, … in the order of their names are held out."""
     scale: float = 1.0
     """Factor on the size of the images."""
@@ -108,14 +102,15 @@ def evaluate_scene(
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device, options=settings.options)
-    held_out = read_colmap(settings.scene).held_out(settings.every)
+    scene = read_colmap(settings.scene)
+    held_out = scene.held_out(settings.every)
     model = load_model(source).to(settings.device)
     renderers: dict[tuple[int, int], Renderer] = {}
     scores: list[ImageScore] = []
-    for posed, image in _images(settings, held_out):
+    for posed in held_out:
         if stop_requested():
             break
-        camera = _camera_of(posed, image)
+        camera, image = scene.read(posed, settings.images, settings.scale)
         size_px = camera.width_px, camera.height_px
         if size_px not in renderers:
             check_picture(camera, settings.scale)
@@ -147,39 +142,3 @@ def evaluate_scene(
     if folder is not None:
         write_whole(folder / RESULT_FILE, json.dumps(asdict(result), indent=1).encode())
     return result
-
-
-def _images(
-    settings: SceneSettings, held_out: tuple[PosedImage, ...]
-) -> Iterator[tuple[PosedImage, NDArray[np.uint8]]]:
-    """Yield the images at the requested size."""
-    for posed in held_out:
-        path = settings.scene / settings.images / posed.name
-        try:
-            picture = decode_picture(path)
-        except UnreadableFile as error:
-            raise RecordingInvalid(f"{path}: {error}; copy the image again, or give another --images") from error
-        if picture.damage is not None:
-            raise RecordingInvalid(f"{path} is damaged: {picture.damage}; copy the image again")
-        image = picture.image
-        if settings.scale != 1:
-            height_px, width_px = image.shape[:2]
-            check_shown_size(width_px, height_px, settings.scale)
-            size_px = max(1, round(width_px * settings.scale)), max(1, round(height_px * settings.scale))
-            image = np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_AREA), np.uint8)
-        yield posed, image
-
-
-def _camera_of(posed: PosedImage, image: NDArray[np.uint8]) -> Camera:
-    """Return the camera at the size of the image file.
-
-    Raises:
-        RecordingInvalid: if the aspect ratios differ.
-    """
-    height_px, width_px = image.shape[:2]
-    camera = posed.camera
-    if abs(width_px / height_px / (camera.width_px / camera.height_px) - 1) > SAME_SHAPE + 1 / min(width_px, height_px):
-        raise RecordingInvalid(
-            f"{posed.name} has {width_px}x{height_px} px and its camera {camera.width_px}x{camera.height_px} px, which is another shape"
-        )
-    return camera.resized(width_px, height_px)

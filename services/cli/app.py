@@ -37,9 +37,11 @@ from services.cli.options import (
     RenderOutOption,
     SamplesOption,
     ScaleOption,
+    SceneArgument,
     SourceArgument,
     SupersamplingOption,
     SynthesizeOptions,
+    TrainOptions,
     path_option,
     renderer_options,
     require_plain_numbers,
@@ -370,6 +372,15 @@ def evaluate(
     if recording is None:
         return evaluate_scene_command(model, scene_settings(options), out, as_json=json)
     return evaluate_command(model, evaluation_settings(recording, options), out, as_json=json)
+
+
+@app.command()
+@takes_run_options
+def train(scene: SceneArgument, out: OutOption, options: TrainOptions, json: JsonOption = False) -> int:
+    """Train a static scene from posed images in COLMAP's format, and evaluate it on held-out images."""
+    from services.cli.train import train_command
+
+    return train_command(scene, out, options, as_json=json)
 
 
 @app.command()

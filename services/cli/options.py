@@ -56,6 +56,10 @@ PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, whi
 MeshArgument = Annotated[Path, path_argument("MESH", "A triangle mesh: .ply, .stl or .obj.")]
 ExportedFileArgument = Annotated[Path, path_argument("FILE", "The exported file.")]
 OutOption = Annotated[Path, path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
+SceneArgument = Annotated[
+    Path,
+    path_argument("SCENE", "A folder in COLMAP's format: images/, and sparse/0/ with cameras, images and points3D."),
+]
 FolderArgument = Annotated[Path, path_argument("FOLDER", "A folder of recordings: videos, and folders of their own.")]
 BatchOutOption = Annotated[
     Path | None,
@@ -194,6 +198,20 @@ class EvaluateOptions:
     samples: SamplesOption = None
     supersampling: SupersamplingOption = None
     order: OrderOption = None
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of `train`."""
+
+    steps: Annotated[int, typer.Option(help="Number of optimiser steps.")] = 30_000
+    device: DeviceOption = "cpu"
+    images: Annotated[str, typer.Option(help="Folder of the scene's images, such as images_4.")] = "images"
+    every: Annotated[int, typer.Option(help="Hold out every k-th image for the evaluation; 0 for none.")] = 8
+    scale: ScaleOption = 1.0
+    sh_degree: Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 4.")] = 3
+    save_every: Annotated[int, typer.Option(help="Interval in steps at which the model is saved.")] = 5000
+    seed: SeedOption = 0
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.errors import CoreError, RecordingInvalid, RecordingMissing
+from gsplat_core.errors import CoreError, InvalidSetting, RecordingInvalid, RecordingMissing
 from gsplat_core.io.files import open_regular
+from gsplat_core.io.recordings.plain_files import UnreadableFile, decode_picture
 from gsplat_core.scene.cameras import Camera
 
 MODELS = {
@@ -33,6 +35,10 @@ MOST_NAME_BYTES = 4096
 MOST_SIDE_PX = 1 << 16
 MOST_PARAMETER_PX = 1e7
 MOST_TRANSLATION = 1e9
+SAME_SHAPE = 0.01
+"""Largest relative difference of the aspect ratios of a camera and its image file."""
+HELD_OUT_EVERY = 8
+"""Default interval of held-out images."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +60,52 @@ class ColmapScene:
     """Folder of the reconstruction."""
     images: tuple[PosedImage, ...]
 
-    def held_out(self, every: int = 8) -> tuple[PosedImage, ...]:
+    def held_out(self, every: int = HELD_OUT_EVERY) -> tuple[PosedImage, ...]:
         """Return every k-th image, beginning with the first: the usual test split of 3DGS trainers."""
         return self.images[::every]
+
+    def training(self, every: int = HELD_OUT_EVERY) -> tuple[PosedImage, ...]:
+        """Return the images that are not held out."""
+        return tuple(posed for number, posed in enumerate(self.images) if number % every)
+
+    def read(self, posed: PosedImage, images: str = "images", scale: float = 1.0) -> tuple[Camera, NDArray[np.uint8]]:
+        """Read an image, and return it with the camera for its size.
+
+        Args:
+            posed: image of this scene.
+            images: folder of the image files inside the scene, such as `images_4` for smaller ones.
+            scale: factor on the size of the image.
+
+        Returns:
+            Camera, and RGB [H, W, 3].
+
+        Raises:
+            RecordingInvalid: if the file is missing or damaged, or its aspect ratio differs from that of the camera.
+            InvalidSetting: if nothing is left of the image at `scale`.
+        """
+        path = self.folder / images / posed.name
+        try:
+            picture = decode_picture(path)
+        except UnreadableFile as error:
+            raise RecordingInvalid(f"{path}: {error}; copy the image again, or give another --images") from error
+        if picture.damage is not None:
+            raise RecordingInvalid(f"{path} is damaged: {picture.damage}; copy the image again")
+        image = picture.image
+        height_px, width_px = image.shape[:2]
+        if min(width_px, height_px) * scale < 1:
+            raise InvalidSetting(
+                f"at scale {scale:g} nothing is left of {width_px}x{height_px} px; give at least {1 / min(width_px, height_px):.3g}"
+            )
+        if scale != 1:
+            width_px, height_px = max(1, round(width_px * scale)), max(1, round(height_px * scale))
+            image = np.asarray(cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
+        camera = posed.camera
+        ratio = width_px / height_px / (camera.width_px / camera.height_px)
+        if abs(ratio - 1) > SAME_SHAPE + 1 / min(width_px, height_px):
+            raise RecordingInvalid(
+                f"{posed.name} has {width_px}x{height_px} px and its camera {camera.width_px}x{camera.height_px} px, which is another shape"
+            )
+        return camera.resized(width_px, height_px), image
 
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Read the points of the reconstruction.

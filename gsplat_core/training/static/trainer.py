@@ -1,0 +1,209 @@
+"""Trainer of a static scene: 3DGS's optimisation (Kerbl et al. 2023) with the defaults of gsplat's example trainer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.neighbours import nearest_others
+from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.rendering.rasterization import rasterization
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.training.static.adam import CompiledAdam
+from gsplat_core.training.static.pictures import Points, TrainingCoordinates, TrainingPicture, scene_extent
+
+FULL_STEPS = 30_000
+"""Number of steps to which the schedules refer; shorter trainings shorten them in proportion."""
+RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+"""Learning rates of Adam. That of the means is multiplied by the extent of the scene."""
+MEANS_DECAY = 0.01
+"""Factor by which the rate of the means falls exponentially over a training."""
+SH_EVERY = 1000
+"""Steps after which another degree of the spherical harmonics is used, of `FULL_STEPS`."""
+EPSILON = 1e-15
+NEIGHBOURS = 3
+"""Number of neighbours whose root mean squared distance is the initial scale of a Gaussian."""
+LEAST_SCALE = 1e-7
+"""Minimum initial scale, for points that coincide."""
+NEAR_PLANE = 0.01
+
+
+@dataclass(frozen=True)
+class StaticConfig:
+    """Options of a training.
+
+    Raises:
+        InvalidSetting: if a value is out of range.
+    """
+
+    steps: int = FULL_STEPS
+    sh_degree: int = 3
+    ssim_weight: float = 0.2
+    """Weight of 1 - SSIM; that of L1 is the rest."""
+    init_opacity: float = 0.1
+    init_scale: float = 1.0
+    """Factor on the initial scales."""
+    opacity_weight: float = 0.0
+    """Weight of the mean opacity in the loss."""
+    scale_weight: float = 0.0
+    """Weight of the mean scale in the loss."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise InvalidSetting(f"steps is {self.steps}; it must be at least 1")
+        if not 0 <= self.sh_degree <= 4:
+            raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
+
+    def shortened(self, steps: int) -> int:
+        """Return a number of steps of a full schedule in proportion to the length of this training, at least 1."""
+        return max(1, round(steps * min(1.0, self.steps / FULL_STEPS)))
+
+
+@dataclass(frozen=True)
+class StaticStep:
+    """Result of one step."""
+
+    step: int
+    """Number of the step, from 0."""
+    loss: Tensor
+    """Scalar, on the device."""
+    picture: int
+    """Index of the picture."""
+
+
+class StaticTrainer:
+    """Gaussians of a static scene with their optimisers.
+
+    `params` and `optimizers` are dictionaries with the keys `means`, `scales` (logarithms), `quats`, `opacities` (logits),
+    `sh0` and `shN`, which strategies of gsplat's interface edit. Values are in training coordinates.
+    """
+
+    def __init__(
+        self,
+        pictures: Sequence[TrainingPicture],
+        points: Points,
+        config: StaticConfig | None = None,
+        *,
+        seed: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        """Initialise a Gaussian at each point.
+
+        Args:
+            pictures: pictures to train on, at least one.
+            points: initial positions and colours.
+            config: options.
+            seed: seed of the order of pictures and of the initial rotations.
+            device: device that trains.
+        """
+        if not pictures:
+            raise InvalidSetting("there is no picture to train on; hold out fewer images")
+        self.config = config or StaticConfig()
+        self.device = torch.device(device)
+        self.first_camera = pictures[0].camera
+        self.coordinates = TrainingCoordinates.of([picture.camera for picture in pictures])
+        self._cameras = [self.coordinates.camera(picture.camera) for picture in pictures]
+        self.extent = scene_extent(self._cameras)
+        self._matrices = [camera.matrices(self.device) for camera in self._cameras]
+        self._images = [torch.from_numpy(np.ascontiguousarray(each.image)).to(self.device) for each in pictures]
+        self._order = torch.Generator().manual_seed(seed)
+        self._left: list[int] = []
+        self.params = self._initial(points, seed)
+        self.optimizers = {
+            name: CompiledAdam([{"params": parameter, "lr": self._rate(name), "name": name}], eps=EPSILON)
+            for name, parameter in self.params.items()
+        }
+        self.steps_done = 0
+
+    def _initial(self, points: Points, seed: int) -> torch.nn.ParameterDict:
+        config, generator = self.config, torch.Generator().manual_seed(seed)
+        means = torch.from_numpy(self.coordinates.positions(points.positions)).float()
+        others = nearest_others(means, NEIGHBOURS)
+        distances = (means[others] - means[:, None]).square().sum(-1).mean(-1).sqrt()
+        scales = (distances * config.init_scale).clamp_min(LEAST_SCALE).log()[:, None].repeat(1, 3)
+        sh = torch.zeros(len(means), (config.sh_degree + 1) ** 2, 3)
+        sh[:, 0] = (torch.from_numpy(points.colours).float() / 255 - 0.5) / SH_C0
+        values = {
+            "means": means,
+            "scales": scales,
+            "quats": torch.rand(len(means), 4, generator=generator),
+            "opacities": torch.full((len(means),), config.init_opacity).logit(),
+            "sh0": sh[:, :1],
+            "shN": sh[:, 1:],
+        }
+        return torch.nn.ParameterDict(
+            {name: torch.nn.Parameter(value.contiguous().to(self.device)) for name, value in values.items()}
+        )
+
+    def _rate(self, name: str, step: int = 0) -> float:
+        if name != "means":
+            return RATES[name]
+        return RATES[name] * self.extent * MEANS_DECAY ** (step / self.config.steps)
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return int(self.params["means"].shape[0])
+
+    def gaussians(self) -> Gaussians:
+        """Return a copy of the Gaussians in world coordinates."""
+        params = {name: parameter.detach() for name, parameter in self.params.items()}
+        return self.coordinates.to_world(
+            Gaussians(
+                params["means"].clone(),
+                torch.nn.functional.normalize(params["quats"], dim=-1),
+                params["scales"].clone(),
+                params["opacities"].clone(),
+                torch.cat([params["sh0"], params["shN"]], 1),
+            )
+        )
+
+    def step(self) -> StaticStep:
+        """Train on the next picture; pictures come in random order, each once before any comes again."""
+        step, config = self.steps_done, self.config
+        self.optimizers["means"].param_groups[0]["lr"] = self._rate("means", step)
+        picture = self._next_picture()
+        degree = min(step // config.shortened(SH_EVERY), config.sh_degree)
+        scales, opacities = self.params["scales"].exp(), self.params["opacities"].sigmoid()
+        image = self._render(picture, scales, opacities, degree)[0]
+        loss = image_loss(image, self._images[picture], ssim_weight=config.ssim_weight).loss
+        if config.opacity_weight:
+            loss = loss + config.opacity_weight * opacities.mean()
+        if config.scale_weight:
+            loss = loss + config.scale_weight * scales.mean()
+        loss.backward()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self.steps_done += 1
+        return StaticStep(step, loss.detach(), picture)
+
+    def _next_picture(self) -> int:
+        if not self._left:
+            self._left = torch.randperm(len(self._images), generator=self._order).tolist()
+        return self._left.pop()
+
+    def _render(self, picture: int, scales: Tensor, opacities: Tensor, degree: int) -> tuple[Tensor, dict[str, Any]]:
+        """Return the rendered picture [H, W, 3] and the intermediate results of `rasterization`."""
+        camera, params = self._cameras[picture], self.params
+        viewmat, K = self._matrices[picture]
+        colors, _, info = rasterization(
+            params["means"], params["quats"], scales, opacities, torch.cat([params["sh0"], params["shN"]], 1), viewmat[None],
+            K[None], camera.width_px, camera.height_px, near_plane=NEAR_PLANE, sh_degree=degree, packed=False,
+        )  # fmt: skip
+        return colors[0], info
+
+    def psnr_db(self, picture: int) -> float:
+        """Return the PSNR of a training picture in dB; waits for the device."""
+        with torch.no_grad():
+            scales, opacities = self.params["scales"].exp(), self.params["opacities"].sigmoid()
+            image, _ = self._render(picture, scales, opacities, self.config.sh_degree)
+            error = float((image.clamp(0, 1) - self._images[picture] / 255).square().mean())
+        return -10 * math.log10(max(error, 1e-10))

@@ -1,0 +1,113 @@
+"""Training of a static scene from posed pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core import Camera, Gaussians, render
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.static.adam import CompiledAdam
+from gsplat_core.training.static.pictures import Points, TrainingCoordinates, TrainingPicture
+from gsplat_core.training.static.trainer import StaticConfig, StaticTrainer
+
+SHIFT = np.array([30.0, -20, 10])
+
+
+def posed_pictures(factor=1.0, shift=0.0, count=5):
+    """Pictures of a cloud around the origin, and its centres as points, in a world of another unit and origin."""
+    generator = torch.Generator().manual_seed(0)
+    n = 60
+    cloud = Gaussians(
+        torch.randn(n, 3, generator=generator) * 0.5,
+        torch.randn(n, 4, generator=generator),
+        torch.full((n, 3), -2.0),
+        torch.full((n,), 2.0),
+        torch.randn(n, 1, 3, generator=generator),
+    )
+    pictures = []
+    for k in range(count):
+        pose = np.eye(4)
+        pose[:3, :3], _ = cv2.Rodrigues(np.array([0.2 * k, 0.5 * k - 1, 0.1]))
+        pose[:3, 3] = 0.1, 0.05 * k, 3
+        camera = Camera.from_focal(30, 32, 24, pose)
+        with torch.inference_mode():
+            image = (render(cloud, camera).image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        pose = pose.copy()
+        pose[:3, 3] = factor * pose[:3, 3] - pose[:3, :3] @ np.broadcast_to(shift, 3)
+        pictures.append(TrainingPicture(f"{k}.png", camera.with_pose(pose), image))
+    positions = cloud.means.double().numpy() * factor + shift
+    return pictures, Points(positions, np.full((n, 3), 128, np.uint8))
+
+
+def test_training_brings_the_pictures_closer():
+    pictures, points = posed_pictures()
+    trainer = StaticTrainer(pictures, points, StaticConfig(steps=60, sh_degree=1))
+    before = np.mean([trainer.psnr_db(k) for k in range(5)])
+    seen = [trainer.step().picture for _ in range(60)]
+    assert np.mean([trainer.psnr_db(k) for k in range(5)]) > before + 1
+    assert all(sorted(seen[first : first + 5]) == [0, 1, 2, 3, 4] for first in range(0, 60, 5))
+
+
+def test_the_unit_and_the_origin_of_the_world_do_not_matter():
+    """The rates refer to the distance of the cameras, so the result in another unit is the converted one."""
+    results = []
+    for factor, shift in ((1.0, 0.0), (100.0, SHIFT)):
+        trainer = StaticTrainer(*posed_pictures(factor, shift), StaticConfig(steps=20, sh_degree=1))
+        for _ in range(20):
+            trainer.step()
+        results.append(trainer.gaussians())
+    own, other = results
+    moved = (other.means - torch.tensor(SHIFT, dtype=torch.float32)) / 100
+    assert (moved - own.means).abs().max() < 2e-4
+    assert (other.scales / 100 / own.scales - 1).abs().max() < 2e-3
+    assert (other.opacities - own.opacities).abs().max() < 2e-3
+
+
+def test_coordinates_put_the_centre_of_attention_at_zero():
+    pictures, _ = posed_pictures(7.0, SHIFT)
+    coordinates = TrainingCoordinates.of([each.camera for each in pictures])
+    assert np.abs(coordinates.centre - SHIFT).max() < 7 * 0.3
+    cameras = [coordinates.camera(each.camera) for each in pictures]
+    assert np.median([np.linalg.norm(each.position) for each in cameras]) == pytest.approx(1)
+    # One camera has no centre of attention.
+    alone = TrainingCoordinates.of([pictures[0].camera])
+    assert np.allclose(alone.centre, pictures[0].camera.position) and alone.factor == 1
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    pictures, points = posed_pictures()
+    found = []
+    for seed in (3, 3, 4):
+        trainer = StaticTrainer(pictures, points, StaticConfig(steps=5), seed=seed)
+        for _ in range(5):
+            trainer.step()
+        found.append(trainer.gaussians().means)
+    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+
+
+def test_adam_takes_the_steps_of_torch():
+    generator = torch.Generator().manual_seed(1)
+    ours, theirs = (torch.nn.Parameter(torch.ones(7, 3)) for _ in range(2))
+    optimizers = CompiledAdam([ours], lr=0.01, eps=1e-15), torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
+    for _ in range(4):
+        ours.grad = torch.randn(7, 3, generator=generator)
+        theirs.grad = ours.grad.clone()
+        for optimizer in optimizers:
+            optimizer.step()
+    assert torch.allclose(ours, theirs, atol=1e-7)
+    assert optimizers[0].state[ours].keys() == optimizers[1].state[theirs].keys()
+    before = ours.detach().clone()
+    ours.grad = torch.full((7, 3), 1.0)
+    ours.grad[2, 1] = torch.nan
+    optimizers[0].step()
+    unchanged = (ours == before).all(1)
+    assert unchanged.tolist() == [row == 2 for row in range(7)]
+
+
+@pytest.mark.parametrize(("option", "value"), [("steps", 0), ("sh_degree", 5), ("sh_degree", -1)])
+def test_an_option_out_of_range_is_refused(option, value):
+    with pytest.raises(InvalidSetting, match=option):
+        StaticConfig(**{option: value})
