@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from gsplat_core.rendering.registry import RENDERERS, new_renderer
     from gsplat_core.rendering.renderer import Renderer
     from gsplat_core.scene.cameras import Camera
+    from gsplat_core.scene.collection import GaussianCollection
     from gsplat_core.scene.frames import Frame, FrameStatus
     from gsplat_core.scene.gaussians import Gaussians
     from gsplat_core.training.config import ReconstructorConfig
@@ -46,6 +47,7 @@ __all__ = [
     "Frame",
     "FrameRenderer",
     "FrameStatus",
+    "GaussianCollection",
     "Gaussians",
     "InvalidInput",
     "MCMCStrategy",
@@ -84,6 +86,7 @@ _HOME = {
     "Frame": "scene.frames",
     "FrameRenderer": "rendering.frame_renderer",
     "FrameStatus": "scene.frames",
+    "GaussianCollection": "scene.collection",
     "Gaussians": "scene.gaussians",
     "InvalidInput": "errors",
     "MCMCStrategy": "training.strategies.mcmc",

@@ -11,7 +11,8 @@ import gsplat_core
 from gsplat_core import reference
 
 PUBLIC = [
-    "Camera", "CoreError", "DefaultStrategy", "DeformationField", "Frame", "FrameRenderer", "FrameStatus", "Gaussians",
+    "Camera", "CoreError", "DefaultStrategy", "DeformationField", "Frame", "FrameRenderer", "FrameStatus",
+    "GaussianCollection", "Gaussians",
     "InvalidInput", "MCMCStrategy", "Model", "RENDERERS", "Reconstructor", "ReconstructorConfig", "RenderOutput",
     "Renderer", "SelectiveAdam", "Snapshot", "SnapshotSlots", "Strategy", "fully_fused_projection", "fused_ssim",
     "isect_offset_encode", "isect_tiles", "load_bundle", "load_ply", "new_renderer", "open_recording",
