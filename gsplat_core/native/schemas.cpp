@@ -29,6 +29,21 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "float eps2d, int camera_model, bool needs_viewmats, float compensation_floor=0.005) -> (Tensor v_means, Tensor v_covars, "
       "Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
 
+  // As above for visible pairs of camera and Gaussian only, in ascending order of their ids: (batch * cameras + camera) *
+  // gaussians + gaussian (int64 [rows]). The gradients have one row per pair. The host waits for the number of pairs.
+  m.def(
+      "project_visible(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
+      "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
+      "int camera_model, float compensation_floor) -> (Tensor ids, Tensor means2d, Tensor depths, Tensor conics, Tensor "
+      "compensations, Tensor radii)");
+  m.def(
+      "project_visible_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor viewmats, Tensor Ks, "
+      "Tensor ids, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
+      "float eps2d, int camera_model, bool needs_viewmats, float compensation_floor) -> (Tensor v_means, Tensor v_covars, "
+      "Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
+  // Adds values [rows, D] of pairs to their Gaussians [B, N, D], camera by camera.
+  m.def("add_packed_rows_(Tensor(a!) out, Tensor values, Tensor ids, int cameras) -> ()");
+
   // Colours of R rows of directions [R, M, 3]; all rows share the coefficients [M, K, 3]. The result is 0 where the
   // mask is false.
   m.def("spherical_harmonics(int degree, Tensor dirs, Tensor coeffs, Tensor? masks) -> Tensor");

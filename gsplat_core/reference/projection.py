@@ -17,6 +17,7 @@ from gsplat_core.ops.projection.arguments import (
     PackedProjection,
     check_projection_options,
     check_projection_tensors,
+    check_sparse_gradient,
     pack,
 )
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci, triu_to_matrix
@@ -110,10 +111,11 @@ def fully_fused_projection(
 ) -> DenseProjection | PackedProjection:
     """Project 3D Gaussians to 2D image Gaussians by EWA splatting (Zwicker et al. 2001).
 
-    See `gsplat_core.fully_fused_projection`.
+    See `gsplat_core.fully_fused_projection`. Gradients are dense also with sparse_grad.
     """
-    check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
-    check_projection_options(width, height, sparse_grad, camera_model, compensation_floor)
+    batch_dims = check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
+    check_projection_options(width, height, camera_model, compensation_floor)
+    check_sparse_gradient(sparse_grad, packed, batch_dims)
     # Replace unusable Gaussians before any arithmetic, because a masked NaN would reach the
     # gradient.
     usable = _usable(means, covars, quats, scales, opacities)

@@ -94,27 +94,34 @@ def check_projection_tensors(
     return batch_dims
 
 
-def check_projection_options(
-    width: int, height: int, sparse_grad: bool, camera_model: str, compensation_floor: float
-) -> None:
+def check_projection_options(width: int, height: int, camera_model: str, compensation_floor: float) -> None:
     """Check the options of a projection.
 
     Raises:
         InvalidInput: for an empty image, an unknown camera model or a floor outside 0..1.
-        NotImplementedError: for options that only gsplat supports.
+        NotImplementedError: for camera models that only gsplat supports.
     """
     if width < 1 or height < 1:
         raise InvalidInput(f"the image must be at least 1x1 px, got width={width}, height={height}")
     if not 0 <= compensation_floor <= 1:
         raise InvalidInput(f"compensation_floor must be from 0 to 1, got {compensation_floor}")
-    if sparse_grad:
-        raise NotImplementedError("sparse_grad=True is not supported; gradients are dense (use sparse_grad=False)")
     if camera_model not in CAMERA_MODELS:
         if camera_model in ("ftheta", "lidar"):
             raise NotImplementedError(
                 f"camera_model={camera_model!r} is not supported; the models are {', '.join(CAMERA_MODELS)}"
             )
         raise InvalidInput(f"unknown camera_model {camera_model!r}; the models are {', '.join(CAMERA_MODELS)}")
+
+
+def check_sparse_gradient(sparse_grad: bool, packed: bool, batch_dims: tuple[int, ...]) -> None:
+    """Raise InvalidInput for sparse gradients of a projection that is not packed or has batch dimensions."""
+    if sparse_grad and not packed:
+        raise InvalidInput("sparse_grad=True needs packed=True; give packed=True, or leave sparse_grad out")
+    if sparse_grad and batch_dims:
+        raise InvalidInput(
+            f"sparse_grad=True takes tensors without batch dimensions, got {list(batch_dims)}; render one scene at a"
+            " time, or leave sparse_grad out"
+        )
 
 
 def pack(dense: DenseProjection) -> PackedProjection:

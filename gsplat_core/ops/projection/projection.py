@@ -16,7 +16,7 @@ from gsplat_core.ops.projection.arguments import (
     PackedProjection,
     check_projection_options,
     check_projection_tensors,
-    pack,
+    check_sparse_gradient,
 )
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
@@ -60,8 +60,10 @@ def fully_fused_projection(
         near_plane: smallest z of a centre that is not culled.
         far_plane: largest z of a centre that is not culled.
         radius_clip: a Gaussian with both radii at or below this many pixels is culled.
-        packed: return one row per visible pair of camera and Gaussian.
-        sparse_grad: not supported.
+        packed: return one row per visible pair of camera and Gaussian; other pairs take no memory. On CUDA the host waits
+            for their number.
+        sparse_grad: gradients of means, covars, quats and scales are COO tensors that hold only the rows of visible
+            pairs, for optimisers such as `torch.optim.SparseAdam`. Needs packed, and no batch dimensions.
         calc_compensations: also return the opacity compensation max(compensation_floor, sqrt(det Σ / det (Σ + blur)))
             (Yu et al. 2024).
         camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or "fisheye" (equidistant).
@@ -74,22 +76,32 @@ def fully_fused_projection(
         `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or `PackedProjection`.
 
     Raises:
-        InvalidInput: for wrong shapes, dtypes or devices; `gsplat_core.reference` accepts float64.
-        NotImplementedError: for sparse_grad and gsplat's other camera models.
+        InvalidInput: for wrong shapes, dtypes or devices, and for sparse_grad without packed; `gsplat_core.reference`
+            accepts float64.
+        NotImplementedError: for gsplat's other camera models.
     """
     inputs = (means, covars, quats, scales, opacities, viewmats, Ks)
     batch_dims = check_projection_tensors(*inputs)
-    check_projection_options(width, height, sparse_grad, camera_model, compensation_floor)
+    check_projection_options(width, height, camera_model, compensation_floor)
+    check_sparse_gradient(sparse_grad, packed, batch_dims)
+    if packed:
+        from gsplat_core.ops.packed_projection.packed_projection import project_visible
+
+        _check_float32(*inputs)
+        return project_visible(
+            *inputs, width, height, eps2d=eps2d, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip,
+            calc_compensations=calc_compensations, camera_model=camera_model, compensation_floor=compensation_floor,
+            sparse_grad=sparse_grad,
+        )  # fmt: skip
     means2d, depths, conics, compensations, radii = torch.ops.gsplat_core.project_gaussians(
         *_flat(math.prod(batch_dims), *inputs), width, height, eps2d, near_plane, far_plane, radius_clip,
         calc_compensations, CAMERA_MODELS.index(camera_model), compensation_floor,
     )  # fmt: skip
     rows = (*batch_dims, viewmats.shape[-3], means.shape[-2])
-    dense = DenseProjection(
+    return DenseProjection(
         radii.reshape(*rows, 2), means2d.reshape(*rows, 2), depths.reshape(rows), conics.reshape(*rows, 3),
         compensations.reshape(rows) if calc_compensations else None,
     )  # fmt: skip
-    return pack(dense) if packed else dense
 
 
 def _flat(
@@ -107,10 +119,7 @@ def _flat(
     Raises:
         InvalidInput: unless all tensors are float32.
     """
-    require_float32(
-        "fully_fused_projection", means=means, covars=covars, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks,
-        opacities=opacities,
-    )  # fmt: skip
+    _check_float32(means, covars, quats, scales, opacities, viewmats, Ks)
     n, c = means.shape[-2], viewmats.shape[-3]
 
     def flat(tensor: Tensor | None, *trailing: int) -> Tensor | None:
@@ -119,6 +128,21 @@ def _flat(
     return (
         flat(means, n, 3), flat(covars, n, 6), flat(quats, n, 4), flat(scales, n, 3),
         None if opacities is None else flat(opacities.detach(), n), flat(viewmats, c, 4, 4), flat(Ks.detach(), c, 3, 3),
+    )  # fmt: skip
+
+
+def _check_float32(
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+) -> None:
+    require_float32(
+        "fully_fused_projection", means=means, covars=covars, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks,
+        opacities=opacities,
     )  # fmt: skip
 
 

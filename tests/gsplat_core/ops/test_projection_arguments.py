@@ -40,7 +40,7 @@ def test_wrong_arguments_are_refused(make_scene):
     meta = {name: getattr(scene, name).to("meta") for name in ("means", "quats", "scales", "viewmats", "Ks")}
     with pytest.raises(InvalidInput, match="for the CPU"):
         call(**meta)
-    with pytest.raises(NotImplementedError, match="sparse_grad=True"):
+    with pytest.raises(InvalidInput, match="sparse_grad=True needs packed=True"):
         call(sparse_grad=True)
     with pytest.raises(NotImplementedError, match="ftheta"):
         call(camera_model="ftheta")
