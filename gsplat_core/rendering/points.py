@@ -20,5 +20,5 @@ class PointRenderer(SampledRenderer):
         precisions={"cpu": ("fp32",), "cuda": ("fp32",)},
         differentiable=False,
         deterministic=True,
-        options=("samples", "supersampling", "seed", "progressive"),
+        options=("samples", "supersampling", "seed", "progressive", "storage"),
     )

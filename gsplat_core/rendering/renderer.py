@@ -21,6 +21,7 @@ Precision = Literal["fp32", "fp16"]
 STANDARD_OUTPUTS = RenderOutput._fields
 """Default outputs of a frame: `image`, `alpha`, `depth`."""
 DepthOrder = Literal["splat", "pixel"]
+Storage = Literal["raw", "prepared", "quantised"]
 MOST_SAMPLES = 1 << 20
 MOST_SUPERSAMPLING = 8
 
@@ -43,14 +44,21 @@ class RendererOptions:
     """Seed of all random numbers; equal seeds give equal bytes."""
     progressive: bool = False
     """True adds the samples of consecutive frames of the same model, camera and time."""
+    storage: Storage = "raw"
+    """Format of the splats that the renderer reads.
+
+    `raw` shares the model's memory and is the only one for moving models. `prepared` has precomputed covariances and no
+    splats of an opacity below 1/255. `quantised` takes 16 bytes per splat and one per further colour coefficient.
+    """
 
     def __post_init__(self) -> None:
         for name, most in (("samples", MOST_SAMPLES), ("supersampling", MOST_SUPERSAMPLING)):
             value = getattr(self, name)
             if not 1 <= value <= most:
                 raise InvalidSetting(f"{name} must be from 1 to {most}, got {value}")
-        if self.order not in get_args(DepthOrder):
-            raise InvalidSetting(f"unknown order {self.order!r}; choose {' or '.join(get_args(DepthOrder))}")
+        for name, known in (("order", get_args(DepthOrder)), ("storage", get_args(Storage))):
+            if getattr(self, name) not in known:
+                raise InvalidSetting(f"unknown {name} {getattr(self, name)!r}; choose {' or '.join(known)}")
         if not 0 <= self.seed < 1 << 63:
             raise InvalidSetting(f"seed must be from 0 to 2^63 - 1, got {self.seed}")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import ClassVar
 
 import torch
@@ -13,7 +13,7 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.stochastic.stochastic import Method, SplatScene, new_sums, picture_of, sample_splats
-from gsplat_core.rendering.prepared import raw_splats
+from gsplat_core.rendering.prepared import prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
     Capabilities,
@@ -21,11 +21,19 @@ from gsplat_core.rendering.renderer import (
     PendingFrame,
     Precision,
     RendererOptions,
+    Storage,
     check_camera,
     check_trained_by,
     checked_outputs,
 )
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+
+STORAGES: dict[Storage, Callable[[Gaussians], SplatScene]] = {
+    "raw": raw_splats,
+    "prepared": prepared_splats,
+    "quantised": quantised_splats,
+}
 
 
 class SampledRenderer:
@@ -55,6 +63,8 @@ class SampledRenderer:
             raise InvalidSetting(f"renderer {self.name!r} needs the CUDA kernels, which are {CUDA_MISSING}")
         self._camera, self._device, self._background = camera, device, background
         self._model: Model | None = None
+        self._scene: SplatScene | None = None
+        """Splats of a model that does not move, in the chosen storage."""
         self._sums: Tensor | None = None
         """Sums of the samples so far, for progressive frames."""
         self._drawn = 0
@@ -71,8 +81,15 @@ class SampledRenderer:
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
         check_trained_by(self.name, model)
-        check_trained_by(self.name, model)
-        self._model = model.as_model()
+        model = model.as_model()
+        if self._options.storage != "raw" and model.field is not None:
+            raise InvalidSetting(
+                f"storage {self._options.storage} needs a model that does not move; choose storage raw"
+            )
+        self._model, self._scene = model, None
+        if model.field is None:
+            with torch.no_grad():
+                self._scene = STORAGES[self._options.storage](model.gaussians)
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
         """See `Renderer.render`."""
@@ -81,7 +98,7 @@ class SampledRenderer:
         if self._model is None:
             raise InvalidInput("no model was prepared; call prepare(model) before render()")
         with torch.no_grad():
-            scene = raw_splats(self._model.at(time_s))
+            scene = self._scene or raw_splats(self._model.at(time_s))
             shown = self._model, camera, self._model.clamp_time(time_s)
             if self._sums is None or not self._options.progressive or shown != self._shown:
                 self._sums, self._drawn, self._shown = new_sums(camera, self._model.device), 0, shown
@@ -120,5 +137,5 @@ class StochasticRenderer(SampledRenderer):
         precisions={"cpu": ("fp32",), "cuda": ("fp32",)},
         differentiable=False,
         deterministic=True,
-        options=("samples", "supersampling", "order", "seed", "progressive"),
+        options=("samples", "supersampling", "order", "seed", "progressive", "storage"),
     )

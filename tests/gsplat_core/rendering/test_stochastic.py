@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.models.model import Model
 from gsplat_core.ops.stochastic.stochastic import new_sums, picture_of, sample_splats
@@ -144,3 +145,25 @@ def test_morton_codes_interleave_the_axes():
     corners = torch.tensor([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
     assert morton_codes(corners).argsort().tolist() == list(range(8))
     assert morton_codes(corners)[-1] == (1 << 63) - 1
+
+
+@pytest.mark.parametrize("name", ["stochastic", "points"])
+def test_storages_show_the_same_scene_with_the_same_random_numbers(name):
+    model = model_of(random_scene(80, smallest=0.05, largest=0.2))
+    raw, prepared, quantised = (
+        rendered(name, model, RendererOptions(samples=8, storage=storage)).image
+        for storage in ("raw", "prepared", "quantised")
+    )
+    assert psnr(raw, prepared) > 60
+    assert psnr(raw, quantised) > 30
+    assert not torch.equal(raw, quantised)
+
+
+def test_only_raw_storage_shows_moving_models():
+    gaussians = random_scene(20)
+    moving = dataclasses.replace(model_of(gaussians), field=new_field("basis", gaussians, (0.0, 1.0)).detached_copy())
+    renderer = new_renderer("stochastic", CAMERA, options=RendererOptions(storage="quantised"))
+    with pytest.raises(InvalidSetting, match="choose storage raw"):
+        renderer.prepare(moving)
+    with pytest.raises(InvalidSetting, match="unknown storage 'zip'; choose raw or prepared or quantised"):
+        RendererOptions(storage="zip")
