@@ -89,8 +89,11 @@ def test_experimental_methods_are_named_by_registries_only():
     assert list(folder.glob("*.py")) and wrong == []
 
 
-FIELD_MODULES = ("gsplat_core/choices.py", "gsplat_core/deformation/", "gsplat_core/ops/", "gsplat_core/reference/")
-"""Registry entries of the deformation fields, their modules and their kernels."""
+FIELD_MODULES = (
+    "gsplat_core/choices.py", "gsplat_core/deformation/", "gsplat_core/ops/", "gsplat_core/reference/",
+    "gsplat_core/contrib/", "gsplat_core/as_gsplat/",
+)  # fmt: skip
+"""Registry entries of the deformation fields, their modules and their kernels, and gsplat's class of the same name."""
 FIELD_NAMES, FIELD_CLASSES = {"basis", "hexplane"}, {"BasisField", "HexPlaneField"}
 
 

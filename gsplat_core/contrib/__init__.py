@@ -1,0 +1,1 @@
+"""Experimental parts of gsplat under its names, for training loops of library users."""
