@@ -1,0 +1,168 @@
+"""Blending along rays: an analytic pixel, the linear projection as its limit, and exact gradients."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.tiles.grid import TileGrid
+from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
+from gsplat_core.ops.world_blending.world_blending import rasterize_to_pixels_eval3d
+from gsplat_core.poses.rolling_shutter import RollingShutterType
+from gsplat_core.poses.se3 import exp
+from gsplat_core.reference.compositing import rasterize_to_pixels
+from tests.gsplat_core.ops.test_unscented_projection import DISTORTED, RADIAL, scene
+
+W, H, TILE = 20, 14, 8
+GRID = TileGrid(TILE, 3, 2)
+KS = torch.tensor([[[16.0, 0, 10.0], [0, 17.0, 7.0], [0, 0, 1]]], dtype=torch.float64)
+
+
+def lists(given, **camera):
+    with torch.no_grad():
+        out = fully_fused_projection_with_ut(**given, width=W, height=H, **camera)
+        _, ids, offsets = bin_splats(out.means2d.float(), out.radii, out.depths.float(), GRID)
+    return out, offsets.reshape(*out.radii.shape[:-2], 2, 3), ids
+
+
+def small_scene(count: int, size: float = 0.1):
+    given = scene(count, size)
+    colors = torch.rand(1, count, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    return given | {"Ks": KS}, colors
+
+
+def blend(given, colors, offsets, ids, **more):
+    given = given | {"opacities": given["opacities"][None].expand(colors.shape[:-1])}
+    return rasterize_to_pixels_eval3d(
+        **given,
+        colors=colors,
+        image_width=W,
+        image_height=H,
+        tile_size=TILE,
+        isect_offsets=offsets,
+        flatten_ids=ids,
+        **more,
+    )
+
+
+def test_one_gaussian_by_hand():
+    given, colors = small_scene(1)
+    given |= {
+        "means": torch.tensor([[0.1, 0.05, 1.5]], dtype=torch.float64),
+        "viewmats": torch.eye(4, dtype=torch.float64)[None],
+    }
+    given["quats"], given["scales"] = torch.tensor([[1.0, 0, 0, 0]]).double(), torch.tensor([[0.2, 0.1, 0.4]]).double()
+    _, offsets, ids = lists(given)
+    image, alphas = blend(given, colors, offsets, ids, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]).double())
+    direction = torch.tensor([(8.5 - 10) / 16, (9.5 - 7) / 17, 1.0], dtype=torch.float64) / given["scales"][0]
+    center = given["means"][0] / given["scales"][0]
+    squared = (center @ center) - (center @ direction) ** 2 / (direction @ direction)
+    alpha = given["opacities"][0] * math.exp(-0.5 * squared)
+    torch.testing.assert_close(alphas[0, 9, 8, 0], alpha)
+    torch.testing.assert_close(
+        image[0, 9, 8], alpha * colors[0, 0] + (1 - alpha) * torch.tensor([0.1, 0.2, 0.3]).double()
+    )
+
+
+def test_distant_gaussians_look_as_in_the_picture_plane():
+    given, colors = small_scene(30)
+    given |= {
+        "means": given["means"] * 40,
+        "scales": given["scales"] * 40 * 0.3,
+        "Ks": KS * torch.tensor([[[1.0], [1], [1]]]),
+    }
+    out, offsets, ids = lists(given, eps2d=0.0)
+    image, alphas = blend(given, colors, offsets, ids)
+    flat, flat_alphas = rasterize_to_pixels(
+        out.means2d, out.conics, colors, given["opacities"][None], W, H, TILE, offsets, ids
+    )
+    assert alphas.max() > 0.5
+    assert (image - flat).abs().max() < 0.05 and (alphas - flat_alphas).abs().mean() < 2e-3
+
+
+@pytest.mark.parametrize("kind", ["distorted", "rolling"])
+def test_gradients_of_all_tensors_in_double_precision(kind):
+    given, colors = small_scene(3)
+    camera = dict(DISTORTED)
+    if kind == "rolling":
+        move = exp(torch.tensor([[0.01, 0.02, -0.01, 0.02, 0.01, -0.03]], dtype=torch.float64))
+        camera = {"viewmats_rs": move @ given["viewmats"]}
+    fixed = {"rolling_shutter": RollingShutterType.ROLLING_LEFT_TO_RIGHT} if kind == "rolling" else {}
+    _, offsets, ids = lists(given, **camera, **fixed)
+    names = [*given, *camera]
+    values = [(given | camera)[name].clone().requires_grad_() for name in names]
+    background = torch.rand(1, 3, dtype=torch.float64)
+
+    def run(colors, background, *tensors):
+        tensors = dict(zip(names, tensors, strict=True))
+        image, alphas = blend(
+            {name: tensors[name] for name in given}, colors, offsets, ids, backgrounds=background,
+            **{name: tensors[name] for name in camera}, **fixed,
+        )  # fmt: skip
+        weights = torch.cos(torch.arange(image.numel(), dtype=torch.float64)).view(image.shape)
+        return (image * weights).sum() + alphas[..., 0].square().sum()
+
+    torch.autograd.gradcheck(
+        run,
+        (colors.requires_grad_(), background.requires_grad_(), *values),
+        atol=1e-4,
+        rtol=1e-3,
+        eps=1e-7,
+        fast_mode=True,
+    )
+
+
+def test_long_lists_end_at_low_transmittance_and_masked_tiles_show_the_background(monkeypatch):
+    from gsplat_core.ops.world_blending import plain_torch
+
+    given, colors = small_scene(40, size=0.4)
+    given["opacities"] = torch.full((40,), 0.9, dtype=torch.float64)
+    _, offsets, ids = lists(given)
+    image, alphas = blend(given, colors, offsets, ids)
+    assert 0.999 < alphas.max() < 1 - 1e-4
+    monkeypatch.setattr(plain_torch, "PAIRS_AT_A_TIME", 1)
+    again = blend(given, colors, offsets, ids)
+    torch.testing.assert_close(again[0], image)
+    masks = torch.ones(1, 2, 3, dtype=torch.bool)
+    masks[0, 1, 2] = False
+    background = torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64)
+    masked, seen = blend(given, colors, offsets, ids, masks=masks, backgrounds=background)
+    assert (seen[0, 8:, 16:] == 0).all() and torch.equal(masked[0, 8:, 16:], background[0].expand(6, 4, 3))
+    torch.testing.assert_close(seen[0, :8], alphas[0, :8])
+
+
+def test_pixels_that_the_lens_does_not_see_show_the_background():
+    given, colors = small_scene(8, size=0.3)
+    _, offsets, ids = lists(given)
+    radial = RADIAL * 0
+    radial[..., 0] = -1.2  # folds over at r = 0.53: the corners have no ray
+    image, alphas = blend(given, colors, offsets, ids, radial_coeffs=radial)
+    assert (alphas[0, 0, 0] == 0) and alphas[0, 7, 10] > 0 and image.isfinite().all()
+
+
+def test_nothing_to_blend():
+    given, colors = small_scene(1)
+    none = {name: value[:0] if name not in ("viewmats", "Ks") else value for name, value in given.items()}
+    empty = torch.zeros(0, dtype=torch.int32)
+    image, alphas = blend(none, colors[:, :0], torch.zeros(1, 2, 3, dtype=torch.int32), empty)
+    assert image.shape == (1, H, W, 3) and (image == 0).all() and (alphas == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"max_alpha": 1.0}, "max_alpha"),
+        ({"masks": torch.ones(1, 1, 1, dtype=torch.bool)}, "masks"),
+        ({"backgrounds": torch.zeros(1, 2).double()}, "backgrounds"),
+        ({"camera_model": "fisheye", "radial_coeffs": RADIAL}, "radial_coeffs"),
+    ],
+)
+def test_wrong_arguments_are_refused(options, words):
+    given, colors = small_scene(2)
+    _, offsets, ids = lists(given)
+    with pytest.raises(InvalidInput, match=words):
+        blend(given, colors, offsets, ids, **options)
