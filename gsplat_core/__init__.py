@@ -23,12 +23,17 @@ if TYPE_CHECKING:
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.ssim.ssim import fused_ssim
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
+    from gsplat_core.ops.unscented_projection.parameters import UnscentedTransformParameters
+    from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
+    from gsplat_core.ops.world_blending.world_blending import rasterize_to_pixels_eval3d
+    from gsplat_core.poses.rolling_shutter import RollingShutterType
     from gsplat_core.rendering.frame_renderer import FrameRenderer
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
     from gsplat_core.rendering.registry import RENDERERS, new_renderer
     from gsplat_core.rendering.renderer import Renderer
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.collection import GaussianCollection
+    from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, FThetaPolynomialType
     from gsplat_core.scene.frames import Frame, FrameStatus
     from gsplat_core.scene.gaussians import Gaussians
     from gsplat_core.training.config import ReconstructorConfig
@@ -44,6 +49,8 @@ __all__ = [
     "CoreError",
     "DefaultStrategy",
     "DeformationField",
+    "FThetaCameraDistortionParameters",
+    "FThetaPolynomialType",
     "Frame",
     "FrameRenderer",
     "FrameStatus",
@@ -56,11 +63,14 @@ __all__ = [
     "ReconstructorConfig",
     "RenderOutput",
     "Renderer",
+    "RollingShutterType",
     "SelectiveAdam",
     "Snapshot",
     "SnapshotSlots",
     "Strategy",
+    "UnscentedTransformParameters",
     "fully_fused_projection",
+    "fully_fused_projection_with_ut",
     "fused_ssim",
     "isect_offset_encode",
     "isect_tiles",
@@ -71,6 +81,7 @@ __all__ = [
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
+    "rasterize_to_pixels_eval3d",
     "render",
     "save_bundle",
     "save_ply",
@@ -83,6 +94,8 @@ _HOME = {
     "CoreError": "errors",
     "DefaultStrategy": "training.strategies.adc",
     "DeformationField": "deformation",
+    "FThetaCameraDistortionParameters": "scene.distortion",
+    "FThetaPolynomialType": "scene.distortion",
     "Frame": "scene.frames",
     "FrameRenderer": "rendering.frame_renderer",
     "FrameStatus": "scene.frames",
@@ -95,11 +108,14 @@ _HOME = {
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",
     "Renderer": "rendering.renderer",
+    "RollingShutterType": "poses.rolling_shutter",
     "SelectiveAdam": "training.steps.selective_adam",
     "Snapshot": "models.snapshots",
     "SnapshotSlots": "models.snapshots",
     "Strategy": "training.strategies.strategy",
+    "UnscentedTransformParameters": "ops.unscented_projection.parameters",
     "fully_fused_projection": "ops.projection.projection",
+    "fully_fused_projection_with_ut": "ops.unscented_projection.unscented_projection",
     "fused_ssim": "ops.ssim.ssim",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
@@ -110,6 +126,7 @@ _HOME = {
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering.rasterization",
     "rasterize_to_pixels": "ops.compositing.compositing",
+    "rasterize_to_pixels_eval3d": "ops.world_blending.world_blending",
     "render": "rendering.rasterization",
     "save_bundle": "io.bundle",
     "save_ply": "io.ply",

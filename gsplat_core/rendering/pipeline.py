@@ -353,6 +353,11 @@ class Operations(StepOperations):
             extra_signals: further values [..., (C,) N, E], blended with the weights of the colours into
                 `meta["render_extra_signals"]` [..., C, H, W, E]; or [..., (C,) N, K, E] with `extra_signals_sh_degree`, blended
                 as 0.5 + sum. Their background is 0.
+            with_ut: project by the unscented transform; needs quats and scales, and `meta` is not packed. `camera_model` may
+                then be "ftheta", too.
+            with_eval3d: blend by the response of the Gaussians along each pixel's ray.
+            radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs, ut_params: lens
+                and shutter for `with_ut`, as in `fully_fused_projection_with_ut`.
             channel_chunk, segmented, renderer_config: accepted for compatibility with gsplat; without effect. Colours may
                 have any number of channels.
 
@@ -373,16 +378,11 @@ class Operations(StepOperations):
             InvalidInput: if a shape, dtype, device or mode does not fit; the message states the observed value.
             NotImplementedError: if an argument of gsplat is not supported; the message states its value.
         """
-        asked_for = (
-            sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
-            ftheta_coeffs, rolling_shutter, viewmats_rs, ut_params, rays, lidar_coeffs, external_distortion_coeffs,
-        )  # fmt: skip
+        asked_for = (sparse_grad, distributed, rays, lidar_coeffs, external_distortion_coeffs)
         if any(value is not None and value is not False for value in asked_for):
             refuse_unsupported(
-                sparse_grad=sparse_grad, distributed=distributed, with_ut=with_ut, with_eval3d=with_eval3d,
-                radial_coeffs=radial_coeffs, tangential_coeffs=tangential_coeffs, thin_prism_coeffs=thin_prism_coeffs,
-                ftheta_coeffs=ftheta_coeffs, rolling_shutter=rolling_shutter, viewmats_rs=viewmats_rs, ut_params=ut_params,
-                rays=rays, lidar_coeffs=lidar_coeffs, external_distortion_coeffs=external_distortion_coeffs,
+                sparse_grad=sparse_grad, distributed=distributed, rays=rays, lidar_coeffs=lidar_coeffs,
+                external_distortion_coeffs=external_distortion_coeffs,
             )  # fmt: skip
         settings = RenderSettings(
             width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
@@ -393,10 +393,19 @@ class Operations(StepOperations):
         )  # fmt: skip
         arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals)
         check_tensors(arguments, settings.has_colors)
-        rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
+        ops = self
+        unscented = (with_ut, with_eval3d, ut_params, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs,
+                     rolling_shutter, viewmats_rs)  # fmt: skip
+        if any(value is not None and value is not False for value in unscented):
+            from gsplat_core.rendering.unscented import UnscentedCamera, with_unscented_camera
+
+            camera = UnscentedCamera(*unscented)
+            if camera.given:
+                ops, arguments, settings = with_unscented_camera(self, camera, arguments, settings)
+        rendered = None if ops.in_one_call is None else ops.in_one_call(arguments, settings)
         if rendered is not None:
             return _named_as_in_gsplat(rendered, arguments, settings)
-        image, splats, extra, normals = _step_by_step(self, arguments, settings)
+        image, splats, extra, normals = _step_by_step(ops, arguments, settings)
         ids = splats.rows[:3] if isinstance(splats.rows, PackedProjection) else (None, None, None)
         keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.nearness, math.prod(settings.tile_grid))
         meta = _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])

@@ -182,15 +182,6 @@ def _shown(value: object) -> str:
 REFUSED: dict[str, str] = {
     "sparse_grad": "use packed=True, whose gradients are dense",
     "distributed": "render with one process",
-    "with_ut": "leave it out to project with the camera models pinhole, ortho and fisheye",
-    "with_eval3d": "leave it out to blend projected splats",
-    "radial_coeffs": "undistort the pictures, or use camera_model='fisheye' without coefficients",
-    "tangential_coeffs": "undistort the pictures, or use camera_model='fisheye' without coefficients",
-    "thin_prism_coeffs": "undistort the pictures, or use camera_model='fisheye' without coefficients",
-    "ftheta_coeffs": "use camera_model='fisheye'",
-    "rolling_shutter": "use a global shutter",
-    "viewmats_rs": "use a global shutter",
-    "ut_params": "leave it out",
     "rays": "give viewmats and Ks, which define the rays",
     "lidar_coeffs": (
         "use the camera models pinhole, ortho and fisheye, or gsplat_core.rendering.ranges.render_ranges for a range sensor"

@@ -11,13 +11,13 @@ import gsplat_core
 from gsplat_core import reference
 
 PUBLIC = [
-    "Camera", "CoreError", "DefaultStrategy", "DeformationField", "Frame", "FrameRenderer", "FrameStatus",
-    "GaussianCollection", "Gaussians",
-    "InvalidInput", "MCMCStrategy", "Model", "RENDERERS", "Reconstructor", "ReconstructorConfig", "RenderOutput",
-    "Renderer", "SelectiveAdam", "Snapshot", "SnapshotSlots", "Strategy", "fully_fused_projection", "fused_ssim",
-    "isect_offset_encode", "isect_tiles", "load_bundle", "load_ply", "new_renderer", "open_recording",
-    "quat_scale_to_covar_preci", "rasterization", "rasterize_to_pixels", "render", "save_bundle", "save_ply",
-    "spherical_harmonics",
+    "Camera", "CoreError", "DefaultStrategy", "DeformationField", "FThetaCameraDistortionParameters",
+    "FThetaPolynomialType", "Frame", "FrameRenderer", "FrameStatus", "GaussianCollection", "Gaussians", "InvalidInput",
+    "MCMCStrategy", "Model", "RENDERERS", "Reconstructor", "ReconstructorConfig", "RenderOutput", "Renderer",
+    "RollingShutterType", "SelectiveAdam", "Snapshot", "SnapshotSlots", "Strategy", "UnscentedTransformParameters",
+    "fully_fused_projection", "fully_fused_projection_with_ut", "fused_ssim", "isect_offset_encode", "isect_tiles",
+    "load_bundle", "load_ply", "new_renderer", "open_recording", "quat_scale_to_covar_preci", "rasterization",
+    "rasterize_to_pixels", "rasterize_to_pixels_eval3d", "render", "save_bundle", "save_ply", "spherical_harmonics",
 ]  # fmt: skip
 
 # gsplat 1.5.3, in its order.

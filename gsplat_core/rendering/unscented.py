@@ -1,0 +1,120 @@
+"""Rendering through distorted lenses and rolling shutters: operations of the pipeline with the unscented transform.
+
+`rasterization(with_ut=True)` projects Gaussians by the unscented transform, and `with_eval3d=True` blends them by their
+response along each pixel's ray (3DGUT, Wu et al. 2025). Tile lists and, without `with_eval3d`, blending are the ordinary
+operations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.projection.arguments import DenseProjection
+from gsplat_core.ops.unscented_projection.parameters import UnscentedTransformParameters
+from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
+from gsplat_core.ops.world_blending.world_blending import rasterize_to_pixels_eval3d
+from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
+from gsplat_core.rendering.settings import Arguments, RenderSettings
+from gsplat_core.scene.distortion import FThetaCameraDistortionParameters
+
+if TYPE_CHECKING:
+    from gsplat_core.rendering.pipeline import Operations
+
+
+class UnscentedCamera(NamedTuple):
+    """Arguments of `rasterization` that only the unscented transform and blending along rays take."""
+
+    with_ut: bool
+    with_eval3d: bool
+    ut_params: UnscentedTransformParameters | None
+    radial_coeffs: Tensor | None
+    tangential_coeffs: Tensor | None
+    thin_prism_coeffs: Tensor | None
+    ftheta_coeffs: FThetaCameraDistortionParameters | None
+    rolling_shutter: RollingShutterType | None
+    viewmats_rs: Tensor | None
+
+    @property
+    def given(self) -> bool:
+        """True if any argument differs from its default."""
+        return any(
+            value is not None and value is not False and getattr(value, "name", None) != "GLOBAL" for value in self
+        )
+
+    @property
+    def lens(self) -> dict[str, Any]:
+        """Lens and shutter, as keyword arguments of the operations."""
+        return {
+            name: value for name, value in self._asdict().items() if name not in ("with_ut", "with_eval3d", "ut_params")
+        }
+
+
+def with_unscented_camera(
+    ops: Operations, camera: UnscentedCamera, arguments: Arguments, settings: RenderSettings
+) -> tuple[Operations, Arguments, RenderSettings]:
+    """Return operations, arguments and settings that render through the lens and shutter of `camera`.
+
+    The view directions of spherical harmonics, and depths, are those at the middle of the read-out. Rows of `meta` are not
+    packed.
+
+    Raises:
+        InvalidInput: for arguments that cannot be combined.
+        NotImplementedError: for outputs that need straight rays from one position.
+    """
+    means, quats, scales = arguments.means, arguments.quats, arguments.scales
+    if quats is None or scales is None or arguments.covars is not None:
+        raise InvalidInput("with_ut and with_eval3d need quats and scales; covars are not supported")
+    special = [
+        name for name, value in camera.lens.items() if value is not None and getattr(value, "name", "") != "GLOBAL"
+    ]
+    if settings.camera_model == "ftheta":
+        special.append("camera_model='ftheta'")
+    if special and not camera.with_ut:
+        raise InvalidInput(f"{', '.join(special)} need with_ut=True")
+    if special and (settings.has_distance or settings.normals):
+        raise NotImplementedError(
+            f"distance along the rays and normals are not supported with {', '.join(special)}; use the render modes D and ED,"
+            " or undistort the pictures"
+        )
+    if arguments.viewmats.dim() < 3 or means.dim() < 2:
+        raise InvalidInput(f"viewmats must be [..., C, 4, 4], got {list(arguments.viewmats.shape)}")
+    images = (*means.shape[:-2], arguments.viewmats.shape[-3])
+    require_shape("viewmats", arguments.viewmats, (*images, 4, 4), "[..., C, 4, 4]")
+    viewmats = arguments.viewmats
+    options = camera.lens | {"camera_model": settings.camera_model}
+    shutter = Shutter.of(viewmats, camera.viewmats_rs, camera.rolling_shutter)
+
+    def project(means: Tensor, covars: Tensor | None, quats: Tensor, scales: Tensor, middle: Tensor, Ks: Tensor, *size: int,
+                opacities: Tensor | None = None, packed: bool = False, **limits: Any) -> DenseProjection:  # fmt: skip
+        limits = {name: value for name, value in limits.items() if name != "camera_model"}
+        return fully_fused_projection_with_ut(
+            means, quats, scales, opacities, viewmats, Ks, *size, ut_params=camera.ut_params, **options, **limits
+        )
+
+    def blend(means2d: Tensor, conics: Tensor, channels: Tensor, opacities: Tensor, *rest: Any, packed: bool = False,
+              absgrad: bool = False, **limits: Any) -> tuple[Tensor, Tensor]:  # fmt: skip
+        return rasterize_to_pixels_eval3d(
+            means, quats, scales, channels, opacities, viewmats, arguments.Ks, *rest, **options, **limits
+        )
+
+    def bin_by_boxes(
+        *arguments: Any, conics: Tensor, opacities: Tensor, **options: Any
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        # The response along rays is no ellipse in the picture, so only the boxes of the splats limit their tiles.
+        return ops.bin_splats(*arguments, **options)
+
+    changes: dict[str, Any] = {"in_one_call": None}
+    if camera.with_ut:
+        changes["fully_fused_projection"] = project
+    if camera.with_eval3d:
+        changes |= {"rasterize_to_pixels": blend, "bin_splats": bin_by_boxes}
+    return (
+        replace(ops, **changes),
+        arguments._replace(viewmats=shutter.matrices()),
+        replace(settings, packed=False),
+    )
