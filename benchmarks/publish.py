@@ -1,4 +1,4 @@
-"""Generate RESULTS.md, results/methods.md and the figures in README.md from the logs in `benchmarks/logs`.
+"""Generate RESULTS.md, results/methods.md, results/gsplat.md and the figures in README.md from the logs in `benchmarks/logs`.
 
     python benchmarks/publish.py            # writes
     python benchmarks/publish.py --check    # exit code 1 where a written figure and its log differ
@@ -21,13 +21,16 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "methods"))
+sys.path.insert(0, str(Path(__file__).resolve().parent / "gsplat"))
 
 from accepted import methods_text
+from results import gsplat_text
 
 ROOT = Path(__file__).resolve().parent.parent
 LOGS = ROOT / "benchmarks" / "logs"
 RESULTS = ROOT / "benchmarks" / "RESULTS.md"
 METHODS = ROOT / "benchmarks" / "results" / "methods.md"
+GSPLAT = ROOT / "benchmarks" / "results" / "gsplat.md"
 README = ROOT / "README.md"
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 ENVELOPE = ("benchmark", "run", "commit", "date", "machine", "command", "seconds")
@@ -402,6 +405,7 @@ def main() -> int:
     wanted = {
         RESULTS: results_text(),
         METHODS: methods_text(),
+        GSPLAT: gsplat_text(),
         README: with_figures(README.read_text(encoding="utf-8")),
     }
     stale = [path for path, text in wanted.items() if not path.exists() or path.read_text(encoding="utf-8") != text]

@@ -13,13 +13,17 @@ if TYPE_CHECKING:
     from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.io.bundle import load_bundle, save_bundle
+    from gsplat_core.io.exports.splats import export_splats
     from gsplat_core.io.ply import load_ply, save_ply
+    from gsplat_core.io.png_compression import PngCompression
     from gsplat_core.io.recordings import open_recording
     from gsplat_core.models.model import Model
     from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
     from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+    from gsplat_core.ops.compositing.indices import accumulate, rasterize_to_indices_in_range
     from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
+    from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.ssim.ssim import fused_ssim
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
@@ -28,6 +32,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.world_blending.world_blending import rasterize_to_pixels_eval3d
     from gsplat_core.poses.rolling_shutter import RollingShutterType
     from gsplat_core.rendering.frame_renderer import FrameRenderer
+    from gsplat_core.rendering.inria import rasterization_inria_wrapper
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
     from gsplat_core.rendering.registry import RENDERERS, new_renderer
     from gsplat_core.rendering.renderer import Renderer
@@ -59,6 +64,7 @@ __all__ = [
     "InvalidInput",
     "MCMCStrategy",
     "Model",
+    "PngCompression",
     "Reconstructor",
     "ReconstructorConfig",
     "RenderOutput",
@@ -69,6 +75,8 @@ __all__ = [
     "SnapshotSlots",
     "Strategy",
     "UnscentedTransformParameters",
+    "accumulate",
+    "export_splats",
     "fully_fused_projection",
     "fully_fused_projection_with_ut",
     "fused_ssim",
@@ -78,14 +86,18 @@ __all__ = [
     "load_ply",
     "new_renderer",
     "open_recording",
+    "proj",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterization_inria_wrapper",
+    "rasterize_to_indices_in_range",
     "rasterize_to_pixels",
     "rasterize_to_pixels_eval3d",
     "render",
     "save_bundle",
     "save_ply",
     "spherical_harmonics",
+    "world_to_cam",
 ]
 
 _HOME = {
@@ -104,6 +116,7 @@ _HOME = {
     "InvalidInput": "errors",
     "MCMCStrategy": "training.strategies.mcmc",
     "Model": "models.model",
+    "PngCompression": "io.png_compression",
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",
@@ -114,6 +127,8 @@ _HOME = {
     "SnapshotSlots": "models.snapshots",
     "Strategy": "training.strategies.strategy",
     "UnscentedTransformParameters": "ops.unscented_projection.parameters",
+    "accumulate": "ops.compositing.indices",
+    "export_splats": "io.exports.splats",
     "fully_fused_projection": "ops.projection.projection",
     "fully_fused_projection_with_ut": "ops.unscented_projection.unscented_projection",
     "fused_ssim": "ops.ssim.ssim",
@@ -123,14 +138,18 @@ _HOME = {
     "load_ply": "io.ply",
     "new_renderer": "rendering.registry",
     "open_recording": "io.recordings",
+    "proj": "ops.projection.separate_steps",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering.rasterization",
+    "rasterization_inria_wrapper": "rendering.inria",
+    "rasterize_to_indices_in_range": "ops.compositing.indices",
     "rasterize_to_pixels": "ops.compositing.compositing",
     "rasterize_to_pixels_eval3d": "ops.world_blending.world_blending",
     "render": "rendering.rasterization",
     "save_bundle": "io.bundle",
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
+    "world_to_cam": "ops.projection.separate_steps",
 }
 """Import path of the module that defines each public name."""
 

@@ -27,16 +27,23 @@ def options(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def write(method: str, chosen: argparse.Namespace, figures: Mapping[str, Any]) -> None:
-    """Print the figures, and write them to `chosen.out` with command, commit, machine and date."""
+def write(method: str, chosen: argparse.Namespace, figures: Mapping[str, Any], folder: str = "methods") -> None:
+    """Print the figures, and write them to `chosen.out` with command, commit, machine and date.
+
+    Args:
+        method: name of the script.
+        chosen: its options.
+        figures: values of the log.
+        folder: folder of the script in `benchmarks`.
+    """
     for name, value in figures.items():
         print(f"{name:44s} {value}")
     if chosen.out is None:
         return
-    stated = re.sub(r" --out \S+", "", " ".join(["python", f"benchmarks/methods/{method}.py", *sys.argv[1:]]))
+    stated = re.sub(r" --out \S+", "", " ".join(["python", f"benchmarks/{folder}/{method}.py", *sys.argv[1:]]))
     stated = re.sub(r"\S*/recordings/", "{recordings}/", stated)
     about = {
-        "benchmark": f"methods/{method}",
+        "benchmark": f"{folder}/{method}",
         "command": stated,
         "commit": suite.commit(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),

@@ -10,7 +10,6 @@ from torch import Tensor
 from gsplat_core.ops.projection.arguments import (
     ALPHA_CUTOFF,
     COMPENSATION_FLOOR,
-    FOV_MARGIN,
     MAX_EXTENT_SIGMAS,
     MAX_RADIUS_PX,
     DenseProjection,
@@ -20,72 +19,8 @@ from gsplat_core.ops.projection.arguments import (
     check_sparse_gradient,
     pack,
 )
+from gsplat_core.ops.projection.separate_steps import PROJECTIONS
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci, triu_to_matrix
-
-FISHEYE_SERIES_BELOW = 0.01
-"""Bound of tan θ below which the fisheye's quotients by r use their Taylor series."""
-
-
-def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Project with the pinhole model.
-
-    Returns image points [..., C, N, 2] and Jacobians [..., C, N, 2, 3] of camera-space points [..., C, N, 3].
-    """
-    x, y, z = p.unbind(-1)
-    fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
-    # The linearisation diverges far off axis, so it is evaluated at the border of a slightly larger
-    # view.
-    slope_x = torch.minimum(torch.maximum(x / z, -(cx / fx + margin_x)), (width - cx) / fx + margin_x)
-    slope_y = torch.minimum(torch.maximum(y / z, -(cy / fy + margin_y)), (height - cy) / fy + margin_y)
-    zero = torch.zeros_like(x)
-    jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1)
-    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
-    return means2d, jacobian.unflatten(-1, (2, 3))
-
-
-def _ortho(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    x, y, _ = p.unbind(-1)
-    fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    zero = torch.zeros_like(x)
-    jacobian = torch.stack([fx.expand_as(x), zero, zero, zero, fy.expand_as(x), zero], -1)
-    return torch.stack([fx * x + cx, fy * y + cy], -1), jacobian.unflatten(-1, (2, 3))
-
-
-def _fisheye(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Project with the equidistant fisheye model, in which the image radius is f θ.
-
-    With s = θ/r and q = (dθ/dr - s)/r², du/dx = fx (s + q x²). Results have the shapes of `_pinhole`.
-    """
-    x, y, z = p.unbind(-1)
-    fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    near_axis = (x * x + y * y < (FISHEYE_SERIES_BELOW * z) ** 2) & (z > 0)
-    r2 = torch.where(near_axis, torch.ones_like(x), x * x + y * y)
-    r = r2.sqrt()
-    squared = r2 + z * z
-    s_far = torch.atan2(r, z) / r
-    q_far = (z / squared - s_far) / r2
-    z_near = torch.where(near_axis, z, torch.ones_like(z))
-    t2 = torch.where(near_axis, (x * x + y * y) / (z_near * z_near), torch.zeros_like(x))
-    s_near = (1 - t2 / 3 + t2**2 / 5 - t2**3 / 7) / z_near
-    q_near = (-2 / 3 + 4 / 5 * t2 - 6 / 7 * t2**2 + 8 / 9 * t2**3) / z_near**3
-    s, q = torch.where(near_axis, s_near, s_far), torch.where(near_axis, q_near, q_far)
-    inverse = 1 / (x * x + y * y + z * z)
-    jacobian = torch.stack(
-        [
-            fx * (s + q * x * x),
-            fx * q * x * y,
-            -fx * x * inverse,
-            fy * q * x * y,
-            fy * (s + q * y * y),
-            -fy * y * inverse,
-        ],
-        -1,
-    )
-    return torch.stack([fx * x * s + cx, fy * y * s + cy], -1), jacobian.unflatten(-1, (2, 3))
-
-
-_MODELS = {"pinhole": _pinhole, "ortho": _ortho, "fisheye": _fisheye}
 
 
 def fully_fused_projection(
@@ -126,7 +61,7 @@ def fully_fused_projection(
     z = p[..., 2]
     in_range = usable[..., None, :] & (z >= near_plane) & (z <= far_plane)
     p = torch.where(in_range[..., None], p, p.new_tensor([0, 0, 1]))
-    means2d, jacobian = _MODELS[camera_model](p, Ks, width, height)
+    means2d, jacobian = PROJECTIONS[camera_model](p, Ks, width, height)
 
     # covariance in the image: (J W) Σ (J W)ᵀ
     affine = jacobian @ rotation[..., None, :, :]

@@ -1,0 +1,118 @@
+"""Small functions of `gsplat.utils`, in plain torch and differentiable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape, require_trailing
+from gsplat_core.errors import InvalidInput
+from gsplat_core.io.exports.splats import export_splats
+from gsplat_core.scene.gaussians import SH_C0
+
+
+def normalized_quat_to_rotmat(quat: Tensor) -> Tensor:
+    """Return the rotation matrices [..., 3, 3] of unit quaternions wxyz [..., 4]."""
+    require_trailing("quat", quat, (4,), "[..., 4]")
+    vector = quat[..., 1:]
+    w = quat[..., :1, None]
+    outer = vector[..., :, None] * vector[..., None, :]
+    identity = torch.eye(3, dtype=quat.dtype, device=quat.device)
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    square = (vector * vector).sum(-1)[..., None, None]
+    return identity + 2 * (outer - square * identity + w * cross)
+
+
+def log_transform(x: Tensor) -> Tensor:
+    """Return sign(x) log(1 + |x|)."""
+    return torch.sign(x) * torch.log1p(x.abs())
+
+
+def inverse_log_transform(y: Tensor) -> Tensor:
+    """Return the value whose `log_transform` is `y`."""
+    return torch.sign(y) * torch.expm1(y.abs())
+
+
+def depth_to_points(depths: Tensor, camtoworlds: Tensor, Ks: Tensor, z_depth: bool = True) -> Tensor:
+    """Return the points [..., H, W, 3] in world axes of depth maps of pinhole cameras.
+
+    Args:
+        depths: depths [..., H, W, 1].
+        camtoworlds: camera-to-world matrices [..., 4, 4].
+        Ks: intrinsic matrices [..., 3, 3].
+        z_depth: True for depth along the camera's axis, False for distance along the ray.
+    """
+    if depths.dim() < 3 or depths.shape[-1] != 1:
+        raise InvalidInput(f"depths must be [..., H, W, 1], got {list(depths.shape)}")
+    leading = tuple(depths.shape[:-3])
+    require_shape("camtoworlds", camtoworlds, (*leading, 4, 4), "[..., 4, 4]")
+    require_shape("Ks", Ks, (*leading, 3, 3), "[..., 3, 3]")
+    height, width = depths.shape[-3:-1]
+    x = torch.arange(width, device=depths.device, dtype=depths.dtype) + 0.5
+    y = torch.arange(height, device=depths.device, dtype=depths.dtype) + 0.5
+    at = lambda row, column: Ks[..., row, column, None]
+    across = ((x - at(0, 2)) / at(0, 0))[..., None, :].expand(*leading, height, width)
+    down = ((y - at(1, 2)) / at(1, 1))[..., :, None].expand(*leading, height, width)
+    local = torch.stack([across, down, torch.ones_like(across)], -1)
+    if not z_depth:
+        local = torch.nn.functional.normalize(local, dim=-1)
+    turned = (camtoworlds[..., None, None, :3, :3] @ local[..., None])[..., 0]
+    return camtoworlds[..., None, None, :3, 3] + depths * turned
+
+
+def depth_to_normal(depths: Tensor, camtoworlds: Tensor, Ks: Tensor, z_depth: bool = True) -> Tensor:
+    """Return the unit normals [..., H, W, 3] in world axes of depth maps; 0 at the border of one pixel.
+
+    Arguments as in `depth_to_points`. A normal is the cross product of the differences of the neighbours below and above,
+    and to the right and left.
+    """
+    points = depth_to_points(depths, camtoworlds, Ks, z_depth)
+    down = points[..., 2:, 1:-1, :] - points[..., :-2, 1:-1, :]
+    across = points[..., 1:-1, 2:, :] - points[..., 1:-1, :-2, :]
+    inner = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
+    return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1))
+
+
+def get_projection_matrix(
+    znear: float, zfar: float, fovX: float, fovY: float, device: torch.device | str | None = None
+) -> Tensor:
+    """Return the projection matrix [4, 4] of a camera with its axis along +z, with depth from 0 to 1.
+
+    Args:
+        znear: z of the near plane.
+        zfar: z of the far plane.
+        fovX: horizontal field of view in radians.
+        fovY: vertical field of view in radians.
+        device: device of the matrix; None for the default device of torch.
+    """
+    matrix = torch.zeros(4, 4, device=device)
+    matrix[0, 0] = 1 / math.tan(0.5 * fovX)
+    matrix[1, 1] = 1 / math.tan(0.5 * fovY)
+    matrix[2, 2] = zfar / (zfar - znear)
+    matrix[2, 3] = -zfar * znear / (zfar - znear)
+    matrix[3, 2] = 1
+    return matrix
+
+
+def save_ply(splats: Mapping[str, Tensor], dir: str, colors: Tensor | None = None) -> None:
+    """Write splats to a `.ply` file.
+
+    Args:
+        splats: tensors means [N, 3], scales [N, 3] (logarithms), quats [N, 4], opacities [N] (logits), sh0 [N, 1, 3] and
+            shN [N, K, 3].
+        dir: path of the file.
+        colors: colours [N, 3] from 0 to 1 that replace the spherical harmonics.
+    """
+    sh0, shN = splats.get("sh0"), splats.get("shN")
+    if colors is not None:
+        sh0, shN = ((colors - 0.5) / SH_C0)[:, None], colors.new_zeros(len(colors), 0, 3)
+    if sh0 is None or shN is None:
+        raise InvalidInput("splats must hold sh0 and shN, or give colors")
+    export_splats(
+        splats["means"], splats["scales"], splats["quats"], splats["opacities"], sh0, shN, format="ply", save_to=dir
+    )

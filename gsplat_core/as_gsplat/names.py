@@ -1,0 +1,103 @@
+"""Modules of gsplat 1.5.3, and where `gsplat_core` defines each of their names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+VERSION = "1.5.3"
+"""Version of gsplat whose names and signatures the modules have."""
+
+_ABSENT_EXTENSION = "gsplat_core.as_gsplat.extension"
+_FUNCTIONS = "gsplat_core.as_gsplat.functions"
+_PLAIN = "gsplat_core.reference.gsplat_names"
+_STRATEGIES = {
+    "DefaultStrategy": "gsplat_core.training.strategies.adc",
+    "MCMCStrategy": "gsplat_core.training.strategies.mcmc",
+    "Strategy": "gsplat_core.training.strategies.strategy",
+}
+_OPERATIONS = "gsplat_core.training.strategies.operations"
+_CUDA = {
+    "fully_fused_projection": "gsplat_core.ops.projection.projection",
+    "isect_offset_encode": "gsplat_core.ops.tiles.tiles",
+    "isect_tiles": "gsplat_core.ops.tiles.tiles",
+    "proj": "gsplat_core.ops.projection.separate_steps",
+    "quat_scale_to_covar_preci": "gsplat_core.ops.covariance.covariance",
+    "rasterize_to_indices_in_range": "gsplat_core.ops.compositing.indices",
+    "rasterize_to_pixels": "gsplat_core.ops.compositing.compositing",
+    "spherical_harmonics": "gsplat_core.ops.spherical_harmonics.spherical_harmonics",
+    "world_to_cam": "gsplat_core.ops.projection.separate_steps",
+}
+_RENDERING = {
+    "rasterization": "gsplat_core.rendering.rasterization",
+    "rasterization_inria_wrapper": "gsplat_core.rendering.inria",
+}
+
+MODULES: Mapping[str, Mapping[str, str]] = {
+    "gsplat": {
+        **_CUDA,
+        **_RENDERING,
+        **_STRATEGIES,
+        "PngCompression": "gsplat_core.io.png_compression",
+        "SelectiveAdam": "gsplat_core.training.steps.selective_adam",
+        "__version__": "gsplat_core.as_gsplat.names:VERSION",
+        "accumulate": "gsplat_core.ops.compositing.indices",
+        "export_splats": "gsplat_core.io.exports.splats",
+    },
+    "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.test_scene"},
+    "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
+    "gsplat.compression.png_compression": {"PngCompression": "gsplat_core.io.png_compression"},
+    "gsplat.cuda": {},
+    "gsplat.cuda._backend": {"_C": _ABSENT_EXTENSION},
+    "gsplat.cuda._torch_impl": {
+        "_fisheye_proj": _PLAIN,
+        "_fully_fused_projection": _PLAIN,
+        "_isect_offset_encode": _PLAIN,
+        "_isect_tiles": _PLAIN,
+        "_ortho_proj": _PLAIN,
+        "_persp_proj": _PLAIN,
+        "_quat_scale_to_covar_preci": _PLAIN,
+        "_quat_scale_to_matrix": _PLAIN,
+        "_quat_to_rotmat": _PLAIN,
+        "_rasterize_to_pixels": _PLAIN,
+        "_spherical_harmonics": _PLAIN,
+        "_world_to_cam": _PLAIN,
+        "accumulate": "gsplat_core.ops.compositing.indices",
+    },
+    "gsplat.cuda._wrapper": _CUDA,
+    "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.splats"},
+    "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
+    "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
+    "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.relocation"},
+    "gsplat.rendering": {
+        **_RENDERING,
+        "_rasterization": _PLAIN,
+        "fully_fused_projection": _CUDA["fully_fused_projection"],
+        "rasterize_to_pixels": _CUDA["rasterize_to_pixels"],
+        "spherical_harmonics": _CUDA["spherical_harmonics"],
+    },
+    "gsplat.strategy": _STRATEGIES,
+    "gsplat.strategy.base": {"Strategy": _STRATEGIES["Strategy"]},
+    "gsplat.strategy.default": {"DefaultStrategy": _STRATEGIES["DefaultStrategy"]},
+    "gsplat.strategy.mcmc": {"MCMCStrategy": _STRATEGIES["MCMCStrategy"]},
+    "gsplat.strategy.ops": {
+        "duplicate": _OPERATIONS,
+        "inject_noise_to_position": _OPERATIONS,
+        "relocate": _OPERATIONS,
+        "remove": _OPERATIONS,
+        "reset_opa": _OPERATIONS,
+        "sample_add": _OPERATIONS,
+        "split": _OPERATIONS,
+    },
+    "gsplat.utils": {
+        "depth_to_normal": _FUNCTIONS,
+        "depth_to_points": _FUNCTIONS,
+        "get_projection_matrix": _FUNCTIONS,
+        "inverse_log_transform": _FUNCTIONS,
+        "log_transform": _FUNCTIONS,
+        "normalized_quat_to_rotmat": _FUNCTIONS,
+        "save_ply": _FUNCTIONS,
+    },
+    "gsplat.version": {"__version__": "gsplat_core.as_gsplat.names:VERSION"},
+    "fused_ssim": {"fused_ssim": "gsplat_core.ops.ssim.ssim"},
+}
+"""For each module its names, and for each name the module that defines it, or `module:name` if it has another name there."""

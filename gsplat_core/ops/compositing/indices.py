@@ -1,0 +1,202 @@
+"""Blending as a list of pairs of pixel and splat, in plain torch, for experiments with blending.
+
+`rasterize_to_indices_in_range` returns the pairs that `rasterize_to_pixels` blends, and `accumulate` blends them. Autograd
+differentiates the result. Sums are in a fixed order. The memory grows with the number of pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape, require_trailing
+from gsplat_core.errors import InvalidInput
+
+MAX_ALPHA = 0.99
+"""Upper limit of a splat's alpha at a pixel, as in gsplat 1.6; 1.5.3 has 0.999."""
+MIN_ALPHA = 1.0 / 255.0
+LEAST_TRANSMITTANCE = 1e-4
+"""A splat after which less light passes is not blended any more."""
+PAIRS_AT_A_TIME = 1 << 22
+"""Bound of the memory for pairs of pixel and list entry."""
+
+
+@torch.no_grad()
+def rasterize_to_indices_in_range(
+    range_start: int,
+    range_end: int,
+    transmittances: Tensor,
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    *,
+    max_alpha: float = MAX_ALPHA,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pairs of splat and pixel that are blended, without blending them.
+
+    The lists of the tiles are taken in batches of `tile_size`² entries. Several calls with consecutive ranges give the pairs
+    of one call with the whole range.
+
+    Args:
+        range_start: first batch.
+        range_end: end of the batches, exclusive. A large number stands for all.
+        transmittances: transmittance [..., H, W] in front of the first batch.
+        means2d: means [..., N, 2] in pixels.
+        conics: upper triangles [..., N, 3] of the inverse covariances.
+        opacities: opacities [..., N].
+        image_width: width in pixels.
+        image_height: height in pixels.
+        tile_size: side of the tiles in pixels.
+        isect_offsets: starts [..., tile_height, tile_width] of the tiles' lists.
+        flatten_ids: listed splats [M].
+        max_alpha: upper limit of alpha.
+
+    Returns:
+        Ids of Gaussians, pixels (row by row) and pictures, each int64 [P]: sorted by picture and pixel, then front to back.
+
+    Raises:
+        InvalidInput: for wrong shapes.
+    """
+    dims = require_trailing("means2d", means2d, (2,), "[..., N, 2]")
+    _check_splats(dims, conics, opacities)
+    n, image_dims = dims[-1], dims[:-1]
+    require_shape("transmittances", transmittances, (*image_dims, image_height, image_width), "[..., H, W]")
+    tile_height, tile_width = isect_offsets.shape[-2:]
+    require_shape(
+        "isect_offsets", isect_offsets, (*image_dims, tile_height, tile_width), "[..., tile_height, tile_width]"
+    )
+    if tile_height * tile_size < image_height or tile_width * tile_size < image_width:
+        raise InvalidInput(
+            f"{tile_height} x {tile_width} tiles of {tile_size} px do not cover a picture of {image_width} x {image_height} px"
+        )
+    block, device = tile_size * tile_size, means2d.device
+    starts = isect_offsets.reshape(-1).long()
+    ends = torch.cat([starts[1:], starts.new_tensor([len(flatten_ids)])])
+    first = torch.minimum(starts + int(range_start) * block, ends)
+    last = torch.minimum(starts + min(int(range_end), len(flatten_ids) // block + 1) * block, ends)
+    lengths = (last - first).clamp(min=0)
+    values = torch.cat([means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1, 1)], -1)
+    through = transmittances.reshape(-1)
+    inside = torch.arange(block, device=device)
+    row, column = inside // tile_size, inside % tile_size
+    found_ids, found_pixels = [], []
+    for low, high in _groups(lengths.tolist(), max(1, PAIRS_AT_A_TIME // block)):
+        counts = lengths[low:high]
+        tile = torch.repeat_interleave(torch.arange(low, high, device=device), counts)
+        before = torch.cumsum(counts, 0) - counts
+        position = torch.arange(len(tile), device=device) - torch.repeat_interleave(before, counts)
+        ids = flatten_ids[first[tile] + position].long()
+        image, within = tile // (tile_height * tile_width), tile % (tile_height * tile_width)
+        y = (within // tile_width * tile_size)[:, None] + row
+        x = (within % tile_width * tile_size)[:, None] + column
+        alphas = _alphas(values[ids][:, None], x, y, max_alpha)
+        covered = (x < image_width) & (y < image_height)
+        pixel = (image[:, None] * image_height + y) * image_width + x
+        # Transmittance after each entry: the logarithms are summed over the entries of the same tile, in float64.
+        logs = torch.cumsum(torch.log1p(-alphas.double()), 0)
+        ahead = torch.cat([logs.new_zeros(1, block), logs])[torch.repeat_interleave(before, counts)]
+        start = through[torch.where(covered, pixel, 0)].double()
+        used = covered & (alphas > 0) & (start * torch.exp(logs - ahead) > LEAST_TRANSMITTANCE)
+        entry, at = torch.nonzero(used, as_tuple=True)
+        found_ids.append(ids[entry])
+        found_pixels.append(pixel[entry, at])
+    if not found_ids:
+        none = torch.zeros(0, dtype=torch.int64, device=device)
+        return none, none, none
+    pixels, order = torch.sort(torch.cat(found_pixels), stable=True)
+    size = image_width * image_height
+    return torch.cat(found_ids)[order] % max(n, 1), pixels % size, torch.div(pixels, size, rounding_mode="floor")
+
+
+def accumulate(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    gaussian_ids: Tensor,
+    pixel_ids: Tensor,
+    image_ids: Tensor,
+    image_width: int,
+    image_height: int,
+    *,
+    max_alpha: float = MAX_ALPHA,
+) -> tuple[Tensor, Tensor]:
+    """Blend the pairs of splat and pixel front to back; differentiable in means, conics, opacities and colours.
+
+    Args:
+        means2d: means [..., N, 2] in pixels.
+        conics: upper triangles [..., N, 3] of the inverse covariances.
+        opacities: opacities [..., N].
+        colors: colours [..., N, D].
+        gaussian_ids: splat of each pair [P].
+        pixel_ids: pixel of each pair [P], row by row.
+        image_ids: picture of each pair [P]. The pairs of a pixel are from front to back.
+        image_width: width in pixels.
+        image_height: height in pixels.
+        max_alpha: upper limit of alpha.
+
+    Returns:
+        Colours [..., H, W, D] and opacities [..., H, W, 1].
+
+    Raises:
+        InvalidInput: for wrong shapes.
+    """
+    dims = require_trailing("means2d", means2d, (2,), "[..., N, 2]")
+    _check_splats(dims, conics, opacities)
+    image_dims, images = dims[:-1], math.prod(dims[:-1])
+    if tuple(colors.shape[:-1]) != dims:
+        raise InvalidInput(f"colors must be [..., N, D] with [..., N] = {list(dims)}, got {list(colors.shape)}")
+    for name, ids in (("pixel_ids", pixel_ids), ("image_ids", image_ids)):
+        require_shape(name, ids, tuple(gaussian_ids.shape), "[P]")
+    pixels, order = torch.sort(image_ids * (image_height * image_width) + pixel_ids, stable=True)
+    rows = (image_ids * dims[-1] + gaussian_ids)[order]
+    values = torch.cat([means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1, 1)], -1)[rows]
+    at = pixels % (image_height * image_width)
+    alphas = _alphas(values, at % image_width, torch.div(at, image_width, rounding_mode="floor"), max_alpha, cut=False)
+    lengths = torch.bincount(pixels, minlength=images * image_height * image_width)
+    ends = torch.cumsum(lengths, 0)
+    logs = torch.cumsum(torch.log1p(-alphas.double()), 0)
+    before = torch.cat([logs.new_zeros(1), logs])
+    weights = alphas * torch.exp(before[:-1] - before[(ends - lengths)[pixels]]).to(alphas.dtype)
+    blended = torch.cat([weights[:, None] * colors.reshape(-1, colors.shape[-1])[rows], weights[:, None]], 1)
+    # Differences of one running sum instead of atomic additions, for the same bits in every run.
+    sums = torch.cat([blended.new_zeros(1, blended.shape[1], dtype=torch.float64), torch.cumsum(blended.double(), 0)])
+    picture = (sums[ends] - sums[ends - lengths]).to(means2d.dtype)
+    picture = picture.reshape(*image_dims, image_height, image_width, blended.shape[1])
+    return picture[..., :-1], picture[..., -1:]
+
+
+def _check_splats(dims: tuple[int, ...], conics: Tensor, opacities: Tensor) -> None:
+    if not dims:
+        raise InvalidInput("means2d must be [..., N, 2], got [2]")
+    require_shape("conics", conics, (*dims, 3), "[..., N, 3]")
+    require_shape("opacities", opacities, dims, "[..., N]")
+
+
+def _alphas(values: Tensor, x: Tensor, y: Tensor, max_alpha: float, cut: bool = True) -> Tensor:
+    """Return the alpha of splats with values [..., 6] at the centres of pixels; 0 if it is too small to be blended."""
+    mean_x, mean_y, a, b, c, opacity = values.unbind(-1)
+    dx, dy = x + 0.5 - mean_x, y + 0.5 - mean_y
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alphas = (opacity * torch.exp(-sigma)).clamp(max=max_alpha)
+    return torch.where((sigma >= 0) & (alphas >= MIN_ALPHA), alphas, 0) if cut else alphas
+
+
+def _groups(lengths: list[int], most: int) -> Iterator[tuple[int, int]]:
+    """Yield ranges of consecutive tiles with at most `most` entries together, or one tile with more."""
+    low, total = 0, 0
+    for high, length in enumerate(lengths):
+        if total and total + length > most:
+            yield low, high
+            low, total = high, 0
+        total += length
+    if total:
+        yield low, len(lengths)

@@ -1,0 +1,124 @@
+"""gsplat's module names on top of this package."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+
+import gsplat_core
+from gsplat_core.as_gsplat import finder, install, names
+from gsplat_core.as_gsplat import functions as utils
+
+PROGRAM = """
+import sys
+from helper import SIZE
+import torch
+from gsplat import rasterization
+from gsplat.cuda._wrapper import spherical_harmonics
+import gsplat
+
+means = torch.tensor([[0.0, 0.0, 2.0]], requires_grad=True)
+colors, alphas, meta = rasterization(
+    means, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.2), torch.tensor([0.9]), torch.ones(1, 3),
+    torch.eye(4)[None], torch.tensor([[[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]]), SIZE, SIZE,
+)
+colors.sum().backward()
+assert means.grad.abs().sum() > 0
+assert gsplat.rendering.rasterization is rasterization
+print(__name__, gsplat.__version__, tuple(colors.shape), sys.argv[1:])
+"""
+
+
+@pytest.fixture
+def installed():
+    before = dict(sys.modules)
+    install()
+    yield
+    sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, finder.Finder)]
+    for name in names.MODULES:
+        sys.modules.pop(name, None)
+        if name in before:
+            sys.modules[name] = before[name]
+
+
+def test_a_program_runs_unchanged_with_the_modules_in_its_folder(tmp_path):
+    (tmp_path / "helper.py").write_text("SIZE = 16\n")
+    (tmp_path / "program.py").write_text(PROGRAM)
+    command = [sys.executable, "-m", "gsplat_core.as_gsplat", str(tmp_path / "program.py"), "--steps", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["__main__", "1.5.3", "(1,", "16,", "16,", "3)", "['--steps',", "'3']"]
+
+
+def test_every_name_exists(installed):
+    for module_name, homes in names.MODULES.items():
+        module = importlib.import_module(module_name)
+        for name in homes:
+            assert getattr(module, name) is not None, (module_name, name)
+        assert set(homes) <= set(dir(module))
+
+
+def test_names_are_those_of_the_package_itself(installed):
+    module = importlib.import_module("gsplat")
+    for name in names.MODULES["gsplat"]:
+        if name in gsplat_core.__all__:
+            assert getattr(module, name) is getattr(gsplat_core, name)
+
+
+def test_an_unknown_name_is_reported_with_those_that_exist(installed):
+    module = importlib.import_module("gsplat.exporter")
+    with pytest.raises(AttributeError, match=r"no attribute 'export_gltf'.*export_splats"):
+        module.export_gltf  # noqa: B018
+    with pytest.raises(ImportError):
+        importlib.import_module("gsplat.sensors")
+
+
+def test_another_gsplat_that_is_loaded_already_is_not_replaced(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", ModuleType("gsplat"))
+    with pytest.raises(ImportError, match="before the first import of gsplat"):
+        install()
+
+
+def test_a_point_of_a_depth_map_is_projected_back_to_its_pixel():
+    K = torch.tensor([[20.0, 0, 7], [0, 22, 5], [0, 0, 1]])
+    pose = torch.eye(4)
+    pose[:3, :3] = utils.normalized_quat_to_rotmat(torch.tensor([0.5, 0.5, 0.5, 0.5]))
+    pose[:3, 3] = torch.tensor([1.0, 2, 3])
+    depths = 2 + torch.rand(8, 12, 1, generator=torch.Generator().manual_seed(0))
+    points = utils.depth_to_points(depths, pose, K)
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    torch.testing.assert_close(local[..., 2:], depths)
+    pixels = (local @ K.T)[..., :2] / local[..., 2:]
+    torch.testing.assert_close(pixels[3, 4], torch.tensor([4.5, 3.5]))
+    along_ray = utils.depth_to_points(depths, pose, K, z_depth=False)
+    torch.testing.assert_close((along_ray - pose[:3, 3]).norm(dim=-1, keepdim=True), depths)
+
+
+def test_the_normals_of_a_plane_are_its_normal():
+    K = torch.tensor([[20.0, 0, 6], [0, 20, 4], [0, 0, 1]])
+    normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.2, -1.0]), dim=0)
+    y, x = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(12) + 0.5, indexing="ij")
+    rays = torch.stack([(x - 6) / 20, (y - 4) / 20, torch.ones_like(x)], -1)
+    depths = (-3 / (rays @ normal))[..., None]
+    normals = utils.depth_to_normal(depths, torch.eye(4), K)
+    torch.testing.assert_close(normals[1:-1, 1:-1], normal.expand(6, 10, 3), rtol=1e-4, atol=1e-4)
+    assert not normals[0].any()
+
+
+def test_the_projection_matrix_sends_near_and_far_planes_to_0_and_1():
+    matrix = utils.get_projection_matrix(0.5, 10.0, 1.2, 0.8, device="cpu")
+    edge = torch.tensor([0.5 * torch.tan(torch.tensor(0.6)), 0.5 * torch.tan(torch.tensor(0.4)), 0.5, 1.0])
+    near = matrix @ edge
+    torch.testing.assert_close(near[:3] / near[3], torch.tensor([1.0, 1.0, 0.0]))
+    far = matrix @ torch.tensor([0.0, 0, 10, 1])
+    torch.testing.assert_close(far[2] / far[3], torch.tensor(1.0))
+
+
+def test_the_logarithmic_transform_has_an_inverse():
+    values = torch.linspace(-50, 50, 21, dtype=torch.float64)
+    torch.testing.assert_close(utils.inverse_log_transform(utils.log_transform(values)), values)
