@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, ValidationError
     from pydantic_core import CoreSchema
 
-Command = Literal["replay", "batch", "reconstruct", "live", "job", "stream"]
-"""Uses of options: commands of `intrasplat`, replay jobs of the service, and streams of the service."""
+Command = Literal["replay", "batch", "reconstruct", "live", "job", "stream", "render"]
+"""Uses of options: commands of `intrasplat`, replay jobs of the service, and streams of the service. `render` stands for
+pictures of a finished model, by `intrasplat render` or through the REST API."""
 EVERYWHERE: tuple[Command, ...] = get_args(Command)
 _NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:e-?[0-9]{1,2})?")
 MAX_TEXT = 4096
@@ -179,11 +180,11 @@ def _strict(kind: Any, limits: Mapping[str, Any], least_length: int | None) -> A
     if kind is str:
         return Annotated[str, Field(min_length=least_length, max_length=MAX_TEXT)]
     if get_origin(kind) is tuple:
-        return Annotated[kind, BeforeValidator(_listed)]
+        return Annotated[kind, BeforeValidator(listed)]
     return Annotated[bool, Field(strict=True)] if kind is bool else kind
 
 
-def _listed(value: Any) -> Any:
+def listed(value: Any) -> Any:
     """Split a comma-separated string such as "video,keyframes"; "none" gives an empty tuple. Other types are
     unchanged."""
     if isinstance(value, str):

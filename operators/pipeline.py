@@ -244,6 +244,7 @@ class Pipeline(Application):
             self,
             name="rasterize",
             renderer=settings.renderer,
+            renderer_options=settings.renderer_options,
             predict_every=pace.predict_every,
             rasterizer=self._rasterizer,
         )

@@ -15,7 +15,7 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer
+from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
 from operators.messages import DeformedScene, Prediction, Reconstruction, RenderedFrame
@@ -64,9 +64,9 @@ class Rasterizer:
     The calling thread blocks until the picture is in page-locked host memory.
     """
 
-    def __init__(self, renderer: str) -> None:
-        """renderer: name in `gsplat_core.rendering.registry.RENDERERS`."""
-        self.renderer = renderer
+    def __init__(self, renderer: str, options: RendererOptions | None = None) -> None:
+        """renderer: name in `gsplat_core.rendering.registry.RENDERERS`. options: options of the renderer."""
+        self.renderer, self._options = renderer, options
         self._made: Renderer | None = None
         self._made_for: tuple[int, int, str, torch.device] | None = None
         self._stream: torch.cuda.Stream | None = None
@@ -110,7 +110,7 @@ class Rasterizer:
         camera = scene.camera
         wanted = camera.width_px, camera.height_px, camera.model, scene.model.device
         if self._made is None or self._made_for != wanted:
-            self._made = new_renderer(self.renderer, camera, scene.model.device)
+            self._made = new_renderer(self.renderer, camera, scene.model.device, options=self._options)
             self._made_for = wanted
         return self._made
 
@@ -142,11 +142,13 @@ class RasterizeOp(Operator):
 
     Params:
         renderer: name in `gsplat_core.rendering.registry.RENDERERS`.
+        renderer_options: `RendererOptions`; None for the renderer's defaults.
         predict_every: predict one in this many frames; 0 disables prediction.
         rasterizer: warm rasterizer owned by this operator from now on; None creates one.
     """
 
     renderer: str
+    renderer_options: RendererOptions | None
     predict_every: int
 
     def __init__(self, fragment: Any, *args: Any, rasterizer: Rasterizer | None = None, **kwargs: Any) -> None:
@@ -160,6 +162,7 @@ class RasterizeOp(Operator):
         spec.output("rendered", type=RenderedFrame)
         spec.output("predicted", type=Prediction, optional=True)
         spec.param("renderer", "alpha")
+        spec.param("renderer_options", None)
         spec.param("predict_every", 0)
 
     def start(self) -> None:
@@ -171,7 +174,7 @@ class RasterizeOp(Operator):
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         if self._rasterizer is None:
-            self._rasterizer = Rasterizer(self.renderer)
+            self._rasterizer = Rasterizer(self.renderer, self.renderer_options)
         scene: DeformedScene = op_input.receive("scene")
         op_output.emit(self._rasterizer.draw(scene), "rendered")
         if self.predict_every:

@@ -14,13 +14,17 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, GROWTHS, LOSSES, RENDERERS, Eyes
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, GROWTHS, LOSSES, OUTPUTS, RENDERERS, Eyes
+from gsplat_core.combinations import STANDARD, check_losses, check_outputs, check_renderer_options
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
 from operators.graph.application import Engine
-from operators.options import Command, Declared, Names, Option, Section, for_callers, options_for, options_of
+from operators.options import Command, Declared, Names, Option, Section, for_callers, listed, options_for, options_of
+
+if TYPE_CHECKING:
+    from gsplat_core.rendering.renderer import RendererOptions
 
 TRAINING_RUNS: tuple[Command, ...] = ("replay", "batch", "reconstruct", "job")
 REPLAYS: tuple[Command, ...] = ("replay", "batch", "job")
@@ -80,17 +84,23 @@ class PlaybackSection(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructSection(Section):
-    """Model and its training."""
+class SeedSection(Section):
+    """Random numbers."""
 
-    device: Annotated[Device, Option("Processor that trains and renders", COMMANDS)] = "cpu"
-    field: Annotated[str, Option("Deformation field; auto is the better one"), Names(FIELDS)] = "auto"
     seed: Annotated[
         int,
         Option(
             "Seed of all random numbers; the same seed gives the same bytes", ge=0, le=MAX_SEED, callers_le=2**31 - 1
         ),
     ] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructSection(Section):
+    """Model and its training."""
+
+    device: Annotated[Device, Option("Processor that trains and renders", COMMANDS)] = "cpu"
+    field: Annotated[str, Option("Deformation field; auto is the better one"), Names(FIELDS)] = "auto"
     losses: Annotated[
         tuple[Annotated[str, Names(LOSSES, weighted=True)], ...],
         Option("Losses in addition to photometric and depth, each as name or name:weight, or none"),
@@ -122,9 +132,99 @@ class DepthSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class DisplaySection(Section):
-    """Pictures of the model."""
+    """Pictures of the model.
+
+    Raises:
+        InvalidSetting: if the renderer does not have an option or output.
+    """
 
     renderer: Annotated[str, Option("Method that turns Gaussians into a picture"), Names(RENDERERS)] = "alpha"
+    samples: Annotated[
+        int | None,
+        Option("Random samples per pixel of a renderer that has them", null="16", ge=1, le=2**20, callers_le=1024),
+    ] = None
+    supersampling: Annotated[
+        int | None,
+        Option("Sub-pixels per pixel and axis of a renderer that has them", null="1", ge=1, le=8, callers_le=4),
+    ] = None
+    order: Annotated[
+        Literal["splat", "pixel"] | None,
+        Option(
+            "Depth that decides what is in front: splat (of its centre) or pixel (of its plane at each pixel)",
+            null="splat",
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_display(self.options())
+
+    @property
+    def renderer_options(self) -> RendererOptions:
+        """Return the options of the renderer; the seed of the run is its seed if it has one."""
+        from gsplat_core.rendering.renderer import RendererOptions
+
+        given = {name: value for name in RENDERER_OPTIONS if (value := getattr(self, name, None)) is not None}
+        if "seed" in RENDERERS[self.renderer].capabilities.options:
+            given["seed"] = getattr(self, "seed", 0)
+        return RendererOptions(**given)
+
+
+RENDERER_OPTIONS = ("samples", "supersampling", "order", "progressive", "storage")
+"""Options of the engine that only some renderers have."""
+
+
+def check_display(options: Mapping[str, Any]) -> None:
+    """Check the combination of the options `renderer`, those of the renderer, `outputs` and `losses`.
+
+    Args:
+        options: values by name; an absent one has its default.
+
+    Raises:
+        InvalidSetting: if the combination does not work.
+    """
+    renderer = options.get("renderer") or "alpha"
+    check_renderer_options(renderer, [name for name in RENDERER_OPTIONS if options.get(name)])
+    check_outputs(renderer, listed(options.get("outputs")) or ())
+    check_losses(renderer, listed(options.get("losses")) or ())
+
+
+@dataclass(frozen=True, kw_only=True)
+class StillSection(Section):
+    """Pictures of a model that stands still."""
+
+    progressive: Annotated[
+        bool,
+        Option(
+            "Add the samples of consecutive pictures while camera and scene stand still, up to 4096 per pixel",
+            ("stream", "render"),
+        ),
+    ] = False
+    storage: Annotated[
+        Literal["raw", "prepared", "quantised"] | None,
+        Option(
+            "Format of the splats that a renderer of samples reads; prepared and quantised (16 bytes and the colours) are for"
+            " models that do not move",
+            ("stream", "render"),
+            null="raw",
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSection(Section):
+    """Pictures of a finished model."""
+
+    outputs: Annotated[
+        tuple[Annotated[str, Names(OUTPUTS, more=STANDARD)], ...],
+        Option("Outputs to show, side by side; those without colours in false colours", ("render",)),
+    ] = ("image",)
+    fps: Annotated[
+        float, Option("Frames rendered per second of model time", ("render",), gt=0, le=1000, callers_le=120)
+    ] = 30.0
+    scale: Annotated[
+        float, Option("Factor by which the pictures are resized", ("render",), gt=0, le=64, callers_le=4)
+    ] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +321,7 @@ class LiveSection(Section):
 @dataclass(frozen=True, kw_only=True)
 class JobOptions(
     ReconstructSection,
+    SeedSection,
     DepthSection,
     ChecksSection,
     DisplaySection,
@@ -244,7 +345,7 @@ class ReconstructOptions(JobOptions, OfflineSection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EngineOptions(ReconstructSection, DepthSection, ChecksSection, DisplaySection, LiveSection):
+class EngineOptions(ReconstructSection, SeedSection, DepthSection, ChecksSection, DisplaySection, LiveSection):
     """Options of a live reconstruction, by `intrasplat live` or by a stream's engine process."""
 
 
@@ -260,6 +361,11 @@ class LiveOptions(EngineOptions, SourceSection, LengthSection, PlaybackSection):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RenderOptions(DisplaySection, SeedSection, StillSection, RenderSection):
+    """Options of pictures and videos of a finished model."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CaptureOptions(SourceSection, PlaybackSection):
     """Options of a stream's capture process."""
 
@@ -267,7 +373,7 @@ class CaptureOptions(SourceSection, PlaybackSection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreamEngineOptions(EngineOptions):
+class StreamEngineOptions(EngineOptions, StillSection):
     """Options of a stream's engine process."""
 
     engine_scale: Annotated[
@@ -300,6 +406,12 @@ class CallerEngineOptions(StreamEngineOptions):
     """Options of a stream's engine process, with the limits of REST API callers."""
 
 
+@dataclass(frozen=True, kw_only=True)
+@for_callers
+class CallerRenderOptions(RenderOptions):
+    """Options of pictures and videos of a finished model, with the limits of REST API callers."""
+
+
 def stream_options() -> dict[str, Declared]:
     """Return the declared options of a service stream by name."""
     return {**options_for(CallerCaptureOptions, "stream"), **options_for(CallerEngineOptions, "stream")}
@@ -318,6 +430,7 @@ def check_stream_options(options: Mapping[str, Any]) -> None:
             raise InvalidSetting(f"a stream has no option {name!r:.60}; the nearest is {near!r}")
         if value is not None:
             known[name].checked(value)
+    check_display(options)
 
 
 def stream_options_schema() -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Viewer of a model in a browser by pictures that this machine renders, with any renderer and for models of any size.
 
 The page asks for one picture after the other. While the camera stands still, a renderer of random samples adds samples
-to the same picture, up to `MOST_SAMPLES`. Needs only the standard library, no extra.
+to the same picture, up to `PROGRESSIVE_SAMPLES`. Needs only the standard library, no extra.
 """
 
 from __future__ import annotations
@@ -25,14 +25,12 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.models.model import Model
 from gsplat_core.plain_numbers import plain_float
 from gsplat_core.rendering.registry import check_renderer, new_renderer
-from gsplat_core.rendering.renderer import Renderer, RendererOptions
+from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Renderer, RendererOptions
 from gsplat_core.scene.cameras import Camera
 from operators.applications.render import typical_depth
 from operators.rasterize import displayed
 
 log = logging.getLogger(__name__)
-MOST_SAMPLES = 4096
-"""Number of samples per pixel after which a picture is complete."""
 MOST_SIDE_PX = 4096
 JPEG_QUALITY = 92
 RANGES = {
@@ -208,7 +206,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer(HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode())
                 return
             data, samples = self.made.jpeg(viewpoint)
-            complete = not self.made.progressive or samples >= MOST_SAMPLES
+            complete = not self.made.progressive or samples >= PROGRESSIVE_SAMPLES
             self._answer(
                 HTTPStatus.OK, "image/jpeg", data, {"X-Samples": str(samples), "X-Complete": str(int(complete))}
             )

@@ -24,6 +24,8 @@ DepthOrder = Literal["splat", "pixel"]
 Storage = Literal["raw", "prepared", "quantised"]
 MOST_SAMPLES = 1 << 20
 MOST_SUPERSAMPLING = 8
+PROGRESSIVE_SAMPLES = 4096
+"""Number of samples per sub-pixel after which a progressive picture is complete and gains none."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class RendererOptions:
     seed: int = 0
     """Seed of all random numbers; equal seeds give equal bytes."""
     progressive: bool = False
-    """True adds the samples of consecutive frames of the same model, camera and time."""
+    """True adds the samples of consecutive frames of the same model, camera and time, up to `PROGRESSIVE_SAMPLES`."""
     storage: Storage = "raw"
     """Format of the splats that the renderer reads.
 

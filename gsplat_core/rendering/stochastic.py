@@ -15,6 +15,7 @@ from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.stochastic.stochastic import Method, SplatScene, new_sums, picture_of, sample_splats
 from gsplat_core.rendering.prepared import prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.renderer import (
+    PROGRESSIVE_SAMPLES,
     STANDARD_OUTPUTS,
     Capabilities,
     FinishedFrame,
@@ -98,12 +99,13 @@ class SampledRenderer:
         if self._model is None:
             raise InvalidInput("no model was prepared; call prepare(model) before render()")
         with torch.no_grad():
-            scene = self._scene or raw_splats(self._model.at(time_s))
-            shown = self._model, camera, self._model.clamp_time(time_s)
+            static = self._model.field is None
+            shown = self._model, camera, 0.0 if static else self._model.clamp_time(time_s)
             if self._sums is None or not self._options.progressive or shown != self._shown:
                 self._sums, self._drawn, self._shown = new_sums(camera, self._model.device), 0, shown
-            self._sample(scene, camera, self._sums)
-            self._drawn += self._options.samples
+            if self._drawn < PROGRESSIVE_SAMPLES or not self._options.progressive:
+                self._sample(self._scene or raw_splats(self._model.at(time_s)), camera, self._sums)
+                self._drawn += self._options.samples
             factor = self._options.supersampling
             picture = picture_of(self._sums, self._drawn * factor * factor, self._background)
         return FinishedFrame({name: tensor for name, tensor in picture._asdict().items() if name in asked})

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from gsplat_core.choices import FIELDS, GROWTHS, MOTION_PRIORS, RENDERERS, Eyes
+from gsplat_core.combinations import check_losses
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
@@ -135,6 +136,7 @@ class ReconstructorConfig:
         RENDERERS.check(self.renderer)
         GROWTHS.check(self.growth)
         loss_weights(self.losses)
+        check_losses(self.renderer, self.losses)
         if self.motion_detail not in get_args(Detail):
             raise InvalidSetting(f"motion_detail is {self.motion_detail!r}; choose {' or '.join(get_args(Detail))}")
         check_eyes(self.eyes)

@@ -77,7 +77,7 @@ class LiveParts:
 
 def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
     """Create reconstructor and rasterizer of a live session. Their first use is slow (see `warm_up`)."""
-    return LiveParts(new_live_reconstructor(settings, source), Rasterizer(settings.renderer))
+    return LiveParts(new_live_reconstructor(settings, source), Rasterizer(settings.renderer, settings.renderer_options))
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
@@ -267,7 +267,7 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
         UserError: as `live` raises it before anything is written.
     """
     check_device(settings.device)
-    check_renderer(settings.renderer, settings.device)
+    check_renderer(settings.renderer, settings.device, options=settings.renderer_options)
     source = open_source(
         settings.source,
         SourceOptions(

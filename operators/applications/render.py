@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.combinations import check_outputs
 from gsplat_core.errors import InvalidSetting, RecordingError, UserError
 from gsplat_core.io.camera_path import read_camera_path
 from gsplat_core.io.files import PartialFile
@@ -39,6 +40,7 @@ from operators.applications.progress import Progress, ProgressCallback
 from operators.errors import OutputError
 from operators.layer_pictures import mark_unobserved
 from operators.output_folder import OutputFolder, check_file_path
+from operators.output_pictures import OutputPictures
 from operators.rasterize import displayed
 from operators.settings import check_option
 from operators.sinks.images import write_png
@@ -189,6 +191,7 @@ def render_model(
     device: str = "cpu",
     renderer: str = "alpha",
     options: RendererOptions | None = None,
+    outputs: Sequence[str] = ("image",),
     view: ViewWish = RECORDED,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
@@ -196,7 +199,7 @@ def render_model(
 ) -> int:
     """Render the model to a video file or a folder of PNG images.
 
-    All views except `recorded` hatch unobserved areas. An existing video is replaced only with `overwrite`, an
+    Several outputs are side by side. All views except `recorded` hatch unobserved areas. An existing video is replaced only with `overwrite`, an
     existing folder only if an earlier run made it. Either stays unchanged until the new one is complete.
 
     Args:
@@ -207,6 +210,7 @@ def render_model(
         device: `cpu` or `cuda`.
         renderer: name of the renderer.
         options: options of the renderer.
+        outputs: names of the renderer's outputs, as in `OUTPUTS`, or `image`, `alpha` and `depth`.
         view: camera path.
         overwrite: replace an existing video of this program.
         progress: called after each frame.
@@ -222,6 +226,7 @@ def render_model(
         OutputError: `out` cannot be written or must not be replaced.
     """
     check_option("scale", scale)
+    check_shown_outputs(renderer, outputs)
     frames_to_render((0, 0), fps)
     inputs = [bundle, *view.inputs]
     to_video = out.suffix.lower() == VIDEO_SUFFIX
@@ -232,29 +237,55 @@ def render_model(
     model = load_model(bundle).to(device)
     if is_scene_file(bundle) and view.name == RECORDED.name:  # a scene file contains no camera for the recorded view
         view = ViewWish("orbit")
+    camera = camera_at_scale(model, scale, device)
+    shown = view_of(model, camera, view)
+    across = shown.across * len(outputs)
+    check_width(across * camera.width_px)
+    frames = frames_to_render(shown.window_s, fps)
+    pictures = ViewPictures(model, shown, lambda: new_renderer(renderer, camera, device, options=options), outputs)
+    images = _images(pictures, frames, fps, progress, stop_requested)
+    if not to_video:
+        return _write_images(images, inputs, out)
+    if overwrite:
+        _check_not_trained_on(model, out)
+    return write_video(images, out, (across * camera.width_px, camera.height_px), fps, overwrite)
+
+
+def check_shown_outputs(renderer: str, outputs: Sequence[str]) -> None:
+    """Check the outputs to show.
+
+    Raises:
+        InvalidSetting: if there is none, one is repeated, or the renderer does not have one.
+    """
+    if not outputs or len({*outputs}) < len(outputs):
+        raise InvalidSetting(
+            f"outputs is {', '.join(outputs) or 'none'}; name one or more, each once, such as image,depth"
+        )
+    check_outputs(renderer, outputs)
+
+
+def camera_at_scale(model: Model, scale: float, device: str) -> Camera:
+    """Return the model's own camera with its picture resized.
+
+    Raises:
+        InvalidSetting: if the picture is too large, or there is not enough memory to render it.
+    """
     check_shown_size(model.camera.width_px, model.camera.height_px, scale)
     camera = model.camera.scaled(scale)
     check_picture(camera, scale)
     if device == "cpu":
         needed = render_bytes(camera.width_px, camera.height_px, model.parameter_count)
         require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
-    shown = view_of(model, camera, view)
-    check_width(shown.across * camera.width_px)
-    frames = frames_to_render(shown.window_s, fps)
-    pictures = _Pictures(model, shown, lambda: new_renderer(renderer, camera, device, options=options))
-    images = _images(pictures, frames, fps, progress, stop_requested)
-    if not to_video:
-        return _write_images(images, inputs, out)
-    if overwrite:
-        _check_not_trained_on(model, out)
-    return write_video(images, out, (shown.across * camera.width_px, camera.height_px), fps, overwrite)
+    return camera
 
 
-class _Pictures:
+class ViewPictures:
     """Renders a model from a view. Not thread-safe."""
 
-    def __init__(self, model: Model, view: View, make_renderer: Callable[[], Renderer]) -> None:
-        self.view = view
+    def __init__(
+        self, model: Model, view: View, make_renderer: Callable[[], Renderer], outputs: Sequence[str] = ("image",)
+    ) -> None:
+        self.view, self._outputs, self._drawn = view, tuple(outputs), OutputPictures()
         # The second of two pictures side by side is the right eye's.
         models = [model, model.seen_by_right()][: view.across]
         self._eyes = [make_renderer() for _ in models]
@@ -268,16 +299,23 @@ class _Pictures:
             return np.hstack([self._picture(renderer, camera, time_s) for renderer, camera in drawn])
 
     def _picture(self, renderer: Renderer, camera: Camera, time_s: float) -> NDArray[np.uint8]:
-        if not self.view.is_virtual:
+        if not self.view.is_virtual and self._outputs == ("image",):
             return displayed(renderer.render(camera, time_s, ("image",)).result().image)
-        output = renderer.render(camera, time_s, ("image", "alpha")).result()
-        image, alpha = np.array(displayed(output.image)), HostCopy(output.alpha).numpy()
-        mark_unobserved(image, alpha)
-        return image
+        found = renderer.render(camera, time_s, {"image", "alpha", *self._outputs}).outputs()
+        alpha = HostCopy(found["alpha"]).numpy()
+        pictures = []
+        for name in self._outputs:
+            if name == "image":
+                pictures.append(np.array(displayed(found["image"])))
+                if self.view.is_virtual:
+                    mark_unobserved(pictures[-1], alpha)
+            else:
+                pictures.append(self._drawn.picture(name, HostCopy(found[name].float()).numpy(), alpha))
+        return np.hstack(pictures)
 
 
 def _images(
-    pictures: _Pictures,
+    pictures: ViewPictures,
     count: int,
     fps: float,
     progress: ProgressCallback | None,

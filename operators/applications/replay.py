@@ -228,7 +228,7 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
         UserError: as `replay` raises it before anything is written.
     """
     check_device(settings.device)
-    check_renderer(settings.renderer, settings.device)
+    check_renderer(settings.renderer, settings.device, options=settings.renderer_options)
     config = settings.reconstructor_config(offline=offline)
     source = open_source(settings.recording, SourceOptions(settings.given_scale, settings.max_frames))
     description = source.description

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
+from operators.settings import JobOptions, LiveOptions, ReconstructOptions, RenderOptions, ReplayOptions
 from services.cli import service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
@@ -36,7 +36,6 @@ from services.cli.options import (
     RendererOption,
     RenderOutOption,
     SamplesOption,
-    ScaleOption,
     SceneArgument,
     SourceArgument,
     SupersamplingOption,
@@ -51,16 +50,12 @@ from services.cli.options import (
 from services.cli.terminal import sentence
 
 
+@takes_options(RenderOptions, "render")
 def render(
     model: ModelArgument,
     out: RenderOutOption,
-    fps: Annotated[float, typer.Option(help="Frames rendered per second of model time.")] = 30.0,
-    scale: ScaleOption = 1.0,
+    options: Mapping[str, Any],
     device: DeviceOption = "cpu",
-    renderer: RendererOption = "alpha",
-    samples: SamplesOption = None,
-    supersampling: SupersamplingOption = None,
-    order: OrderOption = None,
     view: Annotated[
         str, typer.Option(help="Camera: recorded, orbit, stereo (side by side), or a camera path (.json file).")
     ] = "recorded",
@@ -81,9 +76,9 @@ def render(
     if path is not None and view != "recorded":
         raise InvalidSetting(f"--view is {view!r:.80} and --path {str(path)!r:.80}; give one of them")
     wish = ViewWish(view if path is None else str(path), baseline)
-    chosen = {"scale": scale, "device": device, "renderer": renderer, "view": wish}
-    chosen["options"] = renderer_options(samples, supersampling, order)
-    return render_command(model, out, fps, overwrite=overwrite, as_json=json, **chosen)
+    return render_command(
+        model, out, RenderOptions(**options), device=device, view=wish, overwrite=overwrite, as_json=json
+    )
 
 
 def bench(
@@ -105,7 +100,7 @@ def bench(
     from operators.applications.bench import BenchSettings
     from services.cli.models import bench_command
 
-    options = renderer_options(samples, supersampling, order)
+    options = renderer_options(renderer, samples, supersampling, order)
     settings = BenchSettings(renderer, options, device, path, width, height, frames)
     return bench_command(model, settings, out, overwrite=overwrite, as_json=json)
 

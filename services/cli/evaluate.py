@@ -43,7 +43,7 @@ def scene_settings(options: EvaluateOptions) -> SceneSettings:
         options.scene,
         device=options.device,
         renderer=options.renderer,
-        options=renderer_options(options.samples, options.supersampling, options.order),
+        options=renderer_options(options.renderer, options.samples, options.supersampling, options.order),
         **{name: value for name, value in given.items() if value is not None},  # type: ignore[arg-type]
     )
 

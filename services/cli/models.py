@@ -27,16 +27,21 @@ from operators.applications.bench import BenchSettings, bench_model
 from operators.applications.render import render_model
 from operators.errors import OutputError
 from operators.output_folder import check_file_path
+from operators.settings import RenderOptions
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest
 from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack
 
 
-def render_command(model: Path, out: Path, fps: float, *, as_json: bool, **options: Any) -> int:
-    """Render a model and print the path of the result. `options` are passed to `render_model`."""
+def render_command(model: Path, out: Path, options: RenderOptions, *, as_json: bool, **further: Any) -> int:
+    """Render a model and print the path of the result. `further` are passed to `render_model`."""
+    fps = options.fps
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
-        frames = render_model(model, out, fps=fps, progress=progress, stop_requested=interrupt, **options)
+        frames = render_model(
+            model, out, fps=fps, scale=options.scale, renderer=options.renderer, options=options.renderer_options,
+            outputs=options.outputs, progress=progress, stop_requested=interrupt, **further,
+        )  # fmt: skip
     if as_json:
         typer.echo(
             json.dumps({"path": str(out), "frames": frames, "fps": fps, "interrupted": interrupt.requested}, indent=2)

@@ -14,7 +14,7 @@ import typer
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.plain_numbers import is_plain, plain_float
 from operators.options import Command, Declared, Section, options_for, options_of
-from operators.settings import ReplayOptions
+from operators.settings import RenderOptions, ReplayOptions
 
 
 def _path(text: str) -> Path:
@@ -105,16 +105,13 @@ BenchVideoOption = Annotated[Path | None, path_option("--out", "A video (name.mp
 RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a folder of images.")]
 
 
-def renderer_options(samples: int | None, supersampling: int | None, order: str | None, seed: int = 0) -> Any:
+def renderer_options(renderer: str, samples: int | None, supersampling: int | None, order: str | None) -> Any:
     """Return the `RendererOptions` of command line options; None stands for a renderer's default.
 
     Raises:
-        InvalidSetting: if a value is out of range.
+        InvalidSetting: if a value is out of range, or the renderer does not have the option.
     """
-    from gsplat_core.rendering.renderer import RendererOptions
-
-    given: dict[str, Any] = {"samples": samples, "supersampling": supersampling, "order": order}
-    return RendererOptions(seed=seed, **{name: value for name, value in given.items() if value is not None})
+    return RenderOptions(renderer=renderer, samples=samples, supersampling=supersampling, order=order).renderer_options  # type: ignore[arg-type]  # checked
 
 
 def help_of(each: Declared) -> str:
@@ -136,26 +133,15 @@ def _annotation(each: Declared) -> Any:
 def _shared(name: str) -> Any:
     """Return the typer declaration of an engine option, for a command whose other options are declared in this
     module."""
-    return typer.Option(help=help_of(options_of(ReplayOptions)[name]))
+    each = options_of(ReplayOptions)[name]
+    return typer.Option(help=help_of(each), show_default=each.option.null or True)
 
 
 DeviceOption = Annotated[str, _shared("device")]
 RendererOption = Annotated[str, _shared("renderer")]
-SamplesOption = Annotated[
-    int | None,
-    typer.Option(help="Random samples per pixel of a renderer that has them.", show_default="16"),
-]
-SupersamplingOption = Annotated[
-    int | None,
-    typer.Option(help="Sub-pixels per pixel and axis of a renderer that has them.", show_default="1"),
-]
-OrderOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Depth that decides what is in front: splat (of its centre) or pixel (of its plane at each pixel).",
-        show_default="splat",
-    ),
-]
+SamplesOption = Annotated[int | None, _shared("samples")]
+SupersamplingOption = Annotated[int | None, _shared("supersampling")]
+OrderOption = Annotated[str | None, _shared("order")]
 SeedOption = Annotated[int, _shared("seed")]
 ScaleOption = Annotated[float, _shared("scale")]
 MaxFramesOption = Annotated[int | None, _shared("max_frames")]

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gsplat_core.choices import RENDERERS
+from gsplat_core.errors import InvalidSetting
 from services.cli.ctl import ExpiresOption, KeyName, KeyStreamOption, RoleOption, ctl
 from services.cli.options import (
     DeviceOption,
@@ -143,7 +144,9 @@ def view(
     sampled = renderer is not None and renderer in RENDERERS and "samples" in RENDERERS[renderer].capabilities.options
     if sampled and samples is None:
         samples = 1  # the picture gains samples while the camera stands still
-    options = renderer_options(samples, supersampling, order)
+    if renderer is None and (samples, supersampling, order) != (None, None, None):
+        raise InvalidSetting("the browser draws the model without a renderer; give --renderer with its options")
+    options = renderer_options(renderer or "alpha", samples, supersampling, order)
     return view_command(model, host, port, plaintext=plaintext, renderer=renderer, options=options, device=device)
 
 

@@ -14,7 +14,7 @@ from services.settings import ResourceName, StreamSettings
 from services.settings.sections import masked_address
 
 MOST_OPTIONS = 50
-Option = str | int | FiniteFloat | bool | None
+Option = str | int | FiniteFloat | bool | list[str] | None
 
 
 class StreamOptions(BaseModel):

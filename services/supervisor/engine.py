@@ -289,7 +289,7 @@ def reconstruct(
 def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again: bool) -> None:
     """Run the live reconstruction, or wait while a finished model is displayed, until a stop is requested."""
     check_device(spec.device)
-    check_renderer(spec.renderer, spec.device)
+    check_renderer(spec.renderer, spec.device, options=spec.renderer_options)
     models = ModelShow(worker, spec, screen, layers)
     worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures(), **layers.figures()})
     worker.tell_measures("screen", lambda: {"ages": screen.ages.as_json()})

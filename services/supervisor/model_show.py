@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput, UserError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.rendering.registry import new_renderer
+from gsplat_core.rendering.renderer import RendererOptions
 from gsplat_core.scene.frames import Frame
 from operators.applications.limits import check_picture
 from operators.messages import PictureState
@@ -46,12 +47,21 @@ class FinishedModel:
         CommandRefused: if the warm-up picture is not finite.
     """
 
-    def __init__(self, folder: Path, name: str, version: int, *, device: str, renderer: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        version: int,
+        *,
+        device: str,
+        renderer: str,
+        options: RendererOptions | None = None,
+    ) -> None:
         self.name, self.version = name, version
         self._model = load_bundle(folder).to(device)
         self._camera = self._model.camera
         check_picture(self._camera, 1.0)
-        self._renderer = new_renderer(renderer, self._camera, torch.device(device))
+        self._renderer = new_renderer(renderer, self._camera, torch.device(device), options=options)
         self._renderer.prepare(self._model)
         try:
             self.picture(0.0)
@@ -173,7 +183,10 @@ class ModelShow:
             raise BadMessage(f"most_ms is {most_ms!r:.40}; give milliseconds, or leave it out")
         with self._changing:
             began_s = time.monotonic()
-            model = FinishedModel(Path(folder), name, version, device=self._spec.device, renderer=self._spec.renderer)
+            model = FinishedModel(
+                Path(folder), name, version,
+                device=self._spec.device, renderer=self._spec.renderer, options=self._spec.renderer_options,
+            )  # fmt: skip
             asked = {"folder": folder, "version": version, "name": name, "most_ms": most_ms}
             with self._lock:
                 self._previous = self._current

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, RENDERERS
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS
 from operators.options import options_for
@@ -147,6 +147,56 @@ def test_losses_with_and_without_weights_are_accepted(value, given):
     assert wanted.options.losses == losses
 
 
+@pytest.mark.parametrize("name", LOSSES)
+def test_every_loss_is_accepted_everywhere(name, given, tmp_path):
+    for command in KINDS:
+        assert given(command, "--losses", name).losses == (name,)
+    wanted = ReplayRequest.model_validate({"recording": "a", "options": {"losses": [name]}})
+    assert JobOptions(**json.loads(json.dumps(wanted.options.chosen()))).losses == (name,)
+    for value in (name, [name]):
+        asked = StreamRequest.model_validate({"name": "a", "source": "synthetic:", "options": {"losses": value}})
+        assert specs_of("a", asked)["engine"].engine.losses == (name,)
+
+
+RENDERED = [("samples", 3), ("supersampling", 2), ("order", "pixel")]
+
+
+@pytest.mark.parametrize(("option", "value"), [*RENDERED, ("progressive", True)])
+def test_the_options_of_a_renderer_are_accepted_everywhere(option, value, given):
+    options = {"renderer": "stochastic", option: value}
+    if option != "progressive":
+        for command in KINDS:
+            words = [word for name, each in options.items() for word in (f"--{name}", str(each))]
+            assert getattr(given(command, *words).renderer_options, option) == value
+        wanted = ReplayRequest.model_validate({"recording": "a", "options": options})
+        stored = JobOptions(**json.loads(json.dumps(wanted.options.chosen())))
+        assert getattr(stored.renderer_options, option) == value
+    asked = StreamRequest.model_validate({"name": "a", "source": "synthetic:", "options": options})
+    assert getattr(specs_of("a", asked)["engine"].engine.renderer_options, option) == value
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"samples": 4}, "choose renderer stochastic or points, or leave samples out"),
+        ({"renderer": "points", "order": "pixel"}, "choose renderer stochastic, or leave order out"),
+        ({"renderer": "weighted_sum", "losses": ["flow"]}, "choose renderer alpha, or leave the losses flow out"),
+    ],
+)
+def test_a_combination_that_does_not_work_is_refused_everywhere_with_one_that_does(options, message, tmp_path):
+    with pytest.raises(InvalidSetting, match=message):
+        ReplayOptions(**options)
+    with pytest.raises(ValidationError, match=message):
+        ReplayRequest.model_validate({"recording": "a", "options": options})
+    with pytest.raises(ValidationError, match=message):
+        StreamRequest.model_validate({"name": "a", "source": "synthetic:", "options": options})
+    (tmp_path / "settings.yaml").write_text(
+        json.dumps({"streams": {"a": {"source": "synthetic:", "options": options}}})
+    )
+    with pytest.raises(SettingsInvalid, match=message):
+        load_settings(tmp_path / "settings.yaml")
+
+
 @pytest.mark.parametrize(
     ("value", "message"), [("nope", "choose photometric"), ("depth:x", "as in depth:0.1"), ("depth:0", "positive")]
 )
@@ -175,7 +225,9 @@ def test_every_source_has_a_rule():
     assert set(SOURCES) == known
 
 
-@pytest.mark.parametrize("registry", [FIELDS, RENDERERS, DEPTHS, TOOL_MASKS, SINKS], ids=lambda each: each.what)
+@pytest.mark.parametrize(
+    "registry", [FIELDS, RENDERERS, LOSSES, OUTPUTS, DEPTHS, TOOL_MASKS, SINKS], ids=lambda each: each.what
+)
 def test_every_entry_can_be_imported(registry):
     for name in registry:
         assert registry[name] is not None

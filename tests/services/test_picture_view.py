@@ -15,10 +15,10 @@ import torch
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.models.model import TrainedBy
-from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, RendererOptions
+from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Capabilities, FinishedFrame, RendererOptions
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT
-from services.picture_view import MOST_SAMPLES, Pictures, PictureView, Viewpoint
+from services.picture_view import Pictures, PictureView, Viewpoint
 from tests.services.supervisor.test_model_show import uniform
 
 STILL = {"azimuth": 0, "elevation": 0, "distance": 1, "right": 0, "down": 0, "time": 1, "width": 64, "height": 48}
@@ -90,7 +90,7 @@ def test_samples_add_up_while_the_camera_stands_still(counter):
     with served("counter", samples=3) as view:
         drawn = [picture(view, **changed)[1]["X-Samples"] for changed in ({}, {}, {"azimuth": 5}, {"azimuth": 5}, {})]
         assert drawn == ["3", "6", "3", "6", "3"]
-    with served("counter", samples=MOST_SAMPLES) as view:
+    with served("counter", samples=PROGRESSIVE_SAMPLES) as view:
         assert picture(view)[1]["X-Complete"] == "1"
 
 
@@ -145,7 +145,7 @@ def test_a_taken_port_is_named():
     ("words", "reason"),
     [
         (["--samples", "4"], "give --renderer with its options"),
-        (["--renderer", "none"], "unknown renderer"),
+        (["--renderer", "none"], "renderer is 'none'; choose alpha"),
         (["--renderer", "alpha", "--samples", "4"], "no option samples"),
     ],
 )

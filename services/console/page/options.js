@@ -61,7 +61,7 @@ function fieldOf(schema) {
     field.min = number.minimum ?? number.exclusiveMinimum ?? "";
     field.max = number.maximum ?? number.exclusiveMaximum ?? "";
   } else {
-    field.title = [...words, ...(list?.items.enum ?? [])].join(", ");
+    field.title = [...words, ...(list?.items.enum ?? list?.items.anyOf?.[0].enum ?? [])].join(", ");
     field.autocomplete = "off";
   }
   return field;

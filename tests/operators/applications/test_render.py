@@ -36,6 +36,30 @@ def test_a_stop_leaves_whole_frames(bundle, tmp_path):
     assert written == 3 and (tmp_path / "v.mp4").stat().st_size > 0
 
 
+def test_outputs_are_side_by_side(bundle, model, tmp_path):
+    camera = model().camera
+    render_model(bundle, tmp_path / "images", fps=1, outputs=("image", "normals", "ray_depth"))
+    shown = cv2.imread(str(tmp_path / "images" / "000000.png"))
+    assert shown.shape == (camera.height_px, 3 * camera.width_px, 3)
+    render_model(bundle, tmp_path / "plain", fps=1)
+    assert (shown[:, : camera.width_px] == cv2.imread(str(tmp_path / "plain" / "000000.png"))).all()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ({"outputs": ()}, "outputs is none"),
+        ({"outputs": ("depth", "depth")}, "each once"),
+        ({"outputs": ("normals",), "renderer": "points"}, "choose renderer alpha"),
+        ({"outputs": ("semantics",)}, "train with --losses semantics"),
+    ],
+)
+def test_outputs_that_cannot_be_shown_are_refused(bundle, tmp_path, wanted, message):
+    with pytest.raises(InvalidSetting, match=message):
+        render_model(bundle, tmp_path / "images", **wanted)
+    assert not (tmp_path / "images").exists()
+
+
 @pytest.mark.cuda
 def test_a_gpu_renders_the_same_pictures(gpu, bundle, tmp_path):
     for device in ("cpu", "cuda"):

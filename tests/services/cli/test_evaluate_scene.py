@@ -87,7 +87,7 @@ def test_smaller_images_are_compared_with_smaller_pictures(scene, capsys):
         (["--scene", "{scene}", "--images", "images_8"], "images_8"),
         (["--scene", "{scene}", "--every", "0"], "every is 0"),
         (["--scene", "{scene}", "--samples", "2"], "no option samples"),
-        (["--scene", "{scene}", "--renderer", "none"], "unknown renderer"),
+        (["--scene", "{scene}", "--renderer", "none"], "renderer is 'none'; choose alpha"),
     ],
 )
 def test_a_wrong_option_is_one_sentence(scene, capsys, words, reason):

@@ -1,0 +1,66 @@
+"""Combinations of renderer, options, outputs and losses that are refused, each with one that works."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsplat_core.choices import LOSSES, RENDERERS
+from gsplat_core.combinations import (
+    OF_EVERY_STEP,
+    OPTIONS,
+    OUTPUTS_OF,
+    OWN_OPACITIES,
+    check_losses,
+    check_outputs,
+    check_renderer_options,
+)
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.config import ReconstructorConfig
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_the_tables_state_what_the_renderers_state(name):
+    capabilities = RENDERERS[name].capabilities
+    assert {*OPTIONS[name]} == {*capabilities.options}
+    assert {*OUTPUTS_OF[name]} == {*capabilities.outputs}
+
+
+def test_every_registered_renderer_is_in_the_tables():
+    assert set(OPTIONS) == set(OUTPUTS_OF) == set(RENDERERS)
+
+
+@pytest.mark.parametrize("renderer", OPTIONS)
+@pytest.mark.parametrize("option", ["samples", "order", "progressive"])
+def test_an_option_that_a_renderer_lacks_is_refused_with_a_renderer_that_has_it(renderer, option):
+    if option in OPTIONS[renderer]:
+        check_renderer_options(renderer, [option])
+        return
+    with pytest.raises(InvalidSetting, match=f"no option {option}; choose renderer stochastic"):
+        check_renderer_options(renderer, [option])
+
+
+@pytest.mark.parametrize("renderer", OUTPUTS_OF)
+def test_an_output_that_a_renderer_lacks_is_refused_with_those_that_it_has(renderer):
+    check_outputs(renderer, OUTPUTS_OF[renderer])
+    if renderer != "alpha":
+        with pytest.raises(
+            InvalidSetting, match="no output 'normals'; choose renderer alpha, or take the outputs image"
+        ):
+            check_outputs(renderer, ["depth", "normals"])
+
+
+def test_a_renderer_of_another_package_is_checked_when_it_is_created():
+    check_renderer_options("another", ["samples"])
+    check_outputs("another", ["heat"])
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weighted_sums_are_trained_with_the_losses_of_every_step_only(loss):
+    for renderer in RENDERERS:
+        if renderer in OWN_OPACITIES and loss not in OF_EVERY_STEP:
+            with pytest.raises(InvalidSetting, match="choose renderer alpha, or leave the losses"):
+                check_losses(renderer, [f"{loss}:0.5"])
+            with pytest.raises(InvalidSetting, match="choose renderer alpha"):
+                ReconstructorConfig(renderer=renderer, losses=(loss,))
+        else:
+            check_losses(renderer, [loss])

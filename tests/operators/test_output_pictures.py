@@ -1,0 +1,73 @@
+"""False colours of a renderer's outputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.choices import OUTPUTS
+from gsplat_core.errors import InvalidSetting
+from operators.layer_pictures import UNOBSERVED
+from operators.output_pictures import CLASS_COLOURS, OutputPictures, class_colours, flow_colours, normal_colours
+
+SEEN = np.ones((2, 3), np.float32)
+
+
+def field(*vector: float) -> np.ndarray:
+    return np.broadcast_to(np.asarray(vector, np.float32), (2, 3, len(vector)))
+
+
+@pytest.mark.parametrize(
+    ("normal", "colour"),
+    [
+        ((0, 0, -1), (128, 128, 255)),
+        ((1, 0, 0), (255, 128, 128)),
+        ((0, -1, 0), (128, 255, 128)),
+        ((0, 0, 0), (0, 0, 0)),
+    ],
+)
+def test_normals_have_the_usual_colours(normal, colour):
+    assert normal_colours(field(*normal))[1, 1].tolist() == list(colour)
+
+
+@pytest.mark.parametrize(
+    ("flow", "colour"),
+    [((0, 0), (255, 255, 255)), ((2, 0), (255, 0, 0)), ((-2, 0), (0, 255, 255)), ((1, 0), (255, 128, 128))],
+)
+def test_flow_has_the_hue_of_its_direction(flow, colour):
+    assert flow_colours(field(*flow), 2.0)[0, 0].tolist() == list(colour)
+
+
+def test_a_still_scene_stays_pale():
+    assert flow_colours(field(0.02, 0), 0.02).min() > 230
+
+
+def test_a_class_has_one_colour():
+    assert class_colours(field(0.0, 3.0, 1.0))[0, 0].tolist() == CLASS_COLOURS[1].tolist()
+    with pytest.raises(InvalidSetting, match="train with --losses semantics"):
+        class_colours(np.zeros((2, 3, 0), np.float32))
+
+
+@pytest.mark.parametrize("name", ["depth", *OUTPUTS])
+def test_unobserved_pixels_look_unobserved_in_every_output(name):
+    channels = {"semantics": 4}.get(name) or OUTPUTS[name].channels if name != "depth" else 1
+    values = np.full((30, 40) if channels == 1 else (30, 40, channels), 0.5, np.float32)
+    alpha = np.ones((30, 40), np.float32)
+    alpha[:, 20:] = 0
+    image = OutputPictures().picture(name, values, alpha)
+    assert image.shape == (30, 40, 3) and image.dtype == np.uint8
+    assert (image[:, 20:] == UNOBSERVED).all(-1).mean() > 0.5
+    assert not (image[:, :20] == UNOBSERVED).all(-1).any()
+
+
+def test_near_surfaces_are_warm():
+    depth = np.broadcast_to(np.linspace(50, 80, 32, dtype=np.float32), (8, 32)).copy()
+    image = OutputPictures().picture("ray_depth", depth, np.ones_like(depth)).astype(int)
+    assert image[0, 1, 0] > image[0, 1, 2] and image[0, -2, 2] > image[0, -2, 0]
+
+
+def test_spread_keeps_its_range_over_the_pictures():
+    pictures = OutputPictures()
+    first = pictures.picture("spread", SEEN, SEEN)
+    second = pictures.picture("spread", 0.5 * SEEN, SEEN)
+    assert (first != second).any(), "half the spread has another colour than all of it before"
