@@ -251,6 +251,44 @@ def render_model(
     return write_video(images, out, (across * camera.width_px, camera.height_px), fps, overwrite)
 
 
+def render_picture(
+    bundle: Path,
+    time_s: float | None = None,
+    *,
+    scale: float = 1.0,
+    device: str = "cpu",
+    renderer: str = "alpha",
+    options: RendererOptions | None = None,
+    outputs: Sequence[str] = ("image",),
+    view: ViewWish = RECORDED,
+) -> NDArray[np.uint8]:
+    """Render the model at one time.
+
+    Args:
+        bundle: the saved model.
+        time_s: time in seconds, inside of the model's window; None for its end.
+        scale, device, renderer, options, outputs, view: as for `render_model`.
+
+    Returns:
+        The outputs side by side, uint8 RGB [H, W, 3].
+
+    Raises:
+        BundleError, DeviceMissing, InvalidSetting: as for `render_model`, or if the time is outside of the window.
+    """
+    check_shown_outputs(renderer, outputs)
+    check_device(device)
+    check_renderer(renderer, device, options=options)
+    model = load_model(bundle).to(device)
+    time_s = model.time_window_s[1] if time_s is None else time_s
+    model.check_time(time_s)
+    camera = camera_at_scale(model, scale, device)
+    shown = view_of(model, camera, view)
+    check_width(shown.across * len(outputs) * camera.width_px)
+    return ViewPictures(model, shown, lambda: new_renderer(renderer, camera, device, options=options), outputs).at(
+        time_s
+    )
+
+
 def check_shown_outputs(renderer: str, outputs: Sequence[str]) -> None:
     """Check the outputs to show.
 

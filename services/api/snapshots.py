@@ -20,12 +20,13 @@ from services.api.problems import Forbidden, Unprocessable, problem_answer
 from services.api.state import IdempotencyKey, control_of, part
 from services.api.streams import streams_of
 from services.exports.cache import ALL
-from services.schemas.models import VersionView
+from services.exports.renderings import PICTURES
+from services.schemas.models import RenderRequest, VersionView
 from services.schemas.streams import SnapshotRequest, SnapshotView
 from services.settings import ResourceName
 
 if TYPE_CHECKING:
-    from services.exports.cache import Exported
+    from services.exports.cache import Exported, Wish
     from services.exports.snapshots import ModelExports, StreamSnapshots
 
 router = new_router("snapshots")
@@ -157,6 +158,31 @@ async def export_model(
     return await _answer(request, caller, "model.export", subject, wish, lambda: exports.of_version(name, number, wish))
 
 
+RENDERED: dict[int | str, dict[str, object]] = {
+    200: {
+        **ANSWER[200],
+        "description": "The picture or video.",
+        "content": {each.media_type: BINARY for each in PICTURES.values()},
+    }
+}
+
+
+@exports_router.post(
+    "/models/{name}/versions/{number}/render",
+    response_class=Response,
+    responses={**RENDERED, 409: problem_answer("The version is not checked yet, or was rejected.")},
+)
+@requires("operator")
+async def render_model(
+    request: Request, caller: CallerOf, name: ResourceName, number: Number, wanted: RenderRequest
+) -> Response:
+    """Render a checked version of a model. A separate process renders on the CPU, and later requests use the cached
+    file."""
+    exports, wish = exports_of(request), wanted.wish()
+    subject = f"{name}/{number}"
+    return await _answer(request, caller, "model.render", subject, wish, lambda: exports.of_version(name, number, wish))
+
+
 @exports_router.get("/streams/{name}/snapshots/{number}/exports/{format}", response_class=Response, responses=ANSWER)
 @requires("operator", scope="stream")
 async def export_snapshot(
@@ -191,7 +217,7 @@ def _wish(name: FormatName, time_s: float | None, times: int | None) -> ExportWi
 
 
 async def _answer(
-    request: Request, caller: CallerOf, event: str, subject: str, wish: ExportWish, make: Callable[[], Exported]
+    request: Request, caller: CallerOf, event: str, subject: str, wish: Wish, make: Callable[[], Exported]
 ) -> Response:
     async with recorded(request, caller, event, subject, {"format": wish.format.name}) as said:
         made = await asyncio.to_thread(make)

@@ -25,7 +25,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import format_of
 from gsplat_core.io.files import read_regular
 from services.cli.exit_codes import OK
-from services.cli.options import ExportedFileArgument, JsonOption, takes_run_options
+from services.cli.options import ExportedFileArgument, JsonOption, path_argument, takes_run_options
 from services.cli.terminal import KEY_COLUMNS, Columns, printable, table
 
 if TYPE_CHECKING:
@@ -305,6 +305,34 @@ def export(
 
     def act(client: Any) -> int:
         return client.export_version(name, version, wanted, file, overwrite=overwrite, time_s=time, times=times)
+
+    service(act)
+    typer.echo(str(file))
+    return OK
+
+
+@command("render")
+def render(
+    name: ModelName,
+    version: Annotated[int, typer.Argument(min=1, show_default=False)],
+    file: Annotated[Path, path_argument("FILE", "A picture (.png) or a video (.mp4).")],
+    view: Annotated[str, typer.Option(help="Camera: recorded, orbit or stereo (side by side).")] = "recorded",
+    time: TimeOption = None,
+    option: OptionsOption = None,
+    service: Service = Service(),
+    overwrite: OverwriteOption = False,
+) -> int:
+    """Render a version of a model to a picture or a video, with options of `intrasplat render`."""
+    suffix = file.suffix.lower()
+    if suffix not in (".png", ".mp4"):
+        raise InvalidSetting(f"{file.name} ends in neither .png nor .mp4; give such a name")
+    options = assigned(option or ())
+    check_download(file, overwrite)
+
+    def act(client: Any) -> int:
+        return client.render_version(
+            name, version, suffix[1:], file, overwrite=overwrite, view=view, time_s=time, options=options
+        )
 
     service(act)
     typer.echo(str(file))

@@ -151,6 +151,37 @@ class SnapshotMethods(Requests):
         """
         return self._download(f"/v1/models/{name}/versions/{number}/exports/{format_name}", file, wish, overwrite)
 
+    def render_version(
+        self,
+        name: str,
+        number: int,
+        format_name: str,
+        file: Path,
+        overwrite: bool = False,
+        *,
+        view: str = "recorded",
+        time_s: float | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> int:
+        """Render a version of a model to a picture (`png`) or a video (`mp4`).
+
+        Args:
+            name: name of the model.
+            number: the version.
+            format_name: `png` or `mp4`.
+            file: path of the result.
+            overwrite: replace an existing file.
+            view: `recorded`, `orbit` or `stereo`.
+            time_s: time of a picture in seconds; None for the end of the model's window.
+            options: options of `intrasplat render`, such as `outputs`, by name.
+
+        Returns:
+            Size of the file.
+        """
+        wanted = {"format": format_name, "view": view, "time_s": time_s, "options": dict(options or {})}
+        path = f"/v1/models/{name}/versions/{number}/render"
+        return self._get_file(path, file, overwrite=overwrite, method="POST", json=wanted, timeout=EXPORT_S)
+
     def export_snapshot(
         self, stream: str, number: str, format_name: str, file: Path, overwrite: bool = False, **wish: Any
     ) -> int:

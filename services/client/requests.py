@@ -180,7 +180,7 @@ class Requests:
         except OSError as error:
             raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
 
-    def _get_file(self, path: str, file: Path, *, overwrite: bool = False, **options: Any) -> int:
+    def _get_file(self, path: str, file: Path, *, overwrite: bool = False, method: str = "GET", **options: Any) -> int:
         """Download an answer's body to a file, atomically, verifying the stated length and digest.
 
         Returns:
@@ -192,7 +192,10 @@ class Requests:
         if os.path.lexists(file) and not overwrite:
             raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it")
         try:
-            with PartialFile(file, overwrite=overwrite) as partial, self._http.stream("GET", path, **options) as answer:
+            with (
+                PartialFile(file, overwrite=overwrite) as partial,
+                self._http.stream(method, path, **options) as answer,
+            ):
                 if not answer.is_success:
                     raise refused_by(_with_body(answer, _read_some(answer)), self.url)
                 sha256 = hashlib.sha256()

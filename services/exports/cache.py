@@ -23,6 +23,7 @@ from typing import BinaryIO
 
 from gsplat_core.io.exports.formats import FORMATS, ExportFormat, ExportWish
 from services.errors import ExportBusy, ExportFailed, ExportRefused
+from services.exports.renderings import RenderWish
 from services.registry.bundle_file import SUFFIX
 
 ISPLAT = ExportFormat("isplat", SUFFIX, "application/octet-stream")
@@ -30,8 +31,14 @@ ISPLAT = ExportFormat("isplat", SUFFIX, "application/octet-stream")
 ALL: Mapping[str, ExportFormat] = {**FORMATS, ISPLAT.name: ISPLAT}
 
 
-def arguments_of(wish: ExportWish) -> list[str]:
+Wish = ExportWish | RenderWish
+
+
+def arguments_of(wish: Wish) -> list[str]:
     """Return the command line arguments of the export program."""
+    if isinstance(wish, RenderWish):
+        wanted = {"view": wish.view, "time_s": wish.time_s, "options": wish.options.chosen()}
+        return [f"--format={wish.format.name}", f"--render={json.dumps(wanted, sort_keys=True)}"]
     given = {"--time": wish.time_s, "--times": wish.times}
     named = [f"{name}={value!r}" for name, value in given.items() if value is not None]
     return [f"--format={wish.format.name}", *named]
@@ -55,7 +62,7 @@ class ExportPrograms:
         self._running: set[subprocess.Popen[bytes]] = set()
         self._ended = False
 
-    def make(self, folder: Path, file: Path, wish: ExportWish) -> None:
+    def make(self, folder: Path, file: Path, wish: Wish) -> None:
         """Create one file from an unpacked model; blocks.
 
         Raises:
@@ -76,7 +83,9 @@ class ExportPrograms:
                 try:
                     code = process.wait(self._most_s)
                 except subprocess.TimeoutExpired:
-                    raise ExportFailed(f"the export took longer than {self._most_s:g} s; ask for fewer times") from None
+                    raise ExportFailed(
+                        f"the export took longer than {self._most_s:g} s; ask for fewer times, frames or samples, or a smaller picture"
+                    ) from None
                 finally:
                     _kill(process)
             said.seek(max(0, said.seek(0, os.SEEK_END) - 2000))
@@ -115,7 +124,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-REVISION = 1
+REVISION = 2
 """Version of the exporters' output. Increment when the same model gives other bytes."""
 MOST_BYTES = 2 << 30
 AT_ONCE = 1
@@ -157,7 +166,7 @@ class ExportCache:
         for left in folder.glob("new-*"):
             shutil.rmtree(left)
 
-    def get(self, digest: str, folder_of: Callable[[], Path], wish: ExportWish) -> Exported:
+    def get(self, digest: str, folder_of: Callable[[], Path], wish: Wish) -> Exported:
         """Return an export of the model with this digest, creating it if missing.
 
         Args:
@@ -170,9 +179,7 @@ class ExportCache:
             ExportBusy: if too many exports wait.
             ExportFailed: if the program or the disk fails.
         """
-        key = hashlib.sha256(
-            json.dumps([REVISION, digest, wish.format.name, wish.time_s, wish.times]).encode()
-        ).hexdigest()
+        key = hashlib.sha256(json.dumps([REVISION, digest, *arguments_of(wish)]).encode()).hexdigest()
         with self._queued(), self._lock_of(key):
             found = self._open(key)
             if found is None:
@@ -221,7 +228,7 @@ class ExportCache:
             os.utime(self._folder / f"{key}.data")
             return Exported(file, about["sha256"], about["size_bytes"])
 
-    def _make(self, key: str, source: Path, wish: ExportWish) -> None:
+    def _make(self, key: str, source: Path, wish: Wish) -> None:
         new = self._folder / f"new-{secrets.token_hex(8)}"
         try:
             new.mkdir(mode=0o700)

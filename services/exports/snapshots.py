@@ -24,7 +24,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.files import sync_folder, write_durably
 from services.errors import CommandRefused, Conflict, ExportFailed, NoSnapshot, Rejected
-from services.exports.cache import ExportCache, Exported
+from services.exports.cache import ExportCache, Exported, Wish
 from services.registry.bundle_file import SUFFIX, pack
 from services.registry.models import ModelRegistry
 from services.registry.records import State, VersionRecord
@@ -211,7 +211,7 @@ class StreamSnapshots:
         self._store.delete(stream, number)
 
 
-def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
+def refuse_outside(wish: Wish, window_s: Sequence[float]) -> None:
     """Refuse times outside the model's window before an export process is started.
 
     Raises:
@@ -238,8 +238,8 @@ class ModelExports:
         finally:
             await asyncio.to_thread(self._cache.close)
 
-    def of_version(self, name: str, number: int, wish: ExportWish) -> Exported:
-        """Export a checked model version.
+    def of_version(self, name: str, number: int, wish: Wish) -> Exported:
+        """Export or render a checked model version.
 
         Raises:
             RegistryError: if the version does not exist.

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from datetime import datetime
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from operators.settings import CallerRenderOptions
+from services.exports.renderings import PICTURES, RenderWish
 
 
 class VersionView(BaseModel):
@@ -27,6 +31,36 @@ class ModelView(BaseModel):
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["liver"])
     active: int | None = Field(examples=[3])
+
+
+class RenderRequest(BaseModel):
+    """Rendering of a model: a picture at one time, or a video over its time window."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"format": "png", "options": {"outputs": ["image", "normals"]}}]},
+    )
+    format: Literal["png", "mp4"] = "png"
+    view: Literal["recorded", "orbit", "stereo"] = Field(
+        "recorded", description="Camera: the model's own, an orbit, or a stereo pair side by side."
+    )
+    time_s: FiniteFloat | None = Field(
+        None,
+        ge=-1e9,
+        le=1e9,
+        description="Time of a picture within the model's time window, in seconds. Default: the end of the window.",
+        examples=[0.5],
+    )
+    options: CallerRenderOptions = CallerRenderOptions()
+
+    @model_validator(mode="after")
+    def _picture_or_video(self) -> RenderRequest:
+        self.wish()
+        return self
+
+    def wish(self) -> RenderWish:
+        """Return the request for the export program."""
+        return RenderWish(PICTURES[self.format], self.options, self.view, self.time_s)
 
 
 class Activation(BaseModel):

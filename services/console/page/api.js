@@ -58,6 +58,11 @@ export async function fetched(path) {
   return ask("GET", path);
 }
 
+/** Send a request with a JSON body and return the response, whose body is a file. Throws like `call`. */
+export async function posted(path, body) {
+  return ask("POST", path, body);
+}
+
 /** Return the URL of a path with a ticket, for requests that cannot send a header. A ticket is short-lived and valid once. */
 export async function useTicket(path) {
   const { ticket } = await call("POST", "/v1/tickets", { path });

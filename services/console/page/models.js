@@ -1,8 +1,9 @@
 // The page of models: upload, activate, roll back, delete.
 
-import { call, upload } from "./api.js";
+import { call, posted, upload } from "./api.js";
 import { confirmed } from "./dialogs.js";
 import { exportControls } from "./exports.js";
+import { chosenOptions, offerOptions } from "./options.js";
 import { button, digest, replaceRows, row, size } from "./table.js";
 import { when } from "./times.js";
 
@@ -38,6 +39,7 @@ export function modelsPage(report) {
       if (sure) await then(() => call("DELETE", `${path}/versions/${version.version}`))();
     }, report, `Delete version ${version.version} of the model ${model.name}`));
     if (["ready", "active", "retired"].includes(version.state)) {
+      actions.push(button("Picture", () => choose(model.name, version.version), report, `Picture or video of ${model.name} ${version.version}`));
       actions.push(...exportControls(`${path}/versions/${version.version}`, `${model.name} ${version.version}`, report));
     }
     const state = version.reason ? `${version.state}: ${version.reason}` : version.state;
@@ -60,6 +62,43 @@ export function modelsPage(report) {
       }
     });
   });
+
+  let chosen = { path: "", file: "" }, address = "";
+
+  /** Open the form that renders a version. */
+  async function choose(name, version) {
+    await offerOptions(at("render-options"), "RenderRequest");
+    chosen = { path: `/v1/models/${name}/versions/${version}/render`, file: `${name}-${version}` };
+    at("render-name").textContent = `${name}/${version}`;
+    at("render").hidden = false;
+    at("render").scrollIntoView({ block: "nearest" });
+  }
+
+  at("render-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    report(async () => {
+      const format = at("render-format").value, time = at("render-time").value;
+      const wanted = { format, view: at("render-view").value, options: chosenOptions(at("render-options")) };
+      if (time !== "" && format === "png") wanted.time_s = Number(time);
+      at("render-said").value = "rendering";
+      try {
+        show(format, await (await posted(chosen.path, wanted)).blob());
+      } finally {
+        at("render-said").value = "";
+      }
+    });
+  });
+
+  function show(format, file) {
+    if (address) URL.revokeObjectURL(address);
+    address = URL.createObjectURL(file);
+    const picture = at("render-picture"), video = at("render-video"), save = at("render-save");
+    picture.hidden = format !== "png";
+    video.hidden = format !== "mp4";
+    if (format === "png") picture.src = address;
+    else video.src = address;
+    Object.assign(save, { href: address, download: `${chosen.file}.${format}`, hidden: false });
+  }
 
   /** Wait until the server has checked a version. Throws if it is rejected. */
   async function checked({ name, version }) {

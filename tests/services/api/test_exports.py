@@ -6,10 +6,13 @@ import base64
 import hashlib
 import io
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from control_fakes import FakeVersion, NotThere, fake_parts
 
+from gsplat_core.choices import OUTPUTS, RENDERERS
+from gsplat_core.combinations import OUTPUTS_OF, STANDARD
 from services.api.problems import Conflicting
 
 STREAM = "/v1/streams/endoscope"
@@ -50,9 +53,11 @@ class FakeSnapshots:
 class FakeExports:
     def __init__(self) -> None:
         self.asked: list[tuple] = []
+        self.wishes: list[Any] = []
 
     def of_version(self, name, number, wish):
-        self.asked.append((name, number, wish.format.name, wish.time_s, wish.times))
+        self.wishes.append(wish)
+        self.asked.append((name, number, wish.format.name, wish.time_s, getattr(wish, "times", None)))
         return SimpleNamespace(file=io.BytesIO(DATA), sha256=hashlib.sha256(DATA).hexdigest(), size_bytes=len(DATA))
 
     of_snapshot = of_version
@@ -132,6 +137,48 @@ def test_an_export_is_a_file_with_its_digest(plane, path, name):
     assert plane.events()[-1][0] in ("model.export", "snapshot.export") and plane.events()[-1][2] == "done"
 
 
+def test_a_model_is_rendered_with_the_options_of_the_command_line(plane):
+    options = {"renderer": "stochastic", "samples": 4, "order": "pixel", "seed": 3, "outputs": ["image", "depth"]}
+    wanted = {"format": "png", "view": "orbit", "time_s": 0.5, "options": options}
+    answer = plane.ask("POST", "/v1/models/liver/versions/3/render", "operator", json=wanted)
+    assert answer.status_code == 200 and answer.content == DATA
+    assert answer.headers["Content-Type"] == "image/png"
+    assert answer.headers["Content-Disposition"] == 'attachment; filename="liver-3.png"'
+    wish = plane.parts.exports.wishes[-1]
+    assert (wish.view, wish.time_s, wish.options.outputs) == ("orbit", 0.5, ("image", "depth"))
+    assert wish.options.chosen() == options
+    assert plane.events()[-1] == ("model.render", "liver/3", "done")
+
+
+@pytest.mark.parametrize("output", [*STANDARD, *OUTPUTS])
+def test_every_output_can_be_asked_for(plane, output):
+    path, options = "/v1/models/liver/versions/3/render", {"outputs": [output]}
+    assert plane.ask("POST", path, json={"options": options}).status_code == 200
+    assert plane.parts.exports.wishes[-1].options.outputs == (output,)
+    for renderer in RENDERERS:
+        answer = plane.ask("POST", path, json={"options": {**options, "renderer": renderer}})
+        assert answer.status_code == (200 if output in OUTPUTS_OF[renderer] else 422)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"format": "gif"}, "png"),
+        ({"format": "mp4", "time_s": 0.5}, "leave the time out"),
+        ({"options": {"samples": 4}}, "choose renderer stochastic or points"),
+        ({"options": {"renderer": "points", "outputs": ["normals"]}}, "choose renderer alpha"),
+        ({"options": {"renderer": "points", "samples": 100_000}}, "1024"),
+        ({"options": {"scale": 100}}, "4"),
+        ({"options": {"device": "cuda"}}, "device"),
+        ({"view": "/etc/passwd"}, "recorded"),
+    ],
+)
+def test_a_rendering_that_makes_no_sense_is_refused(plane, wrong, message):
+    answer = plane.ask("POST", "/v1/models/liver/versions/3/render", json=wrong)
+    assert answer.status_code == 422 and message in answer.text
+    assert not plane.parts.exports.wishes
+
+
 @pytest.mark.parametrize(
     "wrong",
     ["obj", "glb?time_s=nan", "ply?times=3", "ply-sequence?time_s=1", "ply-sequence?times=5000", "isplat?time_s=1"],
@@ -144,6 +191,7 @@ def test_an_export_that_makes_no_sense_is_refused(plane, wrong):
 
 def test_what_leaves_the_service_is_not_for_viewers(plane):
     assert plane.ask("GET", "/v1/models/liver/versions/3/exports/ply", "viewer").status_code == 403
+    assert plane.ask("POST", "/v1/models/liver/versions/3/render", "viewer", json={}).status_code == 403
     assert plane.ask("POST", f"{STREAM}/snapshots", "viewer", json={}).status_code == 403
 
 

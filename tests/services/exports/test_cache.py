@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -14,8 +15,10 @@ import pytest
 
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
+from operators.settings import RenderOptions
 from services.errors import ExportBusy, ExportFailed, ExportRefused
 from services.exports.cache import ALL, ExportCache, ExportPrograms
+from services.exports.renderings import PICTURES, RenderWish
 from services.registry.bundle_file import members_of
 from tests.services.supervisor.test_model_show import uniform
 
@@ -53,6 +56,15 @@ def test_another_model_time_or_format_is_another_export(cache):
     ):
         content(cache, digest, wish=wish)
     assert cache.made == 4
+
+
+def test_another_option_of_a_rendering_is_another_rendering(cache):
+    for options in ({}, {"outputs": ("normals",)}, {}):
+        wish = RenderWish(PICTURES["png"], RenderOptions(**options), "orbit", 0.5)
+        said = content(cache, "a", wish=wish)
+    assert said.startswith(b"good --format=png --render=")
+    wanted = json.loads(said.split(b"--render=")[1].split(b"\0")[0])
+    assert wanted == {"view": "orbit", "time_s": 0.5, "options": {}} and cache.made == 2
 
 
 def test_the_oldest_leave_and_one_that_is_being_read_is_read_to_its_end(cache):

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import resource
 
+import av
+import cv2
 import pytest
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.bundle import save_bundle
 from services.exports import make
 from services.exports.cache import ALL
+from tests.services.supervisor.test_model_show import uniform
 
 
 @pytest.fixture
@@ -57,3 +62,19 @@ def test_a_model_is_loaded_and_exported(monkeypatch, tmp_path):
     monkeypatch.setattr(export, "export_model", lambda *wanted: made.append(wanted))
     make.export(tmp_path, tmp_path / "file", "wish")
     assert made == [(("model of", tmp_path), tmp_path / "file", "wish")]
+
+
+@pytest.mark.parametrize("name", ["png", "mp4"])
+def test_a_rendering_has_the_requested_outputs(ran, tmp_path, name):
+    save_bundle(uniform((0.2, 0.5, 0.8)), tmp_path / "model")
+    file, outputs = tmp_path / f"file.{name}", ["image", "normals"]
+    wanted = {"view": "recorded", "time_s": None, "options": {"outputs": outputs, "fps": 1.0}}
+    arguments = [str(tmp_path / "model"), str(file), f"--format={name}", f"--render={json.dumps(wanted)}"]
+    assert make.main(arguments) == 0
+    camera = uniform((0.2, 0.5, 0.8)).camera
+    if name == "png":
+        shown = cv2.imread(str(file))
+        assert shown.shape == (camera.height_px, 2 * camera.width_px, 3)
+    else:
+        with av.open(str(file)) as video:
+            assert video.streams.video[0].width == 2 * camera.width_px
