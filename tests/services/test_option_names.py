@@ -161,10 +161,13 @@ def test_every_loss_is_accepted_everywhere(name, given, tmp_path):
 RENDERED = [("samples", 3), ("supersampling", 2), ("order", "pixel")]
 
 
-@pytest.mark.parametrize(("option", "value"), [*RENDERED, ("progressive", True)])
+OF_STILL_MODELS = [("progressive", True), ("storage", "prepared")]
+
+
+@pytest.mark.parametrize(("option", "value"), [*RENDERED, *OF_STILL_MODELS])
 def test_the_options_of_a_renderer_are_accepted_everywhere(option, value, given):
     options = {"renderer": "stochastic", option: value}
-    if option != "progressive":
+    if (option, value) in RENDERED:
         for command in KINDS:
             words = [word for name, each in options.items() for word in (f"--{name}", str(each))]
             assert getattr(given(command, *words).renderer_options, option) == value
