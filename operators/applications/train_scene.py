@@ -53,13 +53,18 @@ class TrainSettings:
     steps: int = FULL_STEPS
     save_every: int = 5000
     """Interval in steps at which the model is saved."""
+    strategy: str = "adc"
+    """How the number of Gaussians changes: a key of `STARTS`."""
+    max_gaussians: int = 1_000_000
+    absgrad: bool = False
     sh_degree: int = 3
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_option("scale", self.scale)
-        if not 1 <= self.steps <= MOST_STEPS:
+        if self.steps > MOST_STEPS:
             raise InvalidSetting(f"steps is {self.steps}; it must be 1 to {MOST_STEPS}")
+        _ = self.config
         if self.every < 0 or self.every == 1:
             raise InvalidSetting(f"every is {self.every}; it must be 0 (hold out no image) or at least 2")
         if self.save_every < 1:
@@ -68,6 +73,11 @@ class TrainSettings:
             raise InvalidSetting(f"seed is {self.seed}; it must be 0 to 2**63 - 1")
         if Path(self.images).is_absolute() or ".." in Path(self.images).parts:
             raise InvalidSetting(f"images is {self.images!r:.80}; give a folder inside the scene")
+
+    @property
+    def config(self) -> StaticConfig:
+        """Options of the trainer."""
+        return StaticConfig(self.steps, self.strategy, self.max_gaussians, self.absgrad, self.sh_degree)
 
 
 @dataclass(frozen=True)
@@ -127,9 +137,8 @@ def train_scene(
         check_picture(picture.camera, settings.scale)
     if cuda:
         torch.cuda.reset_peak_memory_stats()
-    config = StaticConfig(steps=settings.steps, sh_degree=settings.sh_degree)
     with seeded(settings.seed, settings.device):
-        trainer = StaticTrainer(pictures, points, config, seed=settings.seed, device=settings.device)
+        trainer = StaticTrainer(pictures, points, settings.config, seed=settings.seed, device=settings.device)
         initial = trainer.count
         training_s = _train(trainer, settings, folder, report, stop_requested)
     interrupted = trainer.steps_done < settings.steps

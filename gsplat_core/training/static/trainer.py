@@ -18,6 +18,8 @@ from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.static.adam import CompiledAdam
 from gsplat_core.training.static.pictures import Points, TrainingCoordinates, TrainingPicture, scene_extent
+from gsplat_core.training.strategies.adc import DefaultStrategy
+from gsplat_core.training.strategies.mcmc import MCMCStrategy
 
 FULL_STEPS = 30_000
 """Number of steps to which the schedules refer; shorter trainings shorten them in proportion."""
@@ -36,6 +38,28 @@ NEAR_PLANE = 0.01
 
 
 @dataclass(frozen=True)
+class Start:
+    """Initial values and regularisation that suit a strategy."""
+
+    opacity: float = 0.1
+    scale: float = 1.0
+    """Factor on the initial scales."""
+    opacity_weight: float = 0.0
+    """Weight of the mean opacity in the loss."""
+    scale_weight: float = 0.0
+    """Weight of the mean scale in the loss."""
+
+
+STARTS = {"adc": Start(), "mcmc": Start(0.5, 0.1, 0.01, 0.01), "none": Start()}
+"""Strategies by name: adaptive density control, MCMC, and a fixed number of Gaussians."""
+ABSGRAD_THRESHOLD = 0.0008
+"""Gradient above which Gaussians multiply with `absgrad` (Ye et al. 2024)."""
+REFINE_EVERY = 100
+RESETS_AT_LEAST = 10
+"""Minimum interval between resets of the opacities, in refinements, for short trainings."""
+
+
+@dataclass(frozen=True)
 class StaticConfig:
     """Options of a training.
 
@@ -44,26 +68,58 @@ class StaticConfig:
     """
 
     steps: int = FULL_STEPS
+    strategy: str = "adc"
+    """Key of `STARTS`."""
+    max_gaussians: int = 1_000_000
+    """Number of Gaussians at which `mcmc` stops to add, and after which `adc` multiplies none."""
+    absgrad: bool = False
+    """Let `adc` use sums of absolute gradients."""
     sh_degree: int = 3
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM; that of L1 is the rest."""
-    init_opacity: float = 0.1
-    init_scale: float = 1.0
-    """Factor on the initial scales."""
-    opacity_weight: float = 0.0
-    """Weight of the mean opacity in the loss."""
-    scale_weight: float = 0.0
-    """Weight of the mean scale in the loss."""
 
     def __post_init__(self) -> None:
         if self.steps < 1:
             raise InvalidSetting(f"steps is {self.steps}; it must be at least 1")
+        if self.strategy not in STARTS:
+            raise InvalidSetting(f"unknown strategy {self.strategy!r:.60}; static scenes have {', '.join(STARTS)}")
+        if self.max_gaussians < 1:
+            raise InvalidSetting(f"max_gaussians is {self.max_gaussians}; it must be at least 1")
+        if self.absgrad and self.strategy != "adc":
+            raise InvalidSetting(f"absgrad belongs to strategy adc, and the strategy is {self.strategy}; leave it out")
         if not 0 <= self.sh_degree <= 4:
             raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
+
+    @property
+    def start(self) -> Start:
+        """Initial values of the strategy."""
+        return STARTS[self.strategy]
 
     def shortened(self, steps: int) -> int:
         """Return a number of steps of a full schedule in proportion to the length of this training, at least 1."""
         return max(1, round(steps * min(1.0, self.steps / FULL_STEPS)))
+
+    def new_strategy(self, pictures: int, generator: torch.Generator) -> DefaultStrategy | MCMCStrategy | None:
+        """Return the strategy with its schedule for this length; None for a fixed number of Gaussians.
+
+        Between two refinements, every picture is trained on at least once, but no refinement waits longer than in a full
+        training.
+        """
+        every = max(min(REFINE_EVERY, pictures), self.shortened(REFINE_EVERY))
+        schedule = {"refine_start_iter": self.shortened(500), "refine_every": every}
+        if self.strategy == "adc":
+            stop, reset = self.shortened(15_000), max(self.shortened(3000), RESETS_AT_LEAST * every)
+            if 2 * reset > stop:
+                reset = self.steps  # too short a training to recover from a reset
+            threshold = {"grow_grad2d": ABSGRAD_THRESHOLD} if self.absgrad else {}
+            return DefaultStrategy(
+                **schedule, **threshold, refine_stop_iter=stop, reset_every=reset, absgrad=self.absgrad, generator=generator,
+            )  # fmt: skip
+        if self.strategy == "mcmc":
+            return MCMCStrategy(
+                self.max_gaussians, **schedule, refine_stop_iter=self.shortened(25_000), generator=generator
+            )
+        return None
 
 
 @dataclass(frozen=True)
@@ -121,20 +177,27 @@ class StaticTrainer:
             for name, parameter in self.params.items()
         }
         self.steps_done = 0
+        generator = torch.Generator(self.device).manual_seed(seed)
+        self.strategy = self.config.new_strategy(len(pictures), generator)
+        self._state: dict[str, Any] = {}
+        if self.strategy is not None:
+            self.strategy.check_sanity(self.params, self.optimizers)
+            scale = {"scene_scale": self.extent} if isinstance(self.strategy, DefaultStrategy) else {}
+            self._state = self.strategy.initialize_state(**scale)
 
     def _initial(self, points: Points, seed: int) -> torch.nn.ParameterDict:
         config, generator = self.config, torch.Generator().manual_seed(seed)
         means = torch.from_numpy(self.coordinates.positions(points.positions)).float()
         others = nearest_others(means, NEIGHBOURS)
         distances = (means[others] - means[:, None]).square().sum(-1).mean(-1).sqrt()
-        scales = (distances * config.init_scale).clamp_min(LEAST_SCALE).log()[:, None].repeat(1, 3)
+        scales = (distances * config.start.scale).clamp_min(LEAST_SCALE).log()[:, None].repeat(1, 3)
         sh = torch.zeros(len(means), (config.sh_degree + 1) ** 2, 3)
         sh[:, 0] = (torch.from_numpy(points.colours).float() / 255 - 0.5) / SH_C0
         values = {
             "means": means,
             "scales": scales,
             "quats": torch.rand(len(means), 4, generator=generator),
-            "opacities": torch.full((len(means),), config.init_opacity).logit(),
+            "opacities": torch.full((len(means),), config.start.opacity).logit(),
             "sh0": sh[:, :1],
             "shN": sh[:, 1:],
         }
@@ -172,18 +235,31 @@ class StaticTrainer:
         picture = self._next_picture()
         degree = min(step // config.shortened(SH_EVERY), config.sh_degree)
         scales, opacities = self.params["scales"].exp(), self.params["opacities"].sigmoid()
-        image = self._render(picture, scales, opacities, degree)[0]
+        image, info = self._render(picture, scales, opacities, degree)
         loss = image_loss(image, self._images[picture], ssim_weight=config.ssim_weight).loss
-        if config.opacity_weight:
-            loss = loss + config.opacity_weight * opacities.mean()
-        if config.scale_weight:
-            loss = loss + config.scale_weight * scales.mean()
+        if config.start.opacity_weight:
+            loss = loss + config.start.opacity_weight * opacities.mean()
+        if config.start.scale_weight:
+            loss = loss + config.start.scale_weight * scales.mean()
+        if self.strategy is not None:
+            self.strategy.step_pre_backward(self.params, self.optimizers, self._state, step, info)
         loss.backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+        self._refine(step, info)
         self.steps_done += 1
         return StaticStep(step, loss.detach(), picture)
+
+    def _refine(self, step: int, info: dict[str, Any]) -> None:
+        """Let the strategy change the Gaussians."""
+        own = self.params, self.optimizers, self._state, step, info
+        if isinstance(self.strategy, MCMCStrategy):
+            self.strategy.step_post_backward(*own, lr=self._rate("means", step))
+        elif self.strategy is not None:
+            if self.count >= self.config.max_gaussians:
+                self.strategy.grow_grad2d = math.inf
+            self.strategy.step_post_backward(*own)
 
     def _next_picture(self) -> int:
         if not self._left:
@@ -197,6 +273,7 @@ class StaticTrainer:
         colors, _, info = rasterization(
             params["means"], params["quats"], scales, opacities, torch.cat([params["sh0"], params["shN"]], 1), viewmat[None],
             K[None], camera.width_px, camera.height_px, near_plane=NEAR_PLANE, sh_degree=degree, packed=False,
+            absgrad=self.config.absgrad,
         )  # fmt: skip
         return colors[0], info
 

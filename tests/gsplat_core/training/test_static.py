@@ -12,6 +12,8 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.static.adam import CompiledAdam
 from gsplat_core.training.static.pictures import Points, TrainingCoordinates, TrainingPicture
 from gsplat_core.training.static.trainer import StaticConfig, StaticTrainer
+from gsplat_core.training.strategies.adc import DefaultStrategy
+from gsplat_core.training.strategies.mcmc import MCMCStrategy
 
 SHIFT = np.array([30.0, -20, 10])
 
@@ -44,7 +46,7 @@ def posed_pictures(factor=1.0, shift=0.0, count=5):
 
 def test_training_brings_the_pictures_closer():
     pictures, points = posed_pictures()
-    trainer = StaticTrainer(pictures, points, StaticConfig(steps=60, sh_degree=1))
+    trainer = StaticTrainer(pictures, points, StaticConfig(60, "none", sh_degree=1))
     before = np.mean([trainer.psnr_db(k) for k in range(5)])
     seen = [trainer.step().picture for _ in range(60)]
     assert np.mean([trainer.psnr_db(k) for k in range(5)]) > before + 1
@@ -55,7 +57,7 @@ def test_the_unit_and_the_origin_of_the_world_do_not_matter():
     """The rates refer to the distance of the cameras, so the result in another unit is the converted one."""
     results = []
     for factor, shift in ((1.0, 0.0), (100.0, SHIFT)):
-        trainer = StaticTrainer(*posed_pictures(factor, shift), StaticConfig(steps=20, sh_degree=1))
+        trainer = StaticTrainer(*posed_pictures(factor, shift), StaticConfig(20, "none", sh_degree=1))
         for _ in range(20):
             trainer.step()
         results.append(trainer.gaussians())
@@ -77,15 +79,35 @@ def test_coordinates_put_the_centre_of_attention_at_zero():
     assert np.allclose(alone.centre, pictures[0].camera.position) and alone.factor == 1
 
 
-def test_the_same_seed_gives_the_same_bytes():
+@pytest.mark.parametrize(("strategy", "fewest", "most"), [("adc", 61, 200), ("mcmc", 66, 66), ("none", 60, 60)])
+def test_the_strategy_changes_the_number_and_the_seed_repeats_it(strategy, fewest, most):
     pictures, points = posed_pictures()
     found = []
     for seed in (3, 3, 4):
-        trainer = StaticTrainer(pictures, points, StaticConfig(steps=5), seed=seed)
-        for _ in range(5):
+        trainer = StaticTrainer(pictures, points, StaticConfig(30, strategy, max_gaussians=66, sh_degree=1), seed=seed)
+        for _ in range(30):
             trainer.step()
         found.append(trainer.gaussians().means)
-    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+    assert fewest <= len(found[0]) <= most
+    assert torch.equal(found[0], found[1])
+    assert found[0].shape != found[2].shape or not torch.equal(found[0], found[2])
+
+
+def test_a_full_training_has_the_schedule_of_gsplat():
+    generator = torch.Generator()
+    adc, mcmc = (StaticConfig(strategy=name).new_strategy(200, generator) for name in ("adc", "mcmc"))
+    assert (adc, mcmc) == (DefaultStrategy(generator=generator), MCMCStrategy(generator=generator))
+    assert StaticConfig(absgrad=True).new_strategy(200, generator).grow_grad2d == 0.0008
+    # In a short training every picture counts for each refinement, and there is time to recover from a reset.
+    short = StaticConfig(steps=3000).new_strategy(28, generator)
+    assert (short.refine_start_iter, short.refine_every, short.refine_stop_iter, short.reset_every) == (
+        50,
+        28,
+        1500,
+        300,
+    )
+    shorter = StaticConfig(steps=600).new_strategy(28, generator)
+    assert shorter.reset_every == 600 and shorter.refine_stop_iter == 300
 
 
 def test_adam_takes_the_steps_of_torch():
@@ -107,7 +129,11 @@ def test_adam_takes_the_steps_of_torch():
     assert unchanged.tolist() == [row == 2 for row in range(7)]
 
 
-@pytest.mark.parametrize(("option", "value"), [("steps", 0), ("sh_degree", 5), ("sh_degree", -1)])
+@pytest.mark.parametrize(
+    ("option", "value"), [("steps", 0), ("sh_degree", 5), ("sh_degree", -1), ("strategy", "x"), ("max_gaussians", 0)]
+)
 def test_an_option_out_of_range_is_refused(option, value):
     with pytest.raises(InvalidSetting, match=option):
         StaticConfig(**{option: value})
+    with pytest.raises(InvalidSetting, match="adc"):
+        StaticConfig(strategy="mcmc", absgrad=True)

@@ -49,10 +49,10 @@ def scene(tmp_path_factory):
 
 def test_a_scene_is_trained_saved_and_evaluated(scene, tmp_path, capsys):
     out = tmp_path / "out"
-    words = ["train", str(scene), "--out", str(out), "--steps", "40", "--sh-degree", "1", "--json"]
-    assert run(words) == OK
+    words = ["train", str(scene), "--out", str(out), "--steps", "40", "--sh-degree", "1", "--strategy", "mcmc"]
+    assert run([*words, "--max-gaussians", "90", "--json"]) == OK
     said = json.loads(capsys.readouterr().out)
-    assert (said["steps"], said["training_images"], said["gaussians"]) == (40, 7, 80)
+    assert (said["steps"], said["training_images"], said["initial_gaussians"], said["gaussians"]) == (40, 7, 80, 90)
     assert [each["name"] for each in said["heldout"]["images"]] == ["0.png", "8.png"]
     assert said["peak_memory_bytes"] > 0 and said["training_s"] > 0 and not said["interrupted"]
     assert json.loads((out / "training.json").read_text())["heldout"] == said["heldout"]
@@ -81,7 +81,9 @@ def test_the_model_is_saved_during_the_training(scene, tmp_path):
         return False
 
     with pytest.raises(Killed):
-        train_scene(TrainSettings(scene, steps=40, save_every=2, sh_degree=0), tmp_path, stop_requested=stop)
+        train_scene(
+            TrainSettings(scene, steps=40, strategy="none", save_every=2, sh_degree=0), tmp_path, stop_requested=stop
+        )
     assert load_bundle(tmp_path / "model").gaussians.count == 80
 
 
@@ -99,6 +101,8 @@ def test_the_model_is_saved_during_the_training(scene, tmp_path):
         (lambda folder: (folder / "sparse/0/points3D.txt").write_text("# none\n"), [], "has 0 points"),
         (lambda _: None, ["--every", "1"], "every is 1"),
         (lambda _: None, ["--steps", "0"], "steps is 0"),
+        (lambda _: None, ["--strategy", "streaming"], "adc, mcmc, none"),
+        (lambda _: None, ["--strategy", "mcmc", "--absgrad"], "belongs to strategy adc"),
         (lambda _: None, ["--sh-degree", "7"], "sh_degree is 7"),
         (lambda _: None, ["--images", "/etc"], "inside the scene"),
         (lambda _: None, ["--scale", "0.01"], "nothing is left"),
