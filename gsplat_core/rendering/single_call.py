@@ -49,6 +49,8 @@ def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
         return False
     if arguments.extra_signals is not None or arguments.colors is None:
         return False
+    if arguments.Ks.requires_grad and torch.is_grad_enabled():
+        return False  # the native call has no gradient of the intrinsics
     if settings.constants != NATIVE_CONSTANTS or not _are_plain_cuda_floats(arguments):
         return False
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, _ = arguments

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.projection.arguments import PackedProjection
+from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient_of_rows
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 18}
@@ -124,13 +125,13 @@ class _ProjectVisible(torch.autograd.Function):
         )  # fmt: skip
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(ids, radii)
-        ctx.save_for_backward(*inputs[:4], viewmats, Ks, ids)
+        ctx.save_for_backward(*inputs[:4], viewmats, Ks, ids, *(rest[2:] if ctx.needs_input_grad[9] else (None, None)))
         ctx.pairs, ctx.options, ctx.sparse = pairs, options, sparse
         return ids, *rest, radii
 
     @staticmethod
     def backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
-        *inputs, viewmats, Ks, ids = ctx.saved_tensors
+        *inputs, viewmats, Ks, ids, conics, compensations = ctx.saved_tensors
         pairs, needs = ctx.pairs, ctx.needs_input_grad[3:]
         batches, cameras, gaussians = pairs
         width, height, eps2d, _, _, _, compensate, camera_model, floor = ctx.options
@@ -143,7 +144,14 @@ class _ProjectVisible(torch.autograd.Function):
             pairs.gradient(value, ids, given.shape, ctx.sparse) if needed and given is not None else None
             for value, given, needed in zip(values, inputs, needs, strict=False)
         ]
-        return None, None, None, *gradients, None, v_viewmats.reshape(viewmats.shape) if needs[5] else None, None
+        v_Ks = None
+        if needs[6]:
+            v_Ks = intrinsics_gradient_of_rows(
+                pairs.gaussians_of(ids), ids // max(gaussians, 1), (*inputs, viewmats, Ks), conics,
+                compensations if compensate else None, (v[1], v[3], v[4] if compensate else None), (width, height),
+                CAMERA_MODELS[camera_model], floor,
+            )  # fmt: skip
+        return None, None, None, *gradients, None, v_viewmats.reshape(viewmats.shape) if needs[5] else None, v_Ks
 
 
 def values_of_rows(values: Tensor, ids: Tensor, pairs: Pairs, batch_dims: int = 0, sparse_grad: bool = False) -> Tensor:

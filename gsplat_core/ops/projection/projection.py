@@ -18,6 +18,7 @@ from gsplat_core.ops.projection.arguments import (
     check_projection_tensors,
     check_sparse_gradient,
 )
+from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient, world_covariances
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 
@@ -45,7 +46,7 @@ def fully_fused_projection(
     """Project 3D Gaussians to 2D image Gaussians by EWA splatting (Zwicker et al. 2001), as gsplat 1.5.3.
 
     A Gaussian with a NaN, an infinity, or a value whose square exceeds float32 is culled and gets zero gradients.
-    Differentiable in means, covars, quats, scales and viewmats. Sums over Gaussians run in a fixed order.
+    Differentiable in means, covars, quats, scales, viewmats and Ks. Sums over Gaussians run in a fixed order.
 
     Args:
         means: float32 [..., N, 3]; `...` are any batch dimensions, common to all inputs.
@@ -127,7 +128,7 @@ def _flat(
 
     return (
         flat(means, n, 3), flat(covars, n, 6), flat(quats, n, 4), flat(scales, n, 3),
-        None if opacities is None else flat(opacities.detach(), n), flat(viewmats, c, 4, 4), flat(Ks.detach(), c, 3, 3),
+        None if opacities is None else flat(opacities.detach(), n), flat(viewmats, c, 4, 4), flat(Ks, c, 3, 3),
     )  # fmt: skip
 
 
@@ -176,13 +177,14 @@ def _fake_backward(*arguments: Any) -> tuple[Tensor, ...]:
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     means, covars, quats, scales, _, viewmats, Ks = inputs[:7]
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(means, covars, quats, scales, viewmats, Ks, output[4])
+    projected = (output[2], output[3]) if ctx.needs_input_grad[6] else (None, None)
+    ctx.save_for_backward(means, covars, quats, scales, viewmats, Ks, output[4], *projected)
     ctx.width, ctx.height, ctx.eps2d, ctx.compensate, ctx.camera_model = *inputs[7:10], inputs[13], inputs[14]
     ctx.compensation_floor = inputs[15]
 
 
 def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
-    means, covars, quats, scales, viewmats, Ks, radii = ctx.saved_tensors
+    means, covars, quats, scales, viewmats, Ks, radii, conics, compensations = ctx.saved_tensors
     needs = ctx.needs_input_grad
     v_means2d, v_depths, v_conics, v_compensations, _ = v
     v_means, v_covars, v_quats, v_scales, v_viewmats = torch.ops.gsplat_core.project_gaussians_backward(
@@ -190,6 +192,13 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
         v_compensations if ctx.compensate else None, ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, needs[5],
         ctx.compensation_floor,
     )  # fmt: skip
+    v_Ks = None
+    if needs[6]:
+        v_Ks = intrinsics_gradient(
+            means, world_covariances(covars, quats, scales), viewmats, Ks, radii, conics, compensations,
+            (v_means2d, v_conics, v_compensations if ctx.compensate else None), (ctx.width, ctx.height),
+            CAMERA_MODELS[ctx.camera_model], ctx.compensation_floor,
+        )  # fmt: skip
     return (
         v_means if needs[0] else None,
         v_covars if needs[1] else None,
@@ -197,7 +206,8 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
         v_scales if needs[3] else None,
         None,
         v_viewmats if needs[5] else None,
-        *[None] * 10,
+        v_Ks,
+        *[None] * 9,
     )
 
 

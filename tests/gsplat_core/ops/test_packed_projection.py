@@ -19,7 +19,7 @@ def project(scene, covars=False, **options):
     """The projection, and the leaves that it depends on."""
     leaves = {
         name: getattr(scene, name).detach().clone().requires_grad_()
-        for name in ("means", "quats", "scales", "viewmats")
+        for name in ("means", "quats", "scales", "viewmats", "Ks")
     }
     geometry = (None, leaves["quats"], leaves["scales"])
     if covars:
@@ -31,7 +31,7 @@ def project(scene, covars=False, **options):
         leaves["covars"] = triangle.requires_grad_()
         geometry = (leaves["covars"], None, None)
     out = fully_fused_projection(
-        leaves["means"], *geometry, leaves["viewmats"], scene.Ks, scene.width, scene.height,
+        leaves["means"], *geometry, leaves["viewmats"], leaves["Ks"], scene.width, scene.height,
         opacities=scene.opacities, calc_compensations=True, **options,
     )  # fmt: skip
     return out, leaves

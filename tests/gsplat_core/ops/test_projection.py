@@ -8,18 +8,19 @@ import pytest
 import torch
 
 from gsplat_core import fully_fused_projection, reference
+from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient
 
 MODELS = ("pinhole", "ortho", "fisheye")
 
 
 def project(function, scene, weights_seed=None, covars=False, **options):
     """The projection, and the gradients of a random weighting of its outputs."""
-    leaves = [scene.means, scene.quats, scene.scales, scene.viewmats]
+    leaves = [scene.means, scene.quats, scene.scales, scene.viewmats, scene.Ks]
     geometry = (None, scene.quats, scene.scales)
     if covars:
         triu = reference.quat_scale_to_covar_preci(scene.quats, scene.scales, compute_preci=False, triu=True)[0]
         geometry = (triu.detach(), None, None)
-        leaves = [scene.means, geometry[0], scene.viewmats]
+        leaves = [scene.means, geometry[0], scene.viewmats, scene.Ks]
     if weights_seed is not None:
         for leaf in leaves:
             leaf.requires_grad_()
@@ -59,6 +60,31 @@ def test_matches_reference(make_scene, assert_near, model, options, count, batch
         assert_near(actual, wanted)
     for actual, wanted in zip(gradients, expected, strict=True):
         assert_near(actual, wanted, relative=5e-3, of_largest=1e-4)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_gradient_of_the_intrinsics_in_double_precision(make_scene, model):
+    scene = make_scene(6, model=model, seed=3).to(torch.float64)
+    covariances = reference.quat_scale_to_covar_preci(scene.quats, scene.scales, compute_preci=False)[0]
+
+    def project_with(Ks):
+        return reference.fully_fused_projection(
+            scene.means, None, scene.quats, scene.scales, scene.viewmats, Ks, scene.width, scene.height,
+            calc_compensations=True, camera_model=model,
+        )  # fmt: skip
+
+    Ks = scene.Ks.clone().requires_grad_()
+    out = project_with(Ks)
+    weights = [torch.cos(torch.arange(t.numel(), dtype=torch.float64)).reshape(t.shape) for t in out[1:]]
+    v_means2d, _, v_conics, v_compensations = weights
+    found = intrinsics_gradient(
+        scene.means, covariances, scene.viewmats, scene.Ks, out.radii, out.conics.detach(), out.compensations.detach(),
+        (v_means2d, v_conics, v_compensations), (scene.width, scene.height), model, 0.005,
+    )  # fmt: skip
+    (expected,) = torch.autograd.grad(sum((t * w).sum() for t, w in zip(out[1:], weights, strict=True)), Ks)
+    assert (out.radii > 0).any() and expected.abs().sum() > 0
+    torch.testing.assert_close(found, expected)
+    torch.autograd.gradcheck(lambda Ks: project_with(Ks)[1:], Ks, atol=1e-4, fast_mode=True)
 
 
 @pytest.mark.parametrize("model", MODELS)

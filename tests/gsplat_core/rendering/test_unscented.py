@@ -78,22 +78,22 @@ def test_a_rolling_shutter_shows_the_rows_of_pictures_at_their_times(eval3d):
     assert psnr(rolled[0], torch.stack(rows)) > 40 > psnr(rolled[0], still[0]) + 10
 
 
-@pytest.mark.parametrize("eval3d", [False, True])
-def test_values_and_gradients_are_the_references(eval3d):
+@pytest.mark.parametrize("kind", ["plain", "packed", "unscented", "eval3d"])
+def test_values_and_gradients_are_the_references_with_cameras_and_coefficients(kind):
     results = []
     for function, dtype in ((rasterization, torch.float32), (reference.rasterization, torch.float64)):
         given = scene(dtype)
-        radial = torch.tensor([[-0.2, 0.05, 0, 0.01, 0, 0]], dtype=dtype, requires_grad=True)
-        for name in ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"):
-            given[name].requires_grad_()
+        options = {"packed": kind == "packed"}
+        if kind in ("unscented", "eval3d"):
+            given["radial_coeffs"] = torch.tensor([[-0.2, 0.05, 0, 0.01, 0, 0]], dtype=dtype)
+            options |= {"with_ut": True, "with_eval3d": kind == "eval3d"}
+        for each in given.values():
+            each.requires_grad_()
         image, alphas, _ = function(
-            **given, width=W, height=H, with_ut=True, with_eval3d=eval3d, radial_coeffs=radial, render_mode="RGB+ED",
-            rasterize_mode="antialiased",
-        )  # fmt: skip
-        (image.square().sum() + alphas.sum()).backward()
-        results.append(
-            {"image": image.detach(), "radial": radial.grad, **{name: each.grad for name, each in given.items()}}
+            **given, **options, width=W, height=H, render_mode="RGB+ED", rasterize_mode="antialiased"
         )
+        (image.square().sum() + alphas.sum()).backward()
+        results.append({"image": image.detach(), **{name: each.grad for name, each in given.items()}})
     found, expected = results
     for name, value in expected.items():
         torch.testing.assert_close(
