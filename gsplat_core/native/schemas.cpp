@@ -115,6 +115,33 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_alphas, Tensor v_depths, Tensor v_medians, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
       "Tensor v_opacities, Tensor v_rays, Tensor v_values)");
 
+  // Projection of N surfels in B batches to C cameras: centres of the boxes, depths, ray transforms [B, C, N, 3, 3], normals
+  // in camera axes and radii.
+  m.def(
+      "project_surfels(Tensor means, Tensor quats, Tensor scales, Tensor viewmats, Tensor Ks, int width, int height, "
+      "float near_plane, float far_plane, float radius_clip) -> (Tensor means2d, Tensor depths, Tensor ray_transforms, "
+      "Tensor normals, Tensor radii)");
+  m.def(
+      "project_surfels_backward(Tensor means, Tensor quats, Tensor scales, Tensor viewmats, Tensor Ks, Tensor radii, "
+      "Tensor? v_means2d, Tensor? v_depths, Tensor? v_ray_transforms, Tensor? v_normals, bool needs_viewmats) -> "
+      "(Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
+
+  // Alpha compositing of surfels at the intersections of rays. Besides colours, alphas and normals: distortion and median of
+  // the last colour channel, the sum of weight times that channel relative to the first surfel of the tile, and the list
+  // positions of the last blended surfel and of the median's. `densify` and `absgrad_probe` are unread inputs with gradients.
+  m.def(
+      "blend_surfels(Tensor means2d, Tensor ray_transforms, Tensor colors, Tensor opacities, Tensor normals, Tensor densify, "
+      "Tensor isect_offsets, Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, Tensor? absgrad_probe, int width, "
+      "int height, int tile_size, float max_alpha=0.99) -> (Tensor colors, Tensor alphas, Tensor normals, Tensor distortions, "
+      "Tensor medians, Tensor depth_sums, Tensor last, Tensor median_at)");
+  m.def(
+      "blend_surfels_backward(Tensor means2d, Tensor ray_transforms, Tensor colors, Tensor opacities, Tensor normals, "
+      "Tensor isect_offsets, Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, "
+      "Tensor alphas, Tensor depth_sums, Tensor last, Tensor median_at, Tensor v_colors, Tensor v_alphas, Tensor v_normals, "
+      "Tensor v_distortions, Tensor v_medians, bool absgrad, float max_alpha=0.99) -> (Tensor v_means2d, "
+      "Tensor v_ray_transforms, Tensor v_colors, Tensor v_opacities, Tensor v_normals, Tensor v_densify, Tensor v_backgrounds, "
+      "Tensor v_means2d_abs)");
+
   // Fused `rasterization()`, CUDA only; gsplat_core/ops/rasterization/rasterization.py documents the list arguments.
   m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
   m.def(

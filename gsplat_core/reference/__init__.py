@@ -33,6 +33,8 @@ from gsplat_core.reference.splat_regression import splat_regression, splat_regre
 from gsplat_core.reference.ssim import ssim_map
 from gsplat_core.reference.stereo_matching import match_disparities
 from gsplat_core.reference.stochastic import sample_moments
+from gsplat_core.reference.surfel_blending import rasterize_to_pixels_2dgs
+from gsplat_core.reference.surfel_projection import fully_fused_projection_2dgs
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.reference.weighted_sum import weighted_sums
 
@@ -48,6 +50,7 @@ __all__ = [
     "fit_disparities",
     "frame_loss",
     "fully_fused_projection",
+    "fully_fused_projection_2dgs",
     "hexplane_decode",
     "hexplane_deltas",
     "hexplane_features",
@@ -62,6 +65,7 @@ __all__ = [
     "range_histogram",
     "rasterization",
     "rasterize_to_pixels",
+    "rasterize_to_pixels_2dgs",
     "render_frame",
     "sample_moments",
     "smooth_within_edges",

@@ -1,0 +1,182 @@
+"""Alpha compositing of surfels at their ray intersections in plain torch (Huang et al. 2024, 2D Gaussian Splatting)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from gsplat_core.reference.compositing import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
+
+SCREEN_FACTOR = 2.0
+"""Factor of the squared distance in pixels in the screen-space lower bound of a surfel's size."""
+
+
+class _TileResult(NamedTuple):
+    """Blended values of a tile's pixels [P]."""
+
+    colors: Tensor
+    alphas: Tensor
+    normals: Tensor
+    distortions: Tensor
+    medians: Tensor
+
+
+def rasterize_to_pixels_2dgs(
+    means2d: Tensor,
+    ray_transforms: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    normals: Tensor,
+    densify: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+    distloss: bool = False,
+    *,
+    max_alpha: float = ALPHA_MAX,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Blend surfels front to back over every pixel; see `gsplat_core.rasterize_to_pixels_2dgs`.
+
+    Tiles are processed one by one and recomputed in the backward pass.
+    """
+    image_dims = isect_offsets.shape[:-2]
+    tile_height, tile_width = isect_offsets.shape[-2:]
+    images, channels = image_dims.numel(), colors.shape[-1]
+    background = None if backgrounds is None else backgrounds.reshape(images, channels)
+    transforms = _Densify.apply(ray_transforms.reshape(-1, 3, 3), densify.reshape(-1, 2))
+    tiles = _Tiles(
+        torch.cat([
+            means2d.reshape(-1, 2), transforms.reshape(-1, 9), opacities.reshape(-1, 1), normals.reshape(-1, 3),
+            colors.reshape(-1, channels),
+        ], -1),
+        isect_offsets, flatten_ids, masks, max_alpha,
+    )  # fmt: skip
+    if absgrad:
+        tiles.absolute = means2d.new_zeros(means2d.numel() // 2, 2)
+        means2d.absgrad = tiles.absolute.view(means2d.shape)  # type: ignore[attr-defined]
+    pictures = []
+    for image in range(images):
+        rows = []
+        for tile_y in range(tile_height):
+            row = []
+            for tile_x in range(tile_width):
+                tile = (image * tile_height + tile_y) * tile_width + tile_x
+                x = torch.arange(tile_x * tile_size, min((tile_x + 1) * tile_size, image_width), device=means2d.device)
+                y = torch.arange(tile_y * tile_size, min((tile_y + 1) * tile_size, image_height), device=means2d.device)
+                grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2).to(means2d.dtype) + 0.5
+                result = tiles.blend(tile, grid)
+                if background is not None:
+                    result = result._replace(colors=result.colors + (1 - result.alphas) * background[image])
+                row.append(torch.cat(result, -1).reshape(len(y), len(x), channels + 6))
+            rows.append(torch.cat(row, 1))
+        pictures.append(torch.cat(rows, 0))
+    shape = (*image_dims, image_height, image_width)
+    picture = torch.stack(pictures) if pictures else means2d.new_zeros(0, image_height, image_width, channels + 6)
+    values = picture.reshape(*shape, channels + 6).split([channels, 1, 3, 1, 1], -1)
+    return values[0], values[1], values[2], values[3], values[4]
+
+
+class _Densify(torch.autograd.Function):
+    """Identity on the ray transforms [N, 3, 3] that also passes a gradient to the densification probe [N, 2].
+
+    The probe's gradient is that of the surfel's centre in pixels times its depth.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, transforms: Tensor, densify: Tensor) -> Tensor:
+        ctx.save_for_backward(transforms)
+        return transforms.view_as(transforms)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        (transforms,), (gradient,) = ctx.saved_tensors, gradients
+        return gradient, gradient[:, :2, 2] * transforms[:, 2, 2, None]
+
+
+class _Tiles:
+    """Surfels in the order of the tile lists, with blending of one tile's surfels over its pixels."""
+
+    absolute: Tensor | None = None
+    """Sum over pixels of |dL/dmeans2d| [N, 2], filled in the backward pass; None if it is not requested."""
+
+    def __init__(
+        self, values: Tensor, isect_offsets: Tensor, flatten_ids: Tensor, masks: Tensor | None, max_alpha: float
+    ) -> None:
+        self.max_alpha = max_alpha
+        starts = torch.cat([isect_offsets.flatten(), isect_offsets.new_tensor([flatten_ids.numel()])])
+        sizes = starts.diff().long()
+        with torch.no_grad():
+            tile = torch.repeat_interleave(torch.arange(len(sizes), device=starts.device), sizes)
+            used = values.isfinite().all(-1)[flatten_ids.long()]
+            if masks is not None:
+                used &= masks.reshape(-1)[tile]
+            ids = flatten_ids.long()[used]
+            counts = torch.bincount(tile[used], minlength=len(sizes)).tolist()
+        # Gather and split once. Indexing per tile would cost a gradient of all surfels per tile.
+        self.ids = ids.split(counts)
+        self.values = values[ids].split(counts)
+
+    def blend(self, tile: int, pixels: Tensor) -> _TileResult:
+        """Blend the surfels of a tile over pixel centres [P, 2]."""
+        ids, values = self.ids[tile], self.values[tile]
+        if torch.is_grad_enabled() and values.requires_grad:
+            return _TileResult(*checkpoint(self._blend, ids, values, pixels, use_reentrant=False))
+        return self._blend(ids, values, pixels)
+
+    def _blend(self, ids: Tensor, values: Tensor, pixels: Tensor) -> _TileResult:
+        means2d, transforms, opacities = values[:, :2], values[:, 2:11].reshape(-1, 3, 3), values[:, 11]
+        normals, colors = values[:, 12:15], values[:, 15:]
+        means = means2d[None].expand(len(pixels), -1, -1)
+        if self.absolute is not None and means.requires_grad:
+            absolute = self.absolute
+
+            def add(gradient: Tensor) -> None:
+                absolute.index_add_(0, ids, gradient.abs().sum(0))
+
+            means.register_hook(add)
+        alpha = falloff(means, transforms, pixels) * opacities
+        alpha = alpha.clamp(max=self.max_alpha)
+        alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+        # Cumulative product of (1 - alpha) through logarithms, which has a cheaper gradient.
+        after = torch.exp(torch.cumsum(torch.log1p(-alpha), 1))
+        before = torch.cat([after.new_ones(len(pixels), 1), after[:, :-1]], 1)[:, : alpha.shape[1]]
+        # The product decreases monotonically, so the blended surfels are the start of the list.
+        weights = torch.where(after > TRANSMITTANCE_STOP, alpha * before, 0)
+        depths = colors[:, -1]
+        weighted = weights * depths
+        in_front, depth_in_front = weights.cumsum(1) - weights, weighted.cumsum(1) - weighted
+        distortions = 2 * (weighted * in_front - weights * depth_in_front).sum(1, keepdim=True)
+        first_half = ((before > 0.5) & (weights > 0)).detach()
+        order = torch.arange(1, len(ids) + 1, device=ids.device)
+        median = (first_half * order).max(1).values if len(ids) else order.new_zeros(len(pixels))
+        medians = torch.cat([depths.new_zeros(1), depths])[median][:, None]
+        return _TileResult(weights @ colors, weights.sum(1, keepdim=True), weights @ normals, distortions, medians)
+
+
+def falloff(means2d: Tensor, transforms: Tensor, pixels: Tensor) -> Tensor:
+    """Return exp(-sigma) of surfels at pixels, 0 where a ray is parallel to the surfel.
+
+    Args:
+        means2d: [..., 2], broadcast against the other arguments.
+        transforms: [N, 3, 3], N being the last dimension of the result.
+        pixels: pixel centres [P, 2], or [N, 2] with `transforms` [N, 3, 3] for one pixel per surfel.
+    """
+    if means2d.dim() == 3:
+        pixels = pixels[:, None]
+    x, y, w = transforms.unbind(-2)
+    across, down = pixels[..., :1] * w - x, pixels[..., 1:] * w - y
+    crossing = torch.linalg.cross(across, down)
+    hit = crossing[..., 2] != 0
+    denominator = torch.where(hit, crossing[..., 2], torch.ones_like(crossing[..., 2]))
+    plane = (crossing[..., :2] / denominator[..., None]).square().sum(-1)
+    screen = SCREEN_FACTOR * (means2d - pixels).square().sum(-1)
+    return torch.where(hit, torch.exp(-0.5 * torch.where(plane <= screen, plane, screen)), 0)
