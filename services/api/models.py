@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from fastapi import Path, Response
+from fastapi import Path, Query, Response
 from starlette.requests import Request
 
 from services.api.guard import CallerOf, new_router, recorded, requires
@@ -86,6 +87,22 @@ async def delete_model_version(request: Request, caller: CallerOf, name: Resourc
 
 
 log = logging.getLogger(__name__)
+ModelFormat = Literal["isplat", "ply", "splat", "spz"]
+FileFormat = Annotated[
+    ModelFormat | None,
+    Query(description="Format of the file. Default: recognised by its content, except for `splat`, which has no mark."),
+]
+
+
+def recognised(file: FilePath) -> ModelFormat:
+    """Return the format of a model file by its first bytes; `isplat` for an unknown one, whose check names it."""
+    with open(file, "rb") as opened:
+        start = opened.read(4)
+    if start[:3] == b"ply":
+        return "ply"
+    return "spz" if start == b"NGSP" or start[:2] == b"\x1f\x8b" else "isplat"
+
+
 OCTETS = "application/octet-stream"
 DIGEST = "sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"
 DESCRIBED = {
@@ -100,7 +117,8 @@ DESCRIBED = {
     ],
     "requestBody": {
         "required": True,
-        "description": "A model packed by `intrasplat pack`, at most limits.model_bytes long.",
+        "description": "A model packed by `intrasplat pack`, or a `.ply` (also compressed), `.splat` or `.spz` file of another "
+        "program; at most limits.model_bytes long.",
         "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
     },
 }
@@ -114,15 +132,21 @@ async def upload_model(
     response: Response,
     caller: CallerOf,
     name: ResourceName,
+    format: FileFormat = None,
 ) -> VersionView:
     """Upload a model's next version. It is `uploaded` at first; a check makes it `ready`, or
-    `rejected` with a reason."""
+    `rejected` with a reason. A splat file becomes a static model before the answer."""
     control = control_of(request)
     registry = registry_of(request)
     expected = stated_sha256(", ".join(request.headers.getlist("content-digest")) or None)
     async with recorded(request, caller, "model.upload", name, {"sha256": expected.hex()}) as said:
         async with incoming_file(request, control, expected) as file:
-            record = await asyncio.to_thread(registry.upload, name, file.path, file.sha256, str(caller))
+            kind = format or await asyncio.to_thread(recognised, file.path)
+            if kind == "isplat":
+                record = await asyncio.to_thread(registry.upload, name, file.path, file.sha256, str(caller))
+            else:
+                said["format"] = kind
+                record = await asyncio.to_thread(registry.upload_splats, name, file.path, kind, str(caller))
         said["version"] = record.version
         said["size_bytes"] = file.size_bytes
     check_soon(control, registry, record)

@@ -200,7 +200,12 @@ def models(
 @command("upload")
 def upload(
     name: ModelName,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File made by `intrasplat pack`.", show_default=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="File made by `intrasplat pack`, or a .ply, .splat or .spz file.", show_default=False
+        ),
+    ],
     service: Service = Service(),
 ) -> int:
     """Upload a model's next version and wait for its check."""

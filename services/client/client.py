@@ -283,12 +283,18 @@ class Client(ReplayMethods, SnapshotMethods):
         return VersionView.model_validate(self._ask("GET", f"/v1/models/{name}/versions/{number}"))
 
     def upload(self, name: str, file: Path) -> VersionView:
-        """Upload a file of `intrasplat pack`. The server checks it afterwards; `checked` waits for that.
+        """Upload a file of `intrasplat pack`, or a `.ply`, `.splat` or `.spz` file of another program.
+
+        The server checks it afterwards; `checked` waits for that.
 
         Raises:
             ClientError: if the file cannot be read.
         """
-        return VersionView.model_validate(self._put_file(f"/v1/models/{name}/versions", file))
+        suffix = file.suffix.lower().removeprefix(".")
+        converted: dict[str, Any] = {}
+        if suffix in ("ply", "splat", "spz"):  # converted before the answer
+            converted = {"params": {"format": suffix}, "timeout": EXPORT_S}
+        return VersionView.model_validate(self._put_file(f"/v1/models/{name}/versions", file, **converted))
 
     def checked(self, name: str, number: int, *, within_s: float = 300.0) -> VersionView:
         """Wait until the server has checked a version.

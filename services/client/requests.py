@@ -161,7 +161,7 @@ class Requests:
             return whole
         raise refused_by(whole, self.url)
 
-    def _put_file(self, path: str, file: Path) -> Any:
+    def _put_file(self, path: str, file: Path, **options: Any) -> Any:
         """Send a file as the body, with its digest.
 
         Raises:
@@ -176,7 +176,7 @@ class Requests:
                     "Content-Length": str(size),
                     "Content-Digest": f"sha-256=:{digest}:",
                 }
-                return self._ask("PUT", path, content=_pieces(content, size, file), headers=headers)
+                return self._ask("PUT", path, content=_pieces(content, size, file), headers=headers, **options)
         except OSError as error:
             raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
 

@@ -14,9 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-import os
-import resource
 import sys
 import time
 from pathlib import Path
@@ -29,22 +26,19 @@ from gsplat_core.io.bundle import MANIFEST, load_bundle
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, parse_manifest
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.alpha import AlphaRenderer
+from gsplat_core.rendering.registry import new_renderer
 from services.private_files import keep_files_private
 from services.registry.limits import (
     CHECK_MEMORY_BYTES,
-    CHECK_S,
     MOST_GAUSSIANS,
     MOST_PIXELS,
     MOST_TENSOR_BYTES,
-    NICENESS,
-    lower_limit,
-    taken_bytes,
+    limit_resources,
+    says_out_of_memory,
 )
 
 FAINTEST = 1 / 255
 """Smallest opacity that changes an 8-bit pixel."""
-_MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc")
 
 
 class Unusable(Exception):
@@ -60,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     keep_files_private()
     options = _options(arguments)
     say = _say_json if options.json else _say_words
-    _limit_resources(options.device)
+    limit_resources(options.device)
     try:
         model = _read(options)
         say({"stage": "validated", **_description(model)})
@@ -76,8 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.write(f"{str(error).splitlines()[0]}\n")
         return 1
     except (MemoryError, RuntimeError) as error:
-        # torch's allocators raise RuntimeError when out of memory. Any other RuntimeError is a bug of the check.
-        if isinstance(error, RuntimeError) and not any(words in str(error).lower() for words in _MEMORY_WORDS):
+        if not says_out_of_memory(error):
             raise
         reason = f"it needs more memory than the {CHECK_MEMORY_BYTES} bytes that a check may take"
         say({"stage": "rejected", "reason": reason})
@@ -90,18 +83,6 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="one line of JSON for each step")
     parser.add_argument("--device", default="cpu", help="device of the warm-up render: cpu or cuda")
     return parser.parse_args(arguments)
-
-
-def _limit_resources(device: str) -> None:
-    """Limit processor time and memory beyond what torch uses at startup, and disable core files.
-
-    Memory is not limited on CUDA, which maps far more address space than it uses.
-    """
-    os.nice(NICENESS)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    if device == "cpu":
-        lower_limit(resource.RLIMIT_DATA, taken_bytes() + CHECK_MEMORY_BYTES)
-    lower_limit(resource.RLIMIT_CPU, math.ceil(time.process_time() + CHECK_S), spare=5)
 
 
 def _read(options: argparse.Namespace) -> Model:
@@ -131,6 +112,7 @@ def _description(model: Model) -> dict[str, Any]:
         "gaussians": model.gaussians.count,
         "parameters": model.parameter_count,
         "field": None if model.field is None else model.field.kind,
+        "renderer": model.trained_by.renderer,
         "width_px": model.camera.width_px,
         "height_px": model.camera.height_px,
         "time_window_s": list(model.time_window_s),
@@ -145,7 +127,7 @@ def _render(model: Model, device: str) -> dict[str, Any]:
         Unusable: if a picture is not finite or all pictures are empty.
     """
     start_s, end_s = model.time_window_s
-    renderer = AlphaRenderer(model.camera, torch.device(device))
+    renderer = new_renderer(model.trained_by.renderer, model.camera, device)
     covered, visible, took_s = 0.0, 0.0, 0.0
     with torch.inference_mode():
         renderer.prepare(model.to(device))

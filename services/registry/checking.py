@@ -19,6 +19,7 @@ from services.errors import CheckFailed
 from services.registry.limits import CHECK_PASSED_S
 
 PROGRAM = (sys.executable, "-P", "-m", "services.registry.check")
+CONVERTER = (sys.executable, "-P", "-m", "services.registry.convert")
 MOST_LINE_BYTES = 1 << 16
 MOST_REASON = 500
 
@@ -131,6 +132,30 @@ def run_check(
     if verdict is None:
         raise CheckFailed(f"the check ended with code 0 and without a verdict: {words}; repair that and check again")
     return verdict
+
+
+def run_conversion(file: Path, target: Path, program: tuple[str, ...], running: RunningChecks) -> str | None:
+    """Convert a splat file to a packed model; blocks.
+
+    Returns:
+        Reason of a rejection; None if the model was written to `target`.
+
+    Raises:
+        CheckFailed: if the conversion could not run or was killed by `RunningChecks.end`.
+    """
+    lines: list[dict[str, Any]] = []
+    try:
+        words = run_program([*program, str(file), str(target), "--json"], CHECK_PASSED_S, lines.append, running=running)
+    except BroughtDown as error:
+        return str(error)
+    stages = [line.get("stage") for line in lines]
+    if "rejected" in stages:
+        return str(lines[stages.index("rejected")].get("reason"))[:MOST_REASON]
+    if "ready" not in stages:
+        raise CheckFailed(
+            f"the conversion ended with code 0 and without a result: {words}; repair that and upload again"
+        )
+    return None
 
 
 def run_program(

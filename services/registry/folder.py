@@ -197,7 +197,10 @@ def remove_leftovers(
     """
     removed = []
     for path in sorted(incoming.iterdir()):
-        path.unlink()
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
         removed.append(f"half-written upload {path.name}")
     named = {row["blob"] for row in rows}
     for blob in stored:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import os
 import resource
+import time
 from pathlib import Path
 
 GIB = 1 << 30
@@ -46,3 +49,23 @@ def lower_limit(kind: int, wanted: int, spare: int = 0) -> None:
     if hard != resource.RLIM_INFINITY:
         allowed = [min(each, hard) for each in allowed]
     resource.setrlimit(kind, (allowed[0], allowed[1]))
+
+
+def limit_resources(device: str) -> None:
+    """Limit processor time and memory beyond what torch used at its start, and disable core files.
+
+    Memory is not limited on CUDA, which maps far more address space than it uses.
+    """
+    os.nice(NICENESS)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if device == "cpu":
+        lower_limit(resource.RLIMIT_DATA, taken_bytes() + CHECK_MEMORY_BYTES)
+    lower_limit(resource.RLIMIT_CPU, math.ceil(time.process_time() + CHECK_S), spare=5)
+
+
+_MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc")
+
+
+def says_out_of_memory(error: Exception) -> bool:
+    """Return True for a MemoryError, and for the RuntimeError that torch's allocators raise in place of it."""
+    return not isinstance(error, RuntimeError) or any(words in str(error).lower() for words in _MEMORY_WORDS)

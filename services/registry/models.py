@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,11 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from services.errors import Conflict, NotFound, StoreUnavailable
+from services.errors import Conflict, NotFound, Rejected, StoreUnavailable
 from services.registry import versions
 from services.registry.blobs import StagedUpload, open_blobs, stage
 from services.registry.bundle_file import SUFFIX
-from services.registry.checking import PROGRAM, RunningChecks, Verdict, run_check
+from services.registry.checking import CONVERTER, PROGRAM, RunningChecks, Verdict, run_check, run_conversion
 from services.registry.database import Database
 from services.registry.folder import FolderLock, UnpackedModels, findings, folder_name, remove_leftovers
 from services.registry.limits import MOST_UPLOAD_BYTES
@@ -64,6 +65,7 @@ class ModelRegistry:
         device: str = "cpu",
         reached: Callable[[str], None] = _nothing,
         check_program: tuple[str, ...] = PROGRAM,
+        convert_program: tuple[str, ...] = CONVERTER,
     ) -> None:
         """Open the registry in `folder`, create it if missing, and migrate its database.
 
@@ -76,12 +78,13 @@ class ModelRegistry:
             device: device on which checks render, cpu or cuda.
             reached: called with the name of each completed step, in the calling thread.
             check_program: command that checks a folder.
+            convert_program: command that converts a splat file.
 
         Raises:
             SchemaTooNew: if a later version of the program wrote the database.
         """
         self._folder, self._most_upload_bytes, self._device = folder, most_upload_bytes, device
-        self._reached, self._check_program = reached, check_program
+        self._reached, self._check_program, self._convert_program = reached, check_program, convert_program
         self._incoming = folder / "incoming"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -92,7 +95,7 @@ class ModelRegistry:
             raise StoreUnavailable(
                 f"the registry cannot use {folder}: {error.strerror or error}; give a folder that can be written"
             ) from error
-        self._checks = threading.Lock()
+        self._checks, self._converting = threading.Lock(), threading.Lock()
         self._running = RunningChecks()
         self._lock = FolderLock(folder / "lock")
         self._database = Database(database_url or f"sqlite:///{folder.absolute() / DATABASE_FILE}")
@@ -126,6 +129,33 @@ class ModelRegistry:
                 return self._add(name, version, staged, blob, by)
             finally:
                 staged.path.unlink(missing_ok=True)
+
+    def upload_splats(self, name: str, file: Path, format_name: str, by: str) -> VersionRecord:
+        """Convert a splat file of another program in a separate process, and store it as a new version.
+
+        The version's digest and size are those of the `.isplat` file that the conversion made. One conversion runs at a
+        time; further ones wait.
+
+        Args:
+            name: the model.
+            file: path of the upload; the file stays in place.
+            format_name: `ply`, `splat` or `spz`.
+            by: the caller, for the record.
+
+        Raises:
+            Rejected: if the name or the file is invalid.
+            CheckFailed: if the conversion could not run.
+        """
+        check_name(name)
+        check_by(by)
+        with self._converting, tempfile.TemporaryDirectory(prefix="splats-", dir=self._incoming) as folder:
+            named = Path(folder) / f"file.{format_name}"
+            named.symlink_to(file.absolute())
+            packed = Path(folder) / f"model{SUFFIX}"
+            reason = run_conversion(named, packed, self._convert_program, self._running)
+            if reason is not None:
+                raise Rejected(reason.replace(named.name, f"the .{format_name} file"))
+            return self.upload(name, packed, None, by)
 
     def check(self, name: str, version: int) -> VersionRecord:
         """Check an uploaded version in a separate process; blocks until it is `ready` or `rejected` with a reason.

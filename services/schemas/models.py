@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
@@ -19,10 +19,16 @@ class VersionView(BaseModel):
     version: int = Field(examples=[3])
     state: str = Field(examples=["ready"])
     reason: str | None = None
-    digest: str = Field(description="SHA-256 of the uploaded file.")
+    digest: str = Field(description="SHA-256 of the uploaded file; of a splat file, that of the model made from it.")
     size_bytes: int
     uploaded_at: datetime | str
     uploaded_by: str
+    description: dict[str, Any] = Field(
+        {},
+        examples=[{"gaussians": 20480, "field": "basis", "renderer": "alpha"}],
+        description="Results of the check: Gaussians, deformation field (null for a static model), renderer that trained the"
+        " model, picture size, time window.",
+    )
 
 
 class ModelView(BaseModel):

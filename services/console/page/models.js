@@ -44,7 +44,14 @@ export function modelsPage(report) {
     }
     const state = version.reason ? `${version.state}: ${version.reason}` : version.state;
     const uploaded = [when(version.uploaded_at), `, ${version.uploaded_by}`];
-    return row(model.name, version.version, digest(version.digest), state, size(version.size_bytes), uploaded, actions);
+    return row(model.name, version.version, digest(version.digest), state, [size(version.size_bytes), contents(version.description)], uploaded, actions);
+  }
+
+  /** Return the number of Gaussians and the kind of a checked model. */
+  function contents({ gaussians, field, renderer }) {
+    if (gaussians === undefined) return "";
+    const kind = field ? `moving (${field})` : "static";
+    return `, ${gaussians.toLocaleString("en")} Gaussians, ${kind}${renderer && renderer !== "alpha" ? `, ${renderer}` : ""}`;
   }
 
   at("upload").addEventListener("submit", (event) => {
@@ -54,7 +61,9 @@ export function modelsPage(report) {
       bar.value = 0;
       bar.hidden = false;
       try {
-        const made = await upload(`/v1/models/${at("model-name").value}/versions`, file, (share) => { bar.value = share; });
+        const format = /\.(ply|splat|spz)$/i.exec(file.name)?.[1].toLowerCase();
+        const path = `/v1/models/${at("model-name").value}/versions${format ? `?format=${format}` : ""}`;
+        const made = await upload(path, file, (share) => { bar.value = share; });
         await checked(made);
       } finally {
         bar.hidden = true;

@@ -60,6 +60,9 @@ class FakeModels:
         self.bytes[name, number] = data
         return numbers[number]
 
+    def upload_splats(self, name: str, file: Path, format_name: str, by: str) -> FakeVersion:
+        return self.upload(f"{name}-{format_name}", file, None, by)
+
     def check(self, name: str, version: int) -> FakeVersion:
         good = self.bytes[name, version].startswith(b"GOOD")
         record = replace(

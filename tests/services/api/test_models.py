@@ -22,6 +22,28 @@ def put(plane, body: bytes, role: str = "operator", **headers: str):
     return plane.ask("PUT", VERSIONS, role, content=body, headers={**digest_header(body), **headers})
 
 
+@pytest.mark.parametrize(
+    ("start", "query", "kind"),
+    [
+        (b"ply\nformat", "", "ply"),
+        (b"\x1f\x8b\x08", "", "spz"),
+        (b"NGSP", "", "spz"),
+        (b"ply\nformat", "?format=splat", "splat"),
+        (bytes(32), "?format=splat", "splat"),
+    ],
+)
+def test_a_splat_file_is_converted_to_a_model(plane, start, query, kind):
+    body = start + bytes(64)
+    answer = plane.ask("PUT", VERSIONS + query, "operator", content=body, headers=digest_header(body))
+    assert answer.status_code == 201 and answer.json()["name"] == f"liver-{kind}"
+    assert ("model.upload", "liver", "done") in plane.events()
+
+
+def test_a_format_that_there_is_not_is_refused(plane):
+    answer = plane.ask("PUT", f"{VERSIONS}?format=obj", "operator", content=b"v 0", headers=digest_header(b"v 0"))
+    assert answer.status_code == 422 and not plane.parts.models.kept
+
+
 def settled(plane, number: int) -> dict:
     for _ in range(200):
         version = plane.ask("GET", f"{VERSIONS}/{number}").json()

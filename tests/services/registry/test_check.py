@@ -8,14 +8,17 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from gsplat_core.io import model_files
-from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.bundle import load_bundle, save_bundle
+from gsplat_core.models.model import TrainedBy
 from gsplat_core.rendering.alpha import AlphaRenderer
+from gsplat_core.rendering.weighted_sum import WeightedSumRenderer
 from services.errors import CheckFailed
 from services.registry import check, checking
 from services.registry.checking import PROGRAM, run_check
@@ -27,7 +30,7 @@ from tests.services.registry.stub_check import ALWAYS_READY, says
 @pytest.fixture
 def checked(monkeypatch, capsys):
     """Return the check program's verdicts in this process, without resource limits. Its start takes two seconds."""
-    monkeypatch.setattr(check, "_limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
 
     def verdicts(folder):
         assert check.main([str(folder), "--json"]) == 0
@@ -46,12 +49,23 @@ def test_a_good_model_is_described_and_rendered(tmp_path):
         "gaussians": 5,
         "parameters": load_bundle(folder).parameter_count,
         "field": "basis",
+        "renderer": "alpha",
         "width_px": 16,
         "height_px": 12,
         "time_window_s": [0.0, 1.0],
         "model_sha256": load_bundle(folder).sha256(),
     }
     assert verdict.description.keys() - validated.keys() == {"render_ms", "covered"}
+
+
+def test_a_model_of_another_renderer_is_rendered_by_it(checked, tmp_path):
+    """A model of weighted sums has no picture by alpha blending."""
+    model = load_bundle(save_model(tmp_path / "alpha"))
+    gaussians = WeightedSumRenderer.extended(model.gaussians)
+    trained_by = TrainedBy("weighted_sum", WeightedSumRenderer.first_values(20.0))
+    save_bundle(replace(model, gaussians=gaussians, trained_by=trained_by), tmp_path / "sums")
+    validated, ready = checked(tmp_path / "sums")
+    assert (validated["renderer"], ready["stage"]) == ("weighted_sum", "ready")
 
 
 @pytest.mark.slow
@@ -85,9 +99,7 @@ def test_a_model_without_gaussians_is_rejected(tmp_path, checked):
 @pytest.mark.slow
 def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
     folder = save_model(tmp_path / "model", count=40_000)
-    code = (
-        "import sys\nfrom services.registry import check\ncheck.CHECK_MEMORY_BYTES = 50 << 20\nsys.exit(check.main())"
-    )
+    code = "import sys\nfrom services.registry import check, limits\nlimits.CHECK_MEMORY_BYTES = 50 << 20\nsys.exit(check.main())"
     verdict = run_check(folder, program=(sys.executable, "-c", code))
     assert verdict.reason is not None and "memory" in verdict.reason
 
@@ -95,7 +107,7 @@ def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
 def test_a_machine_without_memory_says_nothing_about_the_model(tmp_path, monkeypatch, capsys):
     """Through the same program in this process: the reader finds too little memory left."""
     folder = save_model(tmp_path / "model")
-    monkeypatch.setattr(check, "_limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
     monkeypatch.setattr(model_files, "available_bytes", lambda: 100)
     assert check.main([str(folder), "--json"]) == 1
     said = capsys.readouterr()
@@ -112,7 +124,7 @@ def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
 @pytest.mark.slow
 def test_a_check_that_computes_too_long_is_ended(tmp_path):
     endless = (
-        "from services.registry import check\ncheck.CHECK_S = 0.1\ncheck._limit_resources('cpu')\nwhile True: pass\n"
+        "from services.registry import limits\nlimits.CHECK_S = 0.1\nlimits.limit_resources('cpu')\nwhile True: pass\n"
     )
     done = subprocess.run([sys.executable, "-c", endless], capture_output=True)
     assert -done.returncode == signal.SIGXCPU
@@ -205,7 +217,7 @@ def test_a_flood_of_words_is_not_collected(tmp_path):
 def test_a_picture_that_is_not_finite_is_rejected(tmp_path, monkeypatch, capsys):
     """Through the same program in this process, with a renderer that is broken."""
     folder = save_model(tmp_path / "model")
-    monkeypatch.setattr(check, "_limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
     render = AlphaRenderer.render
 
     def broken(self, camera, time_s, *arguments):
