@@ -14,10 +14,10 @@ from gsplat_core.ops.projection.arguments import (
     MAX_RADIUS_PX,
     DenseProjection,
     PackedProjection,
+    Pairs,
     check_projection_options,
     check_projection_tensors,
     check_sparse_gradient,
-    pack,
 )
 from gsplat_core.ops.projection.separate_steps import PROJECTIONS
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci, triu_to_matrix
@@ -152,3 +152,26 @@ def _half_sizes(ellipses: _Ellipses, opacities: Tensor | None) -> tuple[Tensor, 
         extent = extent.minimum((2 * (opacities / ALPHA_CUTOFF).clamp(min=1).log()).sqrt())
     half_sizes = (extent[..., None] * ellipses.variances.clamp(min=0).sqrt()).ceil().clamp(max=MAX_RADIUS_PX)
     return half_sizes, visible
+
+
+def pack(dense: DenseProjection) -> PackedProjection:
+    """Keep only the rows that are not culled."""
+    n_cameras, n_gaussians = dense.radii.shape[-3:-1]
+    rows = dense.radii.detach().reshape(-1, 2)[:, 0].nonzero().squeeze(-1)
+    images = torch.div(rows, max(n_gaussians, 1), rounding_mode="floor")
+    compensations = dense.compensations
+    return PackedProjection(
+        batch_ids=torch.div(images, max(n_cameras, 1), rounding_mode="floor"),
+        camera_ids=images % max(n_cameras, 1),
+        gaussian_ids=rows % max(n_gaussians, 1),
+        radii=dense.radii.reshape(-1, 2)[rows],
+        means2d=dense.means2d.reshape(-1, 2)[rows],
+        depths=dense.depths.reshape(-1)[rows],
+        conics=dense.conics.reshape(-1, 3)[rows],
+        compensations=None if compensations is None else compensations.reshape(-1)[rows],
+    )
+
+
+def values_of_rows(values: Tensor, ids: Tensor, pairs: Pairs, batch_dims: int = 0, sparse_grad: bool = False) -> Tensor:
+    """Return the values of packed rows from those of the Gaussians; see `gsplat_core.ops.packed_projection`."""
+    return values.flatten(0, batch_dims)[pairs.gaussians_of(ids)]

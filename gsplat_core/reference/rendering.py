@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.projection.arguments import Pairs
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.reference import ray_blending
 from gsplat_core.reference.compositing import rasterize_to_pixels
-from gsplat_core.reference.projection import fully_fused_projection
+from gsplat_core.reference.projection import fully_fused_projection, values_of_rows
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.rendering.pipeline import Operations
@@ -66,6 +67,19 @@ def splat_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
     return ray_blending.splat_rays(*tensors)
 
 
+def visible_harmonics(
+    degree: int,
+    dirs: Tensor,
+    coefficients: Tensor,
+    ids: Tensor,
+    pairs: Pairs,
+    batch_dims: int = 0,
+    sparse_grad: bool = False,
+) -> Tensor:
+    """Return the spherical harmonics of packed rows; see `gsplat_core.ops.packed_projection`."""
+    return spherical_harmonics(degree, dirs, values_of_rows(coefficients, ids, pairs, batch_dims))
+
+
 rasterization = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
@@ -73,4 +87,6 @@ rasterization = Operations(
     rasterize_to_pixels=rasterize_to_pixels,
     splat_rays=splat_rays,
     blend_rays=ray_blending.blend_rays,
+    values_of_rows=values_of_rows,
+    visible_harmonics=visible_harmonics,
 ).rasterization

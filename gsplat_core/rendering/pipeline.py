@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
+from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, Pairs
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.rendering.settings import (
     CONSTANTS,
@@ -31,6 +31,7 @@ from gsplat_core.rendering.settings import (
     RasterizeMode,
     RenderMode,
     RenderSettings,
+    SparseGradients,
     check_tensors,
     refuse_unsupported,
 )
@@ -51,6 +52,9 @@ class StepOperations:
     splat_rays: Callable[..., tuple[Tensor, Tensor]] | None = None
     blend_rays: Callable[..., tuple[Tensor, ...]] | None = None
     """Distance along rays and normals, as `gsplat_core.ops.splat_rays` and `gsplat_core.ops.ray_blending`."""
+    values_of_rows: Callable[..., Tensor] | None = None
+    visible_harmonics: Callable[..., Tensor] | None = None
+    """Values of packed rows, as in `gsplat_core.ops.packed_projection`."""
     zero_gradients_stay_zero: bool = False
     """True if a zero gradient stays zero in backward operations, even times NaN, as on CUDA."""
 
@@ -91,8 +95,10 @@ class RenderedSplats(NamedTuple):
     """Values returned by `rasterize_to_pixels` after image and alphas."""
 
 
-Coloring = Callable[[DenseProjection], tuple[Tensor, DenseProjection]]
-"""Function that returns colours [..., C, N, D] and the projection without Gaussians it culls."""
+Projection = DenseProjection | PackedProjection
+Coloring = Callable[[Any], tuple[Tensor, Projection]]
+"""Function that returns the colours of a projection, [..., C, N, D] or [rows, D], and the projection without Gaussians
+it culls."""
 
 
 def render_splats(
@@ -109,25 +115,26 @@ def render_splats(
     means, covars, quats, scales, opacities, viewmats, Ks = geometry
     max_alpha, compensation_floor = CONSTANTS[settings.constants]
     batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    dense: DenseProjection = ops.fully_fused_projection(
+    rows: Projection = ops.fully_fused_projection(
         means, covars, quats, scales, viewmats, Ks, settings.width, settings.height,
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
         radius_clip=settings.radius_clip, calc_compensations=settings.rasterize_mode == "antialiased",
         camera_model=settings.camera_model, opacities=opacities, compensation_floor=compensation_floor,
+        packed=settings.packed, sparse_grad=bool(settings.sparse_grad),
     )  # fmt: skip
     channels = None
     if coloring is not None:
-        channels, dense = coloring(dense)
-    opacities = opacities[..., None, :].expand(*batch_dims, n_cameras, n_gaussians)
-    rows: DenseProjection | PackedProjection = dense
+        channels, rows = coloring(rows)
     packing: dict[str, Any] = {}
-    if settings.packed:
-        rows = pack(dense)
+    if isinstance(rows, PackedProjection):
+        pairs = Pairs(math.prod(batch_dims), n_cameras, n_gaussians)
+        picked = pairs.ids_of(rows)
         image_ids = rows.batch_ids * n_cameras + rows.camera_ids
-        packing = {"packed": True, "n_images": math.prod(batch_dims) * n_cameras, "image_ids": image_ids}
-        picked = image_ids * n_gaussians + rows.gaussian_ids
-        opacities = opacities.reshape(-1)[picked]
-        channels = None if channels is None else channels.reshape(-1, channels.shape[-1])[picked]
+        packing = {"packed": True, "n_images": pairs.batches * n_cameras, "image_ids": image_ids}
+        assert ops.values_of_rows is not None
+        opacities = ops.values_of_rows(opacities, picked, pairs, len(batch_dims), settings.sparse_grad == "all")
+    else:
+        opacities = opacities[..., None, :].expand(*batch_dims, n_cameras, n_gaussians)
     if rows.compensations is not None:
         opacities = opacities * rows.compensations
     if settings.has_depth or channels is None:
@@ -198,6 +205,24 @@ class Signal(NamedTuple):
         parts = [ops.spherical_harmonics(self.degree, directions, triple, masks=visible) for triple in triples]
         return torch.cat(parts, -1)[..., :width]
 
+    def of_rows(
+        self, ops: StepOperations, ids: Tensor, pairs: Pairs, directions: Tensor, batch_dims: int, sparse: bool
+    ) -> Tensor:
+        """Return the values [rows, D] of packed rows, before shift and clamp."""
+        assert ops.values_of_rows is not None and ops.visible_harmonics is not None
+        per_camera = self.values.dim() - (1 if self.degree is None else 2) == batch_dims + 2
+        if per_camera:
+            pairs, batch_dims, sparse = Pairs(pairs.batches * pairs.cameras, 1, pairs.gaussians), batch_dims + 1, False
+        if self.degree is None:
+            return ops.values_of_rows(self.values, ids, pairs, batch_dims, sparse)
+        width = self.values.shape[-1]
+        triples = [self.values] if width == 3 else pad(self.values, (0, -width % 3)).split(3, -1)
+        parts = [
+            ops.visible_harmonics(self.degree, directions, each, ids, pairs, batch_dims, sparse and width == 3)
+            for each in triples
+        ]
+        return parts[0] if width == 3 else torch.cat(parts, -1)[..., :width]
+
     def shown(self, values: Tensor) -> Tensor:
         """Return seen values shifted and clamped as in 3DGS; plain values are unchanged."""
         if self.degree is None:
@@ -220,17 +245,11 @@ def view_colors(
         parts = [signal.seen(ops, means, viewmats, visible) for signal in signals]
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
-    def shown(values: Tensor) -> Tensor:
-        if len(signals) == 1:
-            return signals[0].shown(values)
-        parts = values.split([signal.values.shape[-1] for signal in signals], -1)
-        return torch.cat([signal.shown(part) for signal, part in zip(signals, parts, strict=True)], -1)
-
     # Check before clamping, which would turn minus infinity into black.
     values = evaluate(visible)
     if values.is_cuda and ops.zero_gradients_stay_zero:
         finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
-        return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
+        return _shown(signals, values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
     # In the common case one sum suffices, because a sum is non-finite if any of its terms is. A compiled graph cannot
     # branch on a value and always tests every colour.
     if torch.compiler.is_compiling() or not torch.isfinite(values.detach().sum()):
@@ -239,7 +258,55 @@ def view_colors(
         values = torch.where(visible[..., None], evaluate(visible), torch.zeros_like(values))
         keep = visible.to(dense.radii.dtype)
         dense = dense._replace(radii=dense.radii * keep[..., None])
-    return shown(values), dense
+    return _shown(signals, values), dense
+
+
+def row_colors(
+    ops: StepOperations,
+    means: Tensor,
+    signals: Sequence[Signal],
+    viewmats: Tensor,
+    rows: PackedProjection,
+    sparse_grad: SparseGradients,
+) -> tuple[Tensor, PackedProjection]:
+    """Return the channels [rows, D] of all signals, and the rows without those that have non-finite ones."""
+    batch_dims, n_cameras = means.dim() - 2, viewmats.shape[-3]
+    pairs = Pairs(math.prod(means.shape[:-2]), n_cameras, means.shape[-2])
+
+    def evaluate(rows: PackedProjection) -> Tensor:
+        ids, directions = pairs.ids_of(rows), rows.means2d.new_zeros(())
+        if any(signal.degree is not None for signal in signals):
+            assert ops.values_of_rows is not None
+            positions = ops.values_of_rows(means, ids, pairs, batch_dims, bool(sparse_grad))
+            images = rows.batch_ids * n_cameras + rows.camera_ids
+            directions = positions - _centers_of_rows(viewmats, images)
+        parts = [signal.of_rows(ops, ids, pairs, directions, batch_dims, sparse_grad == "all") for signal in signals]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+    values = evaluate(rows)
+    if not torch.isfinite(values.detach().sum()):
+        finite = values.detach().isfinite().all(-1).nonzero()[:, 0]
+        if len(finite) < len(values):
+            rows = PackedProjection(*(None if each is None else each[finite] for each in rows))  # type: ignore[arg-type]
+            values = evaluate(rows)
+    return _shown(signals, values), rows
+
+
+def _centers_of_rows(viewmats: Tensor, images: Tensor) -> Tensor:
+    """Return the camera centre of each row, [rows, 3]; gradients are summed in a fixed order."""
+    centers = camera_centers(viewmats).reshape(-1, 3)
+    if len(centers) > 1 and not centers.requires_grad:
+        return centers[images]
+    counts = [len(images)] if len(centers) == 1 else torch.bincount(images, minlength=len(centers)).tolist()
+    parts = [center.expand(count, 3) for center, count in zip(centers, counts, strict=True)]
+    return torch.cat(parts) if parts else centers
+
+
+def _shown(signals: Sequence[Signal], values: Tensor) -> Tensor:
+    if len(signals) == 1:
+        return signals[0].shown(values)
+    parts = values.split([signal.values.shape[-1] for signal in signals], -1)
+    return torch.cat([signal.shown(part) for signal, part in zip(signals, parts, strict=True)], -1)
 
 
 def camera_centers(viewmats: Tensor) -> Tensor:
@@ -290,7 +357,7 @@ class Operations(StepOperations):
         tile_size: int | None = TILE_SIZE,
         backgrounds: Tensor | None = None,
         render_mode: RenderMode = "RGB",
-        sparse_grad: bool = False,
+        sparse_grad: SparseGradients = False,
         absgrad: bool = False,
         rasterize_mode: RasterizeMode = "classic",
         channel_chunk: int = 32,
@@ -333,7 +400,10 @@ class Operations(StepOperations):
             near_plane, far_plane: range of z in the scene's unit; Gaussians with a centre outside it are culled.
             radius_clip: Gaussians with both radii at or below this many pixels are culled.
             eps2d: blur in pixels² added to the diagonal of the 2D covariance.
-            packed: `meta` holds one row per visible Gaussian and camera; the image is the same.
+            packed: `meta` and the memory hold one row per visible Gaussian and camera; the image is the same.
+            sparse_grad: gradients of means, quats and scales are COO tensors [N, ...] with the visible rows only, for
+                optimisers such as `torch.optim.SparseAdam`. "all": those of opacities and colors, too. Needs packed, quats
+                and scales, and no batch dimensions.
             tile_size: side of the square tiles in pixels; None = 16.
             backgrounds: [..., C, D], blended behind the colours; the depth channel has background 0.
             render_mode: "RGB", "D" (depth z of the centres, weighted by alpha), "ED" (divided by alpha), "RGB+D" or "RGB+ED"
@@ -378,10 +448,10 @@ class Operations(StepOperations):
             InvalidInput: if a shape, dtype, device or mode does not fit; the message states the observed value.
             NotImplementedError: if an argument of gsplat is not supported; the message states its value.
         """
-        asked_for = (sparse_grad, distributed, rays, lidar_coeffs, external_distortion_coeffs)
+        asked_for = (distributed, rays, lidar_coeffs, external_distortion_coeffs)
         if any(value is not None and value is not False for value in asked_for):
             refuse_unsupported(
-                sparse_grad=sparse_grad, distributed=distributed, rays=rays, lidar_coeffs=lidar_coeffs,
+                distributed=distributed, rays=rays, lidar_coeffs=lidar_coeffs,
                 external_distortion_coeffs=external_distortion_coeffs,
             )  # fmt: skip
         settings = RenderSettings(
@@ -389,7 +459,7 @@ class Operations(StepOperations):
             sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
             render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
             constants=constants, global_z_order=bool(global_z_order), extra_degree=extra_signals_sh_degree,
-            normals=bool(return_normals),
+            normals=bool(return_normals), sparse_grad=sparse_grad,
         )  # fmt: skip
         arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals)
         check_tensors(arguments, settings.has_colors)
@@ -448,6 +518,8 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals = arguments
     batch_dims, n_gaussians = _check_shapes(arguments, settings)
     if covars is not None:
+        if settings.sparse_grad:
+            raise InvalidInput("sparse_grad needs quats and scales, got covars; their gradient is dense")
         require_shape("covars", covars, (*batch_dims, n_gaussians, 3, 3), "[..., N, 3, 3]")
         # Indexing with lists would synchronise on CUDA.
         covars = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
@@ -457,9 +529,14 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
         signals.append(Signal(colors, settings.sh_degree))
     if extra_signals is not None:
         signals.append(Signal(extra_signals, settings.extra_degree, clamped=False))
-    coloring = (lambda dense: view_colors(ops, means, signals, viewmats, dense)) if signals else None
+
+    def coloring(rows: Projection) -> tuple[Tensor, Projection]:
+        if isinstance(rows, PackedProjection):
+            return row_colors(ops, means, signals, viewmats, rows, settings.sparse_grad)
+        return view_colors(ops, means, signals, viewmats, rows)
+
     geometry = Geometry(means, covars, quats, scales, opacities, viewmats, Ks)
-    splats = render_splats(ops, geometry, coloring, backgrounds, settings)
+    splats = render_splats(ops, geometry, coloring if signals else None, backgrounds, settings)
     widths = [signal.values.shape[-1] for signal in signals]
     colored = splats.image[..., : widths[0]] if settings.has_colors else splats.image[..., :0]
     extra = None if extra_signals is None else splats.image[..., sum(widths) - widths[-1] : sum(widths)]

@@ -15,6 +15,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
+from gsplat_core.ops.packed_projection.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
@@ -48,6 +49,8 @@ step_by_step = Operations(
     rasterize_to_pixels=rasterize_to_pixels,
     splat_rays=_splat_rays,
     blend_rays=_blend_rays,
+    values_of_rows=values_of_rows,
+    visible_harmonics=visible_harmonics,
     zero_gradients_stay_zero=True,
 )
 """Chain of compiled operations, on any supported device."""

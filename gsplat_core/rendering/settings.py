@@ -13,6 +13,8 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED", "d", "Ed", "RGB-d", "RGB-Ed"]
 RasterizeMode = Literal["classic", "antialiased"]
+SparseGradients = bool | Literal["all"]
+"""True for sparse gradients of means, quaternions and scales; "all" for those of opacities and colours, too."""
 GsplatVersion = Literal["1.6", "1.5.3"]
 _RENDER_MODES, _RASTERIZE_MODES = get_args(RenderMode), get_args(RasterizeMode)
 
@@ -95,6 +97,7 @@ class RenderSettings:
     extra_degree: int | None = None
     """Degree of the spherical harmonics of `extra_signals`; None for plain values."""
     normals: bool = False
+    sparse_grad: SparseGradients = False
 
     def __post_init__(self) -> None:
         for name, least in (("width", 1), ("height", 1), ("tile_size", 1)):
@@ -120,6 +123,10 @@ class RenderSettings:
         ):
             if not isinstance(value, str) or value not in known:
                 raise InvalidInput(f"unknown {name} {value!r}; the modes are {', '.join(known)}")
+        if self.sparse_grad not in (False, True, "all"):
+            raise InvalidInput(f"sparse_grad must be False, True or 'all', got {_shown(self.sparse_grad)}")
+        if self.sparse_grad and not self.packed:
+            raise InvalidInput("sparse_grad needs packed=True; give packed=True, or leave sparse_grad out")
         if self.constants not in tuple(CONSTANTS):
             raise InvalidInput(f"unknown constants {self.constants!r}; the versions are {', '.join(CONSTANTS)}")
 
@@ -180,7 +187,6 @@ def _shown(value: object) -> str:
 
 
 REFUSED: dict[str, str] = {
-    "sparse_grad": "use packed=True, whose gradients are dense",
     "distributed": "render with one process",
     "rays": "give viewmats and Ks, which define the rays",
     "lidar_coeffs": (

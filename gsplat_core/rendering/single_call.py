@@ -28,6 +28,8 @@ from gsplat_core.scene.cameras import CAMERA_MODELS
 
 NATIVE_CONSTANTS = "1.6"
 """gsplat version whose constants are compiled into the native call."""
+MOST_PACKED_PAIRS = 1 << 23
+"""Pairs of camera and Gaussian up to which packed pictures are rendered in the native call, whose scratch memory is dense."""
 _PLAIN_TENSORS = (Tensor, Parameter)
 _DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": DEPTH_SUM, "RGB+ED": EXPECTED_DEPTH}
 
@@ -45,7 +47,7 @@ def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Ras
 def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
     if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or torch.compiler.is_compiling():
         return False
-    if settings.has_distance or settings.normals or not settings.global_z_order:
+    if settings.has_distance or settings.normals or settings.sparse_grad or not settings.global_z_order:
         return False
     if arguments.extra_signals is not None or arguments.colors is None:
         return False
@@ -59,6 +61,8 @@ def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
         return False
     batch, n, c = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     images = c * batch.numel()
+    if settings.packed and images * n > MOST_PACKED_PAIRS:
+        return False
     if images < 1 or not (0 < settings.width <= MOST_PIXELS and 0 < settings.height <= MOST_PIXELS):
         return False
     tiles = settings.tile_grid[0] * settings.tile_grid[1]

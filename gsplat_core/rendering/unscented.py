@@ -69,6 +69,8 @@ def with_unscented_camera(
     means, quats, scales = arguments.means, arguments.quats, arguments.scales
     if quats is None or scales is None or arguments.covars is not None:
         raise InvalidInput("with_ut and with_eval3d need quats and scales; covars are not supported")
+    if settings.sparse_grad:
+        raise InvalidInput("with_ut and with_eval3d have dense gradients; leave sparse_grad out")
     special = [
         name for name, value in camera.lens.items() if value is not None and getattr(value, "name", "") != "GLOBAL"
     ]
@@ -90,7 +92,8 @@ def with_unscented_camera(
     shutter = Shutter.of(viewmats, camera.viewmats_rs, camera.rolling_shutter)
 
     def project(means: Tensor, covars: Tensor | None, quats: Tensor, scales: Tensor, middle: Tensor, Ks: Tensor, *size: int,
-                opacities: Tensor | None = None, packed: bool = False, **limits: Any) -> DenseProjection:  # fmt: skip
+                opacities: Tensor | None = None, packed: bool = False, sparse_grad: bool = False,
+                **limits: Any) -> DenseProjection:  # fmt: skip
         limits = {name: value for name, value in limits.items() if name != "camera_model"}
         return fully_fused_projection_with_ut(
             means, quats, scales, opacities, viewmats, Ks, *size, ut_params=camera.ut_params, **options, **limits

@@ -1,7 +1,6 @@
 """Projection, values and colours of visible pairs of camera and Gaussian only.
 
-A row is a visible pair. Its id is (batch * cameras + camera) * gaussians + gaussian; ids ascend. Memory depends on the
-number of rows. Gradients of rows are added to those of their Gaussians camera by camera, in a fixed order. Sparse
+A row is a visible pair. Its id is that of `Pairs`; ids ascend. Memory depends on the number of rows. Gradients of rows are added to those of their Gaussians camera by camera, in a fixed order. Sparse
 gradients hold one entry per row instead.
 """
 
@@ -9,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsplat_core.argument_checks import check_spherical_harmonics_arguments
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.projection.arguments import PackedProjection
+from gsplat_core.ops.projection.arguments import PackedProjection, Pairs
 from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient_of_rows
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
@@ -23,45 +23,23 @@ ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 18}
 """Rows whose spherical-harmonics coefficients are gathered at once, per device type; limits temporary memory."""
 
 
-class Pairs(NamedTuple):
-    """Numbers of batches, cameras and Gaussians whose pairs the ids count.
+def row_gradient(pairs: Pairs, values: Tensor, ids: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
+    """Return the gradient of values of each Gaussian from those of the rows.
 
-    Values of each camera and Gaussian are those of B * C batches with one camera.
+    Args:
+        pairs: numbers that the ids count.
+        values: gradients of the rows, [rows, ...].
+        ids: int64 [rows], ascending.
+        shape: shape of the gradient: batches, Gaussians, then as `values`.
+        sparse: return a COO tensor with one entry per row; needs a shape without batches.
     """
-
-    batches: int
-    cameras: int
-    gaussians: int
-
-    def gaussians_of(self, ids: Tensor) -> Tensor:
-        """Return the index of each row into the Gaussians of all batches, int64 [rows]."""
-        if self.cameras == 1:
-            return ids
-        gaussian = ids % self.gaussians
-        return gaussian if self.batches == 1 else ids // (self.cameras * self.gaussians) * self.gaussians + gaussian
-
-    def gradient(self, values: Tensor, ids: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-        """Return the gradient of values of each Gaussian from those of the rows.
-
-        Args:
-            values: gradients of the rows, [rows, ...].
-            ids: int64 [rows].
-            shape: shape of the gradient: batches, Gaussians, then as `values`.
-            sparse: return a COO tensor with one entry per row; needs one batch without a dimension.
-        """
-        if sparse:
-            return self.sparse_gradient(values, ids, shape)
-        columns = math.prod(values.shape[1:])
-        total = values.new_zeros(self.batches, self.gaussians, columns)
-        torch.ops.gsplat_core.add_packed_rows_(total, values.reshape(len(ids), columns), ids, self.cameras)
-        return total.reshape(shape)
-
-    def sparse_gradient(self, values: Tensor, ids: Tensor, shape: torch.Size) -> Tensor:
-        """Return the gradient [N, ...] as a COO tensor with the values of the rows; coalesced with one camera."""
-        index = self.gaussians_of(ids)[None]
-        return torch.sparse_coo_tensor(
-            index, values.reshape(len(ids), *shape[1:]), shape, is_coalesced=self.cameras == 1, check_invariants=False
-        )
+    if sparse:
+        index, rows = pairs.gaussians_of(ids)[None], values.reshape(len(ids), *shape[1:])
+        return torch.sparse_coo_tensor(index, rows, shape, is_coalesced=pairs.cameras == 1, check_invariants=False)
+    columns = math.prod(values.shape[1:])
+    total = values.new_zeros(pairs.batches, pairs.gaussians, columns)
+    torch.ops.gsplat_core.add_packed_rows_(total, values.reshape(len(ids), columns), ids, pairs.cameras)
+    return total.reshape(shape)
 
 
 def project_visible(
@@ -141,7 +119,7 @@ class _ProjectVisible(torch.autograd.Function):
             v[1], v[2], v[3], v[4] if compensate else None, width, height, eps2d, camera_model, needs[5], floor,
         )  # fmt: skip
         gradients = [
-            pairs.gradient(value, ids, given.shape, ctx.sparse) if needed and given is not None else None
+            row_gradient(pairs, value, ids, given.shape, ctx.sparse) if needed and given is not None else None
             for value, given, needed in zip(values, inputs, needs, strict=False)
         ]
         v_Ks = None
@@ -164,7 +142,7 @@ def values_of_rows(values: Tensor, ids: Tensor, pairs: Pairs, batch_dims: int = 
         batch_dims: number of dimensions of `values` before that of the Gaussians.
         sparse_grad: give `values` a sparse gradient; needs values without batch dimensions.
     """
-    return _ValuesOfRows.apply(values, ids, pairs, batch_dims, sparse_grad)  # type: ignore[no-any-return, no-untyped-call]
+    return _ValuesOfRows.apply(values, ids, pairs, batch_dims, sparse_grad)
 
 
 class _ValuesOfRows(torch.autograd.Function):
@@ -177,7 +155,7 @@ class _ValuesOfRows(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *v: Tensor) -> tuple[Tensor | None, ...]:
         (ids,) = ctx.saved_tensors
-        return ctx.pairs.gradient(v[0], ids, ctx.shape, ctx.sparse), None, None, None, None
+        return row_gradient(ctx.pairs, v[0], ids, ctx.shape, ctx.sparse), None, None, None, None
 
 
 def visible_harmonics(
@@ -202,8 +180,12 @@ def visible_harmonics(
 
     Returns:
         Sums [rows, 3], as `spherical_harmonics`.
+
+    Raises:
+        InvalidInput: for another degree, or too few coefficients.
     """
-    return _VisibleHarmonics.apply(degree, dirs, coefficients, ids, pairs, batch_dims, sparse_grad)  # type: ignore[no-any-return, no-untyped-call]
+    check_spherical_harmonics_arguments(degree, dirs[:1, None], coefficients.flatten(0, batch_dims)[:1, None], None)
+    return _VisibleHarmonics.apply(degree, dirs, coefficients, ids, pairs, batch_dims, sparse_grad)
 
 
 class _VisibleHarmonics(torch.autograd.Function):
@@ -255,7 +237,7 @@ class _VisibleHarmonics(torch.autograd.Function):
                 )
         v_coefficients = None
         if values is not None:
-            v_coefficients = pairs.sparse_gradient(values, ids, coefficients.shape)
+            v_coefficients = row_gradient(pairs, values, ids, coefficients.shape, sparse=True)
         elif total is not None:
             v_coefficients = total.reshape(coefficients.shape)
         return None, v_dirs, v_coefficients, None, None, None, None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape, require_trailing
@@ -54,6 +53,29 @@ class PackedProjection(NamedTuple):
     depths: Tensor
     conics: Tensor
     compensations: Tensor | None
+
+
+class Pairs(NamedTuple):
+    """Numbers of batches, cameras and Gaussians whose pairs are numbered.
+
+    The id of a pair is (batch * cameras + camera) * gaussians + gaussian. Values of each camera and Gaussian are those
+    of B * C batches with one camera.
+    """
+
+    batches: int
+    cameras: int
+    gaussians: int
+
+    def ids_of(self, rows: PackedProjection) -> Tensor:
+        """Return the ids of the rows, int64 [rows], ascending."""
+        return (rows.batch_ids * self.cameras + rows.camera_ids) * self.gaussians + rows.gaussian_ids
+
+    def gaussians_of(self, ids: Tensor) -> Tensor:
+        """Return the index of each row into the Gaussians of all batches, int64 [rows]."""
+        if self.cameras == 1:
+            return ids
+        gaussian = ids % self.gaussians
+        return gaussian if self.batches == 1 else ids // (self.cameras * self.gaussians) * self.gaussians + gaussian
 
 
 def check_projection_tensors(
@@ -122,21 +144,3 @@ def check_sparse_gradient(sparse_grad: bool, packed: bool, batch_dims: tuple[int
             f"sparse_grad=True takes tensors without batch dimensions, got {list(batch_dims)}; render one scene at a"
             " time, or leave sparse_grad out"
         )
-
-
-def pack(dense: DenseProjection) -> PackedProjection:
-    """Keep only the rows that are not culled."""
-    n_cameras, n_gaussians = dense.radii.shape[-3:-1]
-    rows = dense.radii.detach().reshape(-1, 2)[:, 0].nonzero().squeeze(-1)
-    images = torch.div(rows, max(n_gaussians, 1), rounding_mode="floor")
-    compensations = dense.compensations
-    return PackedProjection(
-        batch_ids=torch.div(images, max(n_cameras, 1), rounding_mode="floor"),
-        camera_ids=images % max(n_cameras, 1),
-        gaussian_ids=rows % max(n_gaussians, 1),
-        radii=dense.radii.reshape(-1, 2)[rows],
-        means2d=dense.means2d.reshape(-1, 2)[rows],
-        depths=dense.depths.reshape(-1)[rows],
-        conics=dense.conics.reshape(-1, 3)[rows],
-        compensations=None if compensations is None else compensations.reshape(-1)[rows],
-    )

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.packed_projection.packed_projection import project_visible
 from gsplat_core.ops.projection.arguments import (
     COMPENSATION_FLOOR,
     DenseProjection,
@@ -86,8 +87,6 @@ def fully_fused_projection(
     check_projection_options(width, height, camera_model, compensation_floor)
     check_sparse_gradient(sparse_grad, packed, batch_dims)
     if packed:
-        from gsplat_core.ops.packed_projection.packed_projection import project_visible
-
         _check_float32(*inputs)
         return project_visible(
             *inputs, width, height, eps2d=eps2d, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip,
