@@ -30,7 +30,7 @@ BINARY_PINHOLE = 1
 
 def texture(points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
     """Return colours [N, 3] in 0..1 of smooth stripes and spots at several scales."""
-    x, y, z = (points * 3).T
+    x, y, z = (points * 4.5).T
     waves = [
         np.sin(2.1 * x + 1.3 * np.sin(1.7 * y + shift) + z),
         np.sin(3.7 * y - 2.2 * z + np.cos(2.9 * x - shift)),

@@ -49,9 +49,43 @@ def calls(logs: Logs) -> str:
     return table(("device", "calls that work", "calls"), rows) + ("\n\n" + "\n".join(missing) if missing else "")
 
 
+def static(logs: Logs) -> str:
+    """Return scores of trained static scenes and of trivial baselines."""
+    head = ("training", "device", "PSNR", "SSIM", "Gaussians", "training time", "peak memory")
+    rows = []
+    for device, log in logs.items():
+        for name, each in log["baselines"].items():
+            rows.append([name, device, f"{each['psnr_db']:.1f} dB", f"{each['ssim']:.3f}", "–", "–", "–"])
+        for name, run in log["strategies"].items():
+            (psnr, psnr_worst), (ssim, ssim_worst), (count, _) = run["psnr_db"], run["ssim"], run["gaussians"]
+            (seconds, seconds_worst), (peak, _) = run["training_s"], run["peak_mib"]
+            rows.append(
+                [
+                    f"`--strategy {name}`",
+                    device,
+                    f"{psnr:.1f} ({psnr_worst:.1f}) dB",
+                    f"{ssim:.3f} ({ssim_worst:.3f})",
+                    f"{count:,.0f}",
+                    f"{seconds:.0f} ({seconds_worst:.0f}) s",
+                    f"{peak:,.0f} MiB",
+                ]
+            )
+    sizes = {
+        f"{log['scene']['views']} views of {log['scene']['width_px']}x{log['scene']['height_px']} px, {log['steps']:,} steps ({device})"
+        for device, log in logs.items()
+    }
+    said = (
+        f"Synthetic scene: {'; '.join(sorted(sizes))}. Every 8th image is held out and scored. Median of three seeds, with the"
+        " worst in brackets. The baselines show the training image of the nearest camera, and the mean of the training images."
+        " gsplat's own trainer needs CUDA and was not run on the CPU."
+    )
+    return f"{said}\n\n{table(head, rows)}"
+
+
 SECTIONS: tuple[tuple[str, str, Callable[[Logs], str]], ...] = (
     ("gsplat's own tests", "own_tests", own_tests),
     ("Typical calls", "calls", calls),
+    ("Static scenes: `intrasplat train`", "static", static),
 )
 """Title, stem of the log files, and function of each topic."""
 
