@@ -1,30 +1,41 @@
-"""Gaussians as `.spz`, the compressed format of Niantic: 20 bytes each plus one per coefficient, in a gzip stream.
+"""Gaussians as `.spz`, the compressed format of Niantic: 20 bytes each plus one per coefficient, compressed.
 
 A header of 16 bytes (magic `NGSP`, version, count, SH degree, fractional bits, flags) is followed by one array per
 attribute: positions (24 bit fixed point), opacities, colours, log-scales, rotations and harmonics (8 bit). Rotations are
 the x, y and z of a unit quaternion in version 2. In version 3 they are its three smallest components with 10 bits. Axes
-are x right, y up, z backward, so y and z change their signs against `.ply`. Versions 2 and 3 are read and written.
+are x right, y up, z backward, so y and z change their signs against `.ply`. Versions 2 and 3 are one gzip stream, and are
+read and written. Version 4, which is read only, has the arrays of version 3 as Zstandard streams. A header of 32 bytes is
+followed by extensions, a table with the sizes of the streams, and the streams.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.errors import BundleCorrupt, ExportError
+from gsplat_core.errors import BundleCorrupt, BundleError, ExportError
 from gsplat_core.io.model_files import BLOCK_BYTES, check_memory, gaussians_of, logit_of_bytes, open_model_file
+from gsplat_core.io.zstd import ZstdError, ZstdStream
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAGIC = b"NGSP"
 VERSIONS = (2, 3)
+"""Versions in a gzip stream."""
+ZSTD_VERSION = 4
+HEADER_4 = struct.Struct("<4sIIBBBBI12x")
+"""Magic, version, count, degree of the harmonics, fractional bits, flags, number of streams, offset of their table."""
+MOST_ZSTD = 20_000
+"""Largest plausible ratio of sizes of a stream. Equal bytes are compressed by more than 1,000."""
+MOST_STREAMS = 16
 MARK = b"written by IntraSplat"
 """Comment in the header of the gzip stream that identifies a file written by this program."""
 GZIP_START = b"\x1f\x8b\x08\x10" + bytes(4) + b"\x00\xff" + MARK + b"\0"
@@ -50,9 +61,7 @@ def load_spz(path: Path) -> Gaussians:
         size = os.fstat(file.fileno()).st_size
         start = file.read(4)
         if start == MAGIC:
-            raise BundleCorrupt(
-                f"{path} is a .spz file without gzip, of version 4 or later; versions 2 and 3 are read, so convert it"
-            )
+            return _load_version_4(file, path, size)
         if start[:2] != b"\x1f\x8b":
             raise BundleCorrupt(f"{path} starts with {start!r} in place of a gzip stream; it is no .spz file")
         file.seek(0)
@@ -61,11 +70,8 @@ def load_spz(path: Path) -> Gaussians:
         if magic != MAGIC:
             raise BundleCorrupt(f"{path} holds {magic!r} in place of {MAGIC!r}; it is no .spz file")
         if version not in VERSIONS:
-            raise BundleCorrupt(f"{path} is a .spz file of version {version}; versions 2 and 3 are read, so convert it")
-        if degree > MAX_SH_DEGREE or fraction > MOST_FRACTIONAL_BITS:
-            raise BundleCorrupt(
-                f"{path} has harmonics of degree {degree} and {fraction} fractional bits; at most {MAX_SH_DEGREE} and {MOST_FRACTIONAL_BITS} are possible"
-            )
+            raise BundleCorrupt(f"{path} is a .spz file of version {version}; versions 2 to 4 are read, so convert it")
+        _check_header(path, degree, fraction)
         higher = (degree + 1) ** 2 - 1
         needed = 16 + count * (9 + 1 + 3 + 3 + (3 if version == 2 else 4) + 3 * higher)
         if needed > MOST_DEFLATED * size:
@@ -78,7 +84,52 @@ def load_spz(path: Path) -> Gaussians:
         return gaussians
 
 
-def _read_arrays(content: _Inflated, count: int, version: int, higher: int, fraction: int) -> Gaussians:
+def _check_header(path: Path, degree: int, fraction: int) -> None:
+    if degree > MAX_SH_DEGREE or fraction > MOST_FRACTIONAL_BITS:
+        raise BundleCorrupt(
+            f"{path} has harmonics of degree {degree} and {fraction} fractional bits; at most {MAX_SH_DEGREE} and {MOST_FRACTIONAL_BITS} are possible"
+        )
+
+
+def _load_version_4(file: BinaryIO, path: Path, size: int) -> Gaussians:
+    file.seek(0)
+    header = file.read(HEADER_4.size)
+    if len(header) < HEADER_4.size:
+        raise BundleCorrupt(
+            f"{path} has {size} bytes, fewer than the header of .spz; the file was cut short, copy it again"
+        )
+    _, version, count, degree, fraction, _, streams, table = HEADER_4.unpack(header)
+    if version != ZSTD_VERSION:
+        raise BundleCorrupt(f"{path} is a .spz file of version {version}; versions 2 to 4 are read, so convert it")
+    _check_header(path, degree, fraction)
+    higher = (degree + 1) ** 2 - 1
+    widths = [width for width in (9, 1, 3, 3, 4, 3 * higher) if width]
+    if not len(widths) <= streams <= MOST_STREAMS or table < HEADER_4.size:
+        raise BundleCorrupt(
+            f"{path} has {streams} streams with their table at byte {table}; a .spz file of degree {degree} has {len(widths)}"
+        )
+    if table + 16 * streams > size:
+        raise BundleCorrupt(f"{path} ends before its table of streams; the file was cut short, copy it again")
+    file.seek(table)
+    sizes = struct.unpack(f"<{2 * streams}Q", file.read(16 * streams))
+    packed, plain = sizes[: 2 * len(widths) : 2], sizes[1 : 2 * len(widths) : 2]
+    if list(plain) != [count * width for width in widths]:
+        raise BundleCorrupt(
+            f"{path} has streams of other sizes than {count} Gaussians of degree {degree}; copy it again"
+        )
+    start = table + 16 * streams
+    if start + sum(sizes[::2]) > size or any(
+        much > MOST_ZSTD * (few + 1) for few, much in zip(packed, plain, strict=True)
+    ):
+        raise BundleCorrupt(f"{path}: {count} Gaussians need more bytes than its {size}; the file was cut short")
+    check_memory(path, count * 4 * (14 + 3 * higher))
+    content = _Streams(file.fileno(), path, start, packed)
+    gaussians = _read_arrays(content, count, ZSTD_VERSION, higher, fraction)
+    content.check_end()
+    return gaussians
+
+
+def _read_arrays(content: _Inflated | _Streams, count: int, version: int, higher: int, fraction: int) -> Gaussians:
     means, quats, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
     logits, sh = np.empty(count, np.float32), np.empty((count, 1 + higher, 3), np.float32)
     signs = _signs(higher)
@@ -189,6 +240,52 @@ class _Inflated:
             return self._stream.decompress(waiting, most)
         except zlib.error as error:
             raise BundleCorrupt(f"{self._path} is a damaged gzip stream ({error}); copy it again") from error
+
+
+class _Streams:
+    """Reader of the Zstandard streams of version 4, one after the other."""
+
+    def __init__(self, descriptor: int, path: Path, start: int, sizes: Sequence[int]) -> None:
+        self._path = path
+        try:
+            starts = itertools.accumulate(sizes, initial=start)
+            self._streams = [ZstdStream(descriptor, at, size) for at, size in zip(starts, sizes, strict=False)]
+        except ZstdError as error:
+            raise BundleError(f"{path} is a .spz file of version {ZSTD_VERSION}: {error}") from error
+
+    def read(self, length: int) -> bytes:
+        """Return the next `length` bytes.
+
+        Raises:
+            BundleCorrupt: if the streams end before, or are damaged.
+        """
+        pieces, missing = [], length
+        while missing:
+            if not self._streams:
+                raise BundleCorrupt(f"{self._path} ends before its last array; the file was cut short, copy it again")
+            piece = self._next(missing)
+            if not piece:
+                self._streams.pop(0)
+            pieces.append(piece)
+            missing -= len(piece)
+        return b"".join(pieces)
+
+    def check_end(self) -> None:
+        """Check that the streams hold nothing else.
+
+        Raises:
+            BundleCorrupt: otherwise, or if the last one is damaged.
+        """
+        while self._streams:
+            if self._next(1):
+                raise BundleCorrupt(f"{self._path} has more bytes in a stream than its table states; copy it again")
+            self._streams.pop(0)
+
+    def _next(self, most: int) -> bytes:
+        try:
+            return self._streams[0].read(most)
+        except ZstdError as error:
+            raise BundleCorrupt(f"{self._path} has a damaged Zstandard stream ({error}); copy it again") from error
 
 
 def spz_pieces(gaussians: Gaussians, version: int = 3) -> Iterator[bytes]:

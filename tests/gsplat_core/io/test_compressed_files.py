@@ -1,6 +1,8 @@
 """Compressed `.ply` and `.spz`, against bytes laid out here by hand, and hostile files."""
 
+import ctypes
 import gzip
+import itertools
 import struct
 import zlib
 
@@ -9,11 +11,12 @@ import pytest
 import torch
 
 from gsplat_core.errors import BundleCorrupt, BundleError, ExportError
-from gsplat_core.io import spz
+from gsplat_core.io import spz, zstd
 from gsplat_core.io.compressed_ply import BOUNDS, compressed_ply_pieces, morton_order
 from gsplat_core.io.exports.export import with_unit_rotations
 from gsplat_core.io.ply import load_ply
 from gsplat_core.io.spz import load_spz, spz_pieces
+from gsplat_core.io.zstd import library
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics_bases
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
@@ -96,6 +99,80 @@ def spz_file(count=1, version=3, degree=0, fraction=12, body=None, magic=b"NGSP"
     higher = 3 * ((degree + 1) ** 2 - 1)
     body = bytes(count * (16 + rotation + higher)) if body is None else body
     return gzip.compress(struct.pack("<4sIIBBBB", magic, version, count, degree, fraction, 0, 0) + body)
+
+
+def compressed(data: bytes) -> bytes:
+    """Compress by the same library, in one call."""
+    found = library()
+    found.ZSTD_compressBound.restype = found.ZSTD_compress.restype = ctypes.c_size_t
+    found.ZSTD_compressBound.argtypes = [ctypes.c_size_t]
+    found.ZSTD_compress.argtypes = [ctypes.c_char_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_int]
+    target = ctypes.create_string_buffer(found.ZSTD_compressBound(len(data)))
+    size = found.ZSTD_compress(target, len(target), data, len(data), 3)
+    return target.raw[:size]
+
+
+def spz_4(version_3: bytes, version=4, extension=b"", streams=None, plain=None) -> bytes:
+    """Lay out a file of version 4 with the arrays of one of version 3."""
+    whole = zlib.decompress(version_3, 31)
+    _, _, count, degree, fraction, _, _ = struct.unpack("<4sIIBBBB", whole[:16])
+    widths = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)]
+    ends = np.cumsum([16, *(count * width for width in widths)])
+    arrays = [whole[first:last] for first, last in itertools.pairwise(ends)]
+    packed = [compressed(each) for each in arrays] if streams is None else streams
+    table = 32 + len(extension)
+    header = struct.pack(
+        "<4sIIBBBBI12x", b"NGSP", version, count, degree, fraction, 2 if extension else 0, len(packed), table
+    )
+    plain = [len(each) for each in arrays] if plain is None else plain
+    sizes = [struct.pack("<QQ", len(few), much) for few, much in zip(packed, plain, strict=True)]
+    return header + extension + b"".join(sizes) + b"".join(packed)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("extension", [b"", b"\1\0\0\0\4\0\0\0abcd"])
+def test_version_4_holds_the_arrays_of_version_3(tmp_path, degree, extension):
+    version_3 = b"".join(spz_pieces(cloud(500, degree)))
+    (tmp_path / "3.spz").write_bytes(version_3)
+    (tmp_path / "4.spz").write_bytes(spz_4(version_3, extension=extension))
+    wanted, seen = (load_spz(tmp_path / name).tensors() for name in ("3.spz", "4.spz"))
+    assert all(torch.equal(seen[name], wanted[name]) for name in wanted)
+
+
+def four(**changes) -> bytes:
+    return spz_4(b"".join(spz_pieces(cloud(40, 0))), **changes)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda: four(version=5), "version 5; versions 2 to 4"),
+        (lambda: four()[:20], "cut short"),
+        (lambda: four()[:50], "cut short"),
+        (lambda: four()[:-1], "cut short"),
+        (lambda: four(plain=[1 << 50, 40, 120, 120, 160, 0]), "other sizes"),
+        (lambda: four(plain=[360, 40, 120, 120, 161, 0]), "other sizes"),
+        (lambda: four(streams=[compressed(bytes(n)) for n in (360, 40, 120, 120, 161, 0)]), "more bytes in a stream"),
+        (lambda: four(streams=[compressed(bytes(n)) for n in (360, 40, 120, 120, 159, 0)]), "cut short"),
+        (lambda: four(streams=[bytes(60)] * 6), "damaged Zstandard"),
+        (lambda: four(streams=[b""] * 6), "cut short"),
+    ],
+)  # fmt: skip
+def test_a_malformed_version_4_is_refused_with_its_reason(tmp_path, make, reason):
+    path = tmp_path / "a.spz"
+    path.write_bytes(make())
+    with pytest.raises(BundleCorrupt, match=reason) as raised:
+        load_spz(path)
+    assert str(path) in str(raised.value)
+
+
+def test_version_4_without_the_library_names_its_package(tmp_path, monkeypatch):
+    (tmp_path / "a.spz").write_bytes(four())
+    monkeypatch.setattr(zstd, "NAMES", ("libnothing.so.1",))
+    zstd.library.cache_clear()
+    with pytest.raises(BundleError, match="install the package libzstd1"):
+        load_spz(tmp_path / "a.spz")
+    zstd.library.cache_clear()
 
 
 def test_an_spz_laid_out_by_hand_is_read(tmp_path):
@@ -203,7 +280,7 @@ def _flipped(data):
     [
         (b"", "gzip"),
         (b"ply\n", "gzip"),
-        (b"NGSP" + bytes(100), "version 4"),
+        (b"NGSP" + bytes(100), "version 0; versions 2 to 4"),
         (b"\x1f\x8b\x08\x00", "cut short"),
         (gzip.compress(b"NG"), "cut short"),
         (spz_file(magic=b"PSNG"), "PSNG"),
