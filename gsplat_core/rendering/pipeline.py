@@ -101,6 +101,15 @@ Coloring = Callable[[Any], tuple[Tensor, Projection]]
 it culls."""
 
 
+class ColoredSplats(NamedTuple):
+    """Projected splats before tiles and blending; rows as in `RenderedSplats`."""
+
+    rows: Projection
+    channels: Tensor
+    opacities: Tensor
+    nearness: Tensor
+
+
 def render_splats(
     ops: StepOperations,
     geometry: Geometry,
@@ -112,8 +121,16 @@ def render_splats(
 
     Without `coloring` only depth is rendered.
     """
+    splats = project_splats(ops, geometry, coloring, settings)
+    return blend_splats(ops, splats, backgrounds, settings, geometry.viewmats.shape[:-2])
+
+
+def project_splats(
+    ops: StepOperations, geometry: Geometry, coloring: Coloring | None, settings: RenderSettings
+) -> ColoredSplats:
+    """Project and colour the Gaussians."""
     means, covars, quats, scales, opacities, viewmats, Ks = geometry
-    max_alpha, compensation_floor = CONSTANTS[settings.constants]
+    compensation_floor = CONSTANTS[settings.constants].compensation_floor
     batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     rows: Projection = ops.fully_fused_projection(
         means, covars, quats, scales, viewmats, Ks, settings.width, settings.height,
@@ -125,12 +142,10 @@ def render_splats(
     channels = None
     if coloring is not None:
         channels, rows = coloring(rows)
-    packing: dict[str, Any] = {}
+    picked = None
     if isinstance(rows, PackedProjection):
         pairs = Pairs(math.prod(batch_dims), n_cameras, n_gaussians)
         picked = pairs.ids_of(rows)
-        image_ids = rows.batch_ids * n_cameras + rows.camera_ids
-        packing = {"packed": True, "n_images": pairs.batches * n_cameras, "image_ids": image_ids}
         assert ops.values_of_rows is not None
         opacities = ops.values_of_rows(opacities, picked, pairs, len(batch_dims), settings.sparse_grad == "all")
     else:
@@ -140,21 +155,38 @@ def render_splats(
     if settings.has_depth or channels is None:
         depth = rows.depths[..., None]
         channels = depth if channels is None else torch.cat([channels, depth], -1)
-    if backgrounds is not None:
-        # Depth and further signals have no background.
-        backgrounds = pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1])) if settings.has_colors else None
     nearness = rows.depths
     if not settings.global_z_order:
         nearness = _distances_of_centres(means.detach(), viewmats.detach())
-        nearness = nearness.reshape(-1)[picked] if settings.packed else nearness
+        nearness = nearness if picked is None else nearness.reshape(-1)[picked]
+    return ColoredSplats(rows, channels, opacities, nearness)
+
+
+def blend_splats(
+    ops: StepOperations,
+    splats: ColoredSplats,
+    backgrounds: Tensor | None,
+    settings: RenderSettings,
+    image_dims: Sequence[int],
+) -> RenderedSplats:
+    """Bin splats into the tiles of pictures [..., C] and blend them."""
+    rows, channels, opacities, nearness = splats
+    packing: dict[str, Any] = {}
+    if isinstance(rows, PackedProjection):
+        image_ids = rows.batch_ids * image_dims[-1] + rows.camera_ids
+        packing = {"packed": True, "n_images": math.prod(image_dims), "image_ids": image_ids}
+    if backgrounds is not None:
+        # Depth and further signals have no background.
+        backgrounds = pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1])) if settings.has_colors else None
     grid = TileGrid(settings.tile_size, *settings.tile_grid)
     tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(
         rows.means2d, rows.radii, nearness, grid, conics=rows.conics, opacities=opacities, **packing
     )
-    isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, *reversed(settings.tile_grid))
+    isect_offsets = isect_offsets.reshape(*image_dims, *reversed(settings.tile_grid))
     image, alphas, *rest = ops.rasterize_to_pixels(
         rows.means2d, rows.conics, channels, opacities, settings.width, settings.height, settings.tile_size, isect_offsets,
-        flatten_ids, backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad, max_alpha=max_alpha,
+        flatten_ids, backgrounds=backgrounds, packed=bool(packing), absgrad=settings.absgrad,
+        max_alpha=CONSTANTS[settings.constants].max_alpha,
     )  # fmt: skip
     return RenderedSplats(
         image, alphas, rows, channels, opacities, tiles_per_gauss, flatten_ids, isect_offsets, nearness, tuple(rest)
@@ -428,6 +460,9 @@ class Operations(StepOperations):
             with_eval3d: blend by the response of the Gaussians along each pixel's ray.
             radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs, ut_params: lens
                 and shutter for `with_ut`, as in `fully_fused_projection_with_ut`.
+            distributed: the Gaussians are shared out over the processes of `torch.distributed`, and each process renders its
+                own cameras, as described in `gsplat_core.rendering.distributed`. `meta` describes this process's Gaussians as
+                seen by the cameras of all processes.
             channel_chunk, segmented, renderer_config: accepted for compatibility with gsplat; without effect. Colours may
                 have any number of channels.
 
@@ -448,10 +483,10 @@ class Operations(StepOperations):
             InvalidInput: if a shape, dtype, device or mode does not fit; the message states the observed value.
             NotImplementedError: if an argument of gsplat is not supported; the message states its value.
         """
-        asked_for = (distributed, rays, lidar_coeffs, external_distortion_coeffs)
+        asked_for = (rays, lidar_coeffs, external_distortion_coeffs)
         if any(value is not None and value is not False for value in asked_for):
             refuse_unsupported(
-                distributed=distributed, rays=rays, lidar_coeffs=lidar_coeffs,
+                rays=rays, lidar_coeffs=lidar_coeffs,
                 external_distortion_coeffs=external_distortion_coeffs,
             )  # fmt: skip
         settings = RenderSettings(
@@ -459,7 +494,7 @@ class Operations(StepOperations):
             sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
             render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
             constants=constants, global_z_order=bool(global_z_order), extra_degree=extra_signals_sh_degree,
-            normals=bool(return_normals), sparse_grad=sparse_grad,
+            normals=bool(return_normals), sparse_grad=sparse_grad, distributed=bool(distributed),
         )  # fmt: skip
         arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals)
         check_tensors(arguments, settings.has_colors)
@@ -470,6 +505,10 @@ class Operations(StepOperations):
             from gsplat_core.rendering.unscented import UnscentedCamera, with_unscented_camera
 
             camera = UnscentedCamera(*unscented)
+            if camera.given and distributed:
+                raise NotImplementedError(
+                    "distributed=True is not supported with with_ut and with_eval3d; leave one of them out"
+                )
             if camera.given:
                 ops, arguments, settings = with_unscented_camera(self, camera, arguments, settings)
         rendered = None if ops.in_one_call is None else ops.in_one_call(arguments, settings)
@@ -517,6 +556,10 @@ class Stepped(NamedTuple):
 def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> Stepped:
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals = arguments
     batch_dims, n_gaussians = _check_shapes(arguments, settings)
+    if settings.distributed:
+        from gsplat_core.rendering.distributed import all_cameras, check_distributed, exchanged
+
+        check_distributed(arguments, settings)
     if covars is not None:
         if settings.sparse_grad:
             raise InvalidInput("sparse_grad needs quats and scales, got covars; their gradient is dense")
@@ -535,8 +578,15 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
             return row_colors(ops, means, signals, viewmats, rows, settings.sparse_grad)
         return view_colors(ops, means, signals, viewmats, rows)
 
+    if settings.distributed:
+        viewmats, Ks = all_cameras(viewmats, Ks)
     geometry = Geometry(means, covars, quats, scales, opacities, viewmats, Ks)
-    splats = render_splats(ops, geometry, coloring if signals else None, backgrounds, settings)
+    mine = project_splats(ops, geometry, coloring if signals else None, settings)
+    image_dims = arguments.viewmats.shape[:-2]
+    to_blend = exchanged(mine, image_dims[-1]) if settings.distributed else mine
+    splats = blend_splats(ops, to_blend, backgrounds, settings, image_dims)
+    if settings.distributed:  # `meta` describes the Gaussians of this process
+        splats = splats._replace(rows=mine.rows, opacities=mine.opacities)
     widths = [signal.values.shape[-1] for signal in signals]
     colored = splats.image[..., : widths[0]] if settings.has_colors else splats.image[..., :0]
     extra = None if extra_signals is None else splats.image[..., sum(widths) - widths[-1] : sum(widths)]

@@ -98,6 +98,8 @@ class RenderSettings:
     """Degree of the spherical harmonics of `extra_signals`; None for plain values."""
     normals: bool = False
     sparse_grad: SparseGradients = False
+    distributed: bool = False
+    """True if the Gaussians are shared out over processes."""
 
     def __post_init__(self) -> None:
         for name, least in (("width", 1), ("height", 1), ("tile_size", 1)):
@@ -187,7 +189,6 @@ def _shown(value: object) -> str:
 
 
 REFUSED: dict[str, str] = {
-    "distributed": "render with one process",
     "rays": "give viewmats and Ks, which define the rays",
     "lidar_coeffs": (
         "use the camera models pinhole, ortho and fisheye, or gsplat_core.rendering.ranges.render_ranges for a range sensor"

@@ -47,7 +47,9 @@ def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Ras
 def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
     if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or torch.compiler.is_compiling():
         return False
-    if settings.has_distance or settings.normals or settings.sparse_grad or not settings.global_z_order:
+    if settings.has_distance or settings.normals or not settings.global_z_order:
+        return False
+    if settings.sparse_grad or settings.distributed:
         return False
     if arguments.extra_signals is not None or arguments.colors is None:
         return False

@@ -246,7 +246,7 @@ class Shutter(enum.Enum):
 @pytest.mark.parametrize(
     ("argument", "value"),
     [
-        ("distributed", True), ("camera_model", "ftheta"), ("camera_model", "lidar"),
+        ("camera_model", "ftheta"), ("camera_model", "lidar"),
     ],
 )  # fmt: skip
 def test_what_is_not_supported_says_so(scene, argument, value):
