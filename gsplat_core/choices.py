@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from gsplat_core.rendering.outputs import OutputKind
     from gsplat_core.rendering.renderer import RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
-    from gsplat_core.training.growth.densification import Growth
     from gsplat_core.training.losses.loss import LossKind
+    from gsplat_core.training.strategies.scene import StrategyKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
@@ -98,18 +98,22 @@ LOSSES: Registry[LossKind] = Registry(
         "flow": "gsplat_core.training.losses.flow:FlowLoss",
         "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
         "range": "gsplat_core.training.losses.ranges:RangeLoss",
+        "opacity": "gsplat_core.training.losses.sparsity:MeanOpacity",
+        "scale": "gsplat_core.training.losses.sparsity:MeanScale",
     },
 )
 """Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""
 
-GROWTHS: Registry[Growth] = Registry(
-    "growth",
+STRATEGIES: Registry[StrategyKind] = Registry(
+    "strategy",
     {
-        "default": "gsplat_core.training.growth.densification:densify",
-        "birth_death": "gsplat_core.training.growth.birth_death:birth_death",
+        "streaming": "gsplat_core.training.strategies.streaming:KIND",
+        "birth_death": "gsplat_core.training.strategies.birth_death:KIND",
+        "adc": "gsplat_core.training.strategies.adc:KIND",
+        "mcmc": "gsplat_core.training.strategies.mcmc:KIND",
     },
 )
-"""Changes of the Gaussians' number between offline training steps, by name."""
+"""Changes of the Gaussians during offline training, by name. `StrategyKind.library` is the class for one's own loop."""
 
 KERNELS: Registry[type[Any]] = Registry(
     "kernel",

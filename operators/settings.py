@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, GROWTHS, LOSSES, OUTPUTS, RENDERERS, Eyes
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS, STRATEGIES, Eyes
 from gsplat_core.combinations import STANDARD, check_losses, check_outputs, check_renderer_options
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
@@ -274,15 +274,15 @@ class OfflineSection(Section):
     steps: Annotated[
         int, Option("Optimiser steps over all training frames", ("reconstruct",), ge=1, le=100_000_000)
     ] = 2000
-    growth: Annotated[
+    strategy: Annotated[
         str,
         Option(
-            "Change of the Gaussians between steps: default splits those with large errors, birth_death draws deaths and"
-            " copies from the gradients of the opacities",
+            "Change of the Gaussians between steps: streaming splits those with large errors, adc those with large gradients,"
+            " mcmc moves transparent ones, birth_death draws deaths and copies from the gradients of the opacities",
             ("reconstruct",),
         ),
-        Names(GROWTHS),
-    ] = "default"
+        Names(STRATEGIES),
+    ] = "streaming"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -180,11 +180,11 @@ METHODS = (
         ),
     ),
     Method(
-        "8. Birth and death as growth of a reconstruction",
+        "8. Birth and death as strategy of a reconstruction",
         "growth",
         (
             figure("cutting: held out", "birth_death|heldout_db", "", unit="dB"),
-            figure("cutting: held out with the default growth", "default|heldout_db", "", unit="dB"),
+            figure("cutting: held out with the default strategy", "default|heldout_db", "", unit="dB"),
         ),
     ),
     Method(

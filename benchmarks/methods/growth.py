@@ -1,4 +1,4 @@
-"""Growth of an offline reconstruction: splits of large errors against birth and death, on a recording.
+"""Strategies of an offline reconstruction: splits of large errors (the default) against birth and death, on a recording.
 
     python benchmarks/methods/growth.py [--recording DIR] [--steps 300] [--full] [--device cpu|cuda] [--out FILE]
 
@@ -36,9 +36,9 @@ def main() -> None:
     recording = open_recording(str(chosen.recording), scale=scale, max_frames=most)
     frames = list(recording)
     figures: dict[str, object] = {"recording": chosen.recording.name, "scale": scale, "steps": steps, "gaussians": last}
-    for growth in ("default", "birth_death"):
+    for name, strategy in (("default", "streaming"), ("birth_death", "birth_death")):
         config = ReconstructorConfig(
-            gaussians=first, max_gaussians=last, motion_spacing_s=0.05, squared_error=True, growth=growth
+            gaussians=first, max_gaussians=last, motion_spacing_s=0.05, squared_error=True, strategy=strategy
         )
         learning = Reconstructor(config, recording.camera, device=chosen.device)
         start = time.perf_counter()
@@ -51,7 +51,7 @@ def main() -> None:
                 camera = recording.camera if frame.pose is None else recording.camera.with_pose(frame.pose)
                 image = render(model.at(frame.time_s), camera).image.clamp(0, 1).cpu().numpy()
                 scores.append(psnr_tissue_db(np.asarray(image, np.float32), frame.image, frame.mask))
-        figures[growth] = {
+        figures[name] = {
             "heldout_db": round(statistics.mean(scores), 3),
             "gaussians": model.gaussian_count,
             "seconds": round(seconds, 1),

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import get_args
 
-from gsplat_core.choices import FIELDS, GROWTHS, MOTION_PRIORS, RENDERERS, Eyes
+from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, STRATEGIES, Eyes
 from gsplat_core.combinations import check_losses
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
@@ -99,8 +99,8 @@ class ReconstructorConfig:
     """Renderer that trains the scene: a name in `RENDERERS`. The pictures of a renderer without gradients are trained
     by alpha blending.
     """
-    growth: str = "default"
-    """Change of the Gaussians between offline training steps: a name in `GROWTHS`."""
+    strategy: str = "streaming"
+    """Change of the Gaussians between offline training steps: a name in `STRATEGIES`."""
     losses: tuple[str, ...] = ()
     """Losses added to those of colours and depth: names in `LOSSES`, each optionally followed by a colon and its
     weight. On a GPU, a step with further losses is not captured as a CUDA graph and therefore slower.
@@ -134,7 +134,12 @@ class ReconstructorConfig:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
         MOTION_PRIORS.check(self.motion_prior)
         RENDERERS.check(self.renderer)
-        GROWTHS.check(self.growth)
+        STRATEGIES.check(self.strategy)
+        if self.trained_by != "alpha" and STRATEGIES[self.strategy].alpha_only:
+            raise InvalidSetting(
+                f"strategy {self.strategy!r} needs a scene that alpha blending trains, and renderer {self.renderer!r} trains"
+                f" by itself; choose strategy 'streaming' with it, or renderer 'alpha' with {self.strategy!r}"
+            )
         loss_weights(self.losses)
         check_losses(self.renderer, self.losses)
         if self.motion_detail not in get_args(Detail):
@@ -189,6 +194,13 @@ class ReconstructorConfig:
         share = origin.right_share_offline if all_known else None
         rates = self.rates if share is None else dataclasses.replace(self.rates, right_share=share)
         return dataclasses.replace(self, depth_weight=factor * self.depth_weight, rates=rates)
+
+    @property
+    def trained_by(self) -> str:
+        """Name of the renderer that trains the scene: `renderer`, or "alpha" if that has no gradients."""
+        if self.renderer == "alpha" or RENDERERS[self.renderer].capabilities.differentiable:
+            return self.renderer
+        return "alpha"
 
     @property
     def chosen_field(self) -> str:

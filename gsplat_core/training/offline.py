@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_core.choices import GROWTHS
+from gsplat_core.choices import STRATEGIES
 from gsplat_core.depth.maps import OfRecording
 from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.growth.densification import UNSEEN_PX, on_tissue, shares_of
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.strategies.scene import Plan
 
 NOISE_LEVELS = 2.5
 """Standard deviation of noise in compressed video, in grey levels of 255."""
@@ -71,22 +70,11 @@ RIGIDITY = 1.0
 """Strength of spatial smoothing: share of the way of a Gaussian's motion to its neighbours' mean per pass over all frames,
 scaled by the learning rates' factor. It is reduced for fast motion by the root of `steadiness`.
 """
-DENSIFY_ROUNDS = 6
-"""Number of densification rounds, which remove invisible Gaussians and split those with large errors."""
-DENSIFY_UNTIL = 0.7
-"""Share of the steps after which the last round takes place; rounds are spread evenly."""
-DENSIFY_FRAMES = 12
-"""Number of random frames in which each round measures the error."""
 
 
 def rate_at(share: float) -> float:
     """Return the factor of the learning rates after this share of the steps."""
     return FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share))
-
-
-def densification_rounds(steps: int) -> list[int]:
-    """Return the step numbers of the densification rounds."""
-    return [round(steps * DENSIFY_UNTIL * (k + 1) / DENSIFY_ROUNDS) for k in range(DENSIFY_ROUNDS)]
 
 
 def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observation]) -> list[Observation]:
@@ -160,14 +148,14 @@ class OfflineTraining:
         *,
         most_gaussians: int,
         seed: int,
-        growth: str = "default",
+        strategy: str = "streaming",
     ) -> None:
         self._step = step
-        self._grow = GROWTHS[growth]
+        self._kind = STRATEGIES[strategy]
         rights = [one.right for one in observations if one.right is not None]
         self._observations = [*observations, *rights]
         """Observations of both eyes."""
-        self._first_count, self._most = step.gaussians.count, most_gaussians
+        self._most_gaussians, self._seed = most_gaussians, seed
         steady = steadiness(observations)
         # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
         # its root.
@@ -180,12 +168,13 @@ class OfflineTraining:
 
     def __call__(self, steps: int, progress: Callable[[int, Tensor], None] | None) -> Tensor:
         """Run `steps` steps, calling `progress` after each. Returns the last loss, [] on the device."""
-        rounds = densification_rounds(steps)
+        strategy = self._kind.training(
+            Plan(self._step, self._observations, steps, self._most_gaussians, self._random, self._seed)
+        )
         loss = torch.zeros(())
         for number in range(steps):
-            while rounds and number >= rounds[0] > 0:
-                self._densify(1 - (len(rounds) - 1) / DENSIFY_ROUNDS)
-                rounds.pop(0)
+            if strategy.before_step(number, self._rate):
+                self._neighbours = None
             self._rate = rate_at(number / steps)
             loss = self._step(self._next(), rate_scale=self._rate)
             if (number + 1) % SMOOTH_EVERY == 0:
@@ -211,23 +200,3 @@ class OfflineTraining:
             if self._neighbours is None:
                 self._neighbours = nearest_others(self._step.gaussians.means)
             share_motion(self._neighbours, min(self._rigidity * each, MOST_AT_ONCE))
-
-    def _densify(self, share: float) -> None:
-        """Run a densification round that raises the number of Gaussians in proportion to `share`, the share of all
-        rounds completed with it.
-        """
-        self._step.settle(self._observations[-1], rate_scale=self._rate)
-        self._neighbours = None
-        order = self._random.permutation(len(self._observations)).tolist()
-        chosen, others = (
-            [self._observations[index] for index in part] for part in (order[:DENSIFY_FRAMES], order[DENSIFY_FRAMES:])
-        )
-        shares = shares_of(self._step, chosen)
-        # Gaussians hidden in all chosen pictures may be visible in others.
-        hidden = ~on_tissue(self._step, chosen)
-        if bool(hidden.any()):
-            seen_px = torch.where(
-                hidden & on_tissue(self._step, others), shares.seen_px.clamp(min=UNSEEN_PX), shares.seen_px
-            )
-            shares = replace(shares, seen_px=seen_px)
-        self._grow(self._step, shares, round(self._first_count + (self._most - self._first_count) * share))

@@ -52,6 +52,19 @@ class LossWeights:
         return self.squared and self.ssim == 0
 
 
+class ScreenGradients(NamedTuple):
+    """Gradients of a loss by the projected Gaussians."""
+
+    means2d: Tensor
+    """Gradients [N, 2] by the centres in pixels."""
+    radii: Tensor
+    """Radii in pixels, int32 [N, 2]; 0 for Gaussians that are not in the picture."""
+    width: int
+    """Width of the picture in pixels."""
+    height: int
+    """Height of the picture in pixels."""
+
+
 class Compared(NamedTuple):
     """Result of comparing a rendered frame with an observation."""
 
@@ -61,6 +74,8 @@ class Compared(NamedTuple):
     """Gradients of the loss by each of the Gaussians' five raw tensors."""
     colour_change: Tensor | None = None
     """Correction [N, 3] of the colours of degree 0, `sh[:, 0]`, whose gradient is then 0; None without a correction."""
+    screen: ScreenGradients | None = None
+    """Gradients in the picture; None for renderers other than alpha blending."""
 
 
 @torch.no_grad()
@@ -121,7 +136,8 @@ def loss_and_gradients(
         "logit_opacities": v_opacities * opacities * (1 - opacities),
         "sh": v_sh,
     }
-    return Compared(loss, gradients, colour_change)
+    screen = ScreenGradients(v_means2d, splats.rows.radii[0], settings.width, settings.height)
+    return Compared(loss, gradients, colour_change, screen)
 
 
 class ComparedByAutograd(NamedTuple):

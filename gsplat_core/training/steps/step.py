@@ -12,7 +12,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from gsplat_core.choices import RENDERERS
+from gsplat_core.choices import RENDERERS, STRATEGIES
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kinds import FieldRates, FieldTraining
 from gsplat_core.deformation.registry import kind_of
@@ -35,6 +35,7 @@ from gsplat_core.training.steps.photometric import (
     RIGHT,
     Compared,
     LossWeights,
+    ScreenGradients,
     loss_and_gradients,
     loss_by_autograd,
     with_eye,
@@ -162,7 +163,8 @@ class TrainingStep:
         # length.
         depth_weight = config.depth_weight * self.distance(camera) if config.depth_weight else 0.0
         self._weights = LossWeights(config.ssim_weight, depth_weight, config.squared_error)
-        self._losses = WeightedLosses(loss_weights(config.losses))
+        strategy = STRATEGIES[config.strategy]
+        self._losses = WeightedLosses({**strategy.losses, **loss_weights(config.losses)})
         self._pictures: PictureTraining | None = None
         """Training by another renderer than alpha blending."""
         if config.renderer != "alpha" and RENDERERS[config.renderer].capabilities.differentiable:
@@ -197,7 +199,12 @@ class TrainingStep:
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         frame_deltas = self.capabilities.frame_deltas
-        captures = gaussians.device.type == "cuda" and not self._losses and self._pictures is None
+        self.screen: ScreenGradients | None = None
+        """Gradients of the last step in its picture, if the strategy reads them."""
+        self._keeps_screen = strategy.screen_gradients
+        captures = (
+            gaussians.device.type == "cuda" and not self._losses and self._pictures is None and not self._keeps_screen
+        )
         if captures and kind.captured_training is not None and frame_deltas is not None:
             training = kind.captured_training(field)
             self._rate_values, self._frame_time = training.rate_values, frame_deltas.frame_time
@@ -235,6 +242,7 @@ class TrainingStep:
             compared = loss_and_gradients(seen, observation, self._weights, relaxation)
             if self._losses:
                 compared = with_losses(compared, seen, losses)
+        self.screen = compared.screen if self._keeps_screen else None
         gradients = compared.gradients if right_sh is None else with_eye(compared.gradients, of_right)
         own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         if right_sh is not None:
@@ -370,6 +378,46 @@ class TrainingStep:
             if self.capabilities.rows is not None:
                 self.capabilities.rows.select(moves.order)
         return moves
+
+    def moments(self, name: str) -> dict[str, Tensor]:
+        """Return copies of Adam's moments of a tensor of the Gaussians, by torch.optim.Adam's names."""
+        count, adam = self.gaussians.count, self._adam
+        return {
+            "exp_avg": adam.first_moments[name][:count].clone(),
+            "exp_avg_sq": adam.second_moments[name][:count].clone(),
+        }
+
+    def rearrange(self, source: Tensor, gaussians: Gaussians, moments: Mapping[str, Mapping[str, Tensor]]) -> Tensor:
+        """Replace the Gaussians by M others, of which each moves as the present one at `source`. Synchronises.
+
+        Args:
+            source: present rows, int64 [M]; a row may occur several times, and those that do not occur are removed.
+            gaussians: the M Gaussians.
+            moments: their moments by tensor, as from `moments`.
+
+        Returns:
+            Order of the scene's rows: index into `gaussians`, int64 [M].
+        """
+        count, total = self.gaussians.count, len(source)
+        numbers = torch.arange(total, device=source.device)
+        first = numbers.new_full((count,), total).scatter_reduce(0, source, numbers, "amin")
+        copies = (first[source] != numbers).nonzero()[:, 0]
+        kept = self.remove(first == total).order
+        row_of = numbers.new_zeros(count)
+        row_of[kept] = numbers[: len(kept)]
+        if len(copies):
+            self.append(gaussians.select(copies), row_of[source[copies]])
+        order = torch.cat([first[kept], copies])
+        for name, tensor in self.gaussians.tensors().items():
+            tensor.copy_(gaussians.tensors()[name][order])
+            self._adam.first_moments[name][:total] = moments[name]["exp_avg"][order]
+            self._adam.second_moments[name][:total] = moments[name]["exp_avg_sq"][order]
+        return order
+
+    @property
+    def means_rate(self) -> float:
+        """Learning rate of positions in world units."""
+        return self._rates.means_px * self._mm_per_px
 
     def restart(self, gaussians: Gaussians, time_s: float, camera: Camera) -> bool:
         """Start another scene of the same camera size in the same memory. Returns False, with

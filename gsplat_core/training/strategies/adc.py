@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.training.strategies.operations import duplicate, remove, reset_opa, split
+from gsplat_core.training.strategies.scene import Plan, StrategyKind, change_rows, every_of, views_of
 from gsplat_core.training.strategies.strategy import GEOMETRY, InvalidParameters, Optimizers, Params, Strategy
 
 
@@ -191,3 +192,64 @@ class DefaultStrategy(Strategy):
         if name not in info:
             raise InvalidParameters(f"info lacks {name!r}; pass the third result of rasterization")
         return info[name]
+
+
+@dataclass
+class CappedAdc(DefaultStrategy):
+    """Adaptive density control that multiplies those with the largest gradients first, up to a number of Gaussians."""
+
+    cap_max: int = field(default=1_000_000, kw_only=True)
+    """Largest number of Gaussians."""
+
+    def _to_grow(self, params: Params, state: dict[str, Any], step: int) -> tuple[Tensor, Tensor]:
+        copied, divided = super()._to_grow(params, state, step)
+        mean = state["grad2d"] / state["count"].clamp(min=1)
+        order = mean.masked_fill(~(copied | divided), -1.0).argsort(descending=True, stable=True)
+        allowed = torch.zeros_like(copied)
+        allowed[order[: max(0, self.cap_max - len(order))]] = True
+        return copied & allowed, divided & allowed
+
+
+FEWEST_STEPS_TO_RESET = 1000
+"""Smallest number of steps between two resets of a scene's opacities, which need several hundred steps to recover."""
+
+
+class SceneAdc:
+    """Adaptive density control of an offline reconstruction, on gsplat's schedule relative to 30,000 steps."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._step = plan.step
+        self._strategy = CappedAdc(
+            refine_start_iter=plan.steps // 60,
+            refine_stop_iter=plan.steps // 2,
+            refine_every=every_of(plan.steps),
+            reset_every=max(FEWEST_STEPS_TO_RESET, plan.steps // 10),
+            generator=torch.Generator(plan.step.gaussians.device).manual_seed(plan.seed),
+            cap_max=plan.most_gaussians,
+        )
+        self._state = self._strategy.initialize_state(plan.step.distance(plan.observations[0].camera))
+
+    def before_step(self, number: int, rate_scale: float) -> bool:
+        """See `SceneStrategy`."""
+        strategy, screen = self._strategy, self._step.screen
+        if screen is None or number >= strategy.refine_stop_iter:
+            return False
+        centres = torch.empty_like(screen.means2d)[None]
+        centres.grad = screen.means2d[None]
+        info = {
+            "means2d": centres, "radii": screen.radii[None], "width": screen.width, "height": screen.height,
+            "n_cameras": 1,
+        }  # fmt: skip
+        if number % strategy.refine_every and number % strategy.reset_every:
+            strategy._update_state(views_of(self._step), self._state, info)
+            return False
+        change_rows(
+            self._step,
+            self._state,
+            lambda params, optimizers: strategy.step_post_backward(params, optimizers, self._state, number, info),
+        )
+        return True
+
+
+KIND = StrategyKind(SceneAdc, DefaultStrategy, screen_gradients=True, alpha_only=True)
+"""The strategy's entry in `STRATEGIES`."""

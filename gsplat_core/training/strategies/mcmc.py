@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsplat_core.training.strategies.operations import inject_noise_to_position, relocate, sample_add
 from gsplat_core.training.strategies.relocation import binomials
+from gsplat_core.training.strategies.scene import Plan, StrategyKind, change_rows, every_of, views_of
 from gsplat_core.training.strategies.strategy import GEOMETRY, Optimizers, Params, Strategy
 
 GROWTH = 1.05
@@ -117,3 +118,41 @@ class MCMCStrategy(Strategy):
                 f"no live Gaussians: all opacities are at most min_opacity={self.min_opacity}; lower the learning rates or"
                 " the weight of the mean opacity"
             )
+
+
+class SceneMcmc:
+    """Markov chain of an offline reconstruction, on gsplat's schedule relative to 30,000 steps.
+
+    The noise is computed in units of the scene's distance from the camera, so that it does not depend on the unit of length.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._step = plan.step
+        distance = plan.step.distance(plan.observations[0].camera)
+        self._strategy = MCMCStrategy(
+            cap_max=plan.most_gaussians,
+            noise_lr=MCMCStrategy.noise_lr / distance**2,
+            refine_start_iter=plan.steps // 60,
+            refine_stop_iter=plan.steps * 5 // 6,
+            refine_every=every_of(plan.steps),
+            generator=torch.Generator(plan.step.gaussians.device).manual_seed(plan.seed),
+        )
+        self._state = self._strategy.initialize_state()
+
+    def before_step(self, number: int, rate_scale: float) -> bool:
+        """See `SceneStrategy`."""
+        if number == 0:
+            return False
+        strategy, rate = self._strategy, self._step.means_rate * rate_scale
+        change = lambda params, optimizers: strategy.step_post_backward(
+            params, optimizers, self._state, number, {}, lr=rate
+        )
+        if number % strategy.refine_every:
+            change(views_of(self._step), {})
+            return False
+        change_rows(self._step, self._state, change)
+        return True
+
+
+KIND = StrategyKind(SceneMcmc, MCMCStrategy, losses={"opacity": 0.01, "scale": 0.01}, alpha_only=True)
+"""The strategy's entry in `STRATEGIES`."""

@@ -144,7 +144,7 @@ def test_defaults_are_those_of_the_published_figures():
         "motion_spacing_s": 0.2, "squared_error": False, "history_s": None, "preallocate": False, "ssim_weight": 0.0,
         "depth_weight": 0.1, "default_depth_mm": 60.0, "eyes": "left", "motion_prior": "bumps", "motion_detail": "full",
         "start_from_motion": False, "depth_from_motion": False, "depth_of_recording": None,
-        "growth": "default", "losses": (), "renderer": "alpha",
+        "losses": (), "renderer": "alpha", "strategy": "streaming",
     }  # fmt: skip
     assert rates == {"means_px": 0.03, "quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh": 5e-3,
                      "right_share": 0.1, "field": None}  # fmt: skip

@@ -12,12 +12,12 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.birth_death import birth_death, relocated
-from gsplat_core.training.growth.densification import UNSEEN_PX, Shares, densify, halves, shares_of
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.strategies.birth_death import birth_death, relocated
+from gsplat_core.training.strategies.streaming import UNSEEN_PX, Shares, densify, halves, shares_of
 
 
 @pytest.fixture(params=[False, True], ids=["exact", "preallocated"])
@@ -189,9 +189,9 @@ def test_two_copies_keep_the_opacity_and_the_brightness(device):
 
 
 def test_a_fit_with_birth_and_death_keeps_the_count(make_frame, camera):
-    config = ReconstructorConfig(field="basis", gaussians=100, max_gaussians=100, growth="birth_death")
+    config = ReconstructorConfig(field="basis", gaussians=100, max_gaussians=100, strategy="birth_death")
     reconstructor = Reconstructor(config, camera)
     reconstructor.fit([make_frame(seq, shift_px=seq) for seq in range(4)], steps=20)
     assert reconstructor.gaussians == 100
-    with pytest.raises(InvalidSetting, match="unknown growth 'none'; known are default, birth_death"):
-        ReconstructorConfig(growth="none")
+    with pytest.raises(InvalidSetting, match="unknown strategy 'none'; known are streaming, birth_death, adc, mcmc"):
+        ReconstructorConfig(strategy="none")

@@ -17,6 +17,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.strategies import streaming
 
 CONFIG = ReconstructorConfig(field="basis", gaussians=300, max_gaussians=500, squared_error=True)
 
@@ -30,7 +31,7 @@ def test_rates_fall_from_all_to_what_is_left():
 
 
 def test_rounds_are_spread_evenly_up_to_their_share_of_the_steps():
-    assert offline.densification_rounds(600) == [70, 140, 210, 280, 350, 420]
+    assert streaming.densification_rounds(600) == [70, 140, 210, 280, 350, 420]
 
 
 def fitted(camera, frames, steps, config=CONFIG, **constants):
@@ -38,7 +39,7 @@ def fitted(camera, frames, steps, config=CONFIG, **constants):
     counts = []
     with pytest.MonkeyPatch.context() as patch:
         for name, value in constants.items():
-            patch.setattr(offline, name, value)
+            patch.setattr(streaming if name.startswith("DENSIFY") else offline, name, value)
         learning.fit(frames, steps, lambda *_: counts.append(learning.gaussians))
     return learning, counts
 

@@ -8,11 +8,11 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training import offline
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes, right_tissue
 from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.strategies import streaming
 from tests.gsplat_core.training.two_eyes import HEIGHT, LEFT, RIGHT, THIRD, WIDTH, seen, stereo_frame
 
 CONFIG = ReconstructorConfig(
@@ -175,7 +175,7 @@ def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
 
 
 def test_offline_training_takes_both_eyes(monkeypatch):
-    monkeypatch.setattr(offline, "DENSIFY_ROUNDS", 1)
+    monkeypatch.setattr(streaming, "DENSIFY_ROUNDS", 1)
     config = dataclasses.replace(CONFIG, depth_of_recording=None)
     views = {}
     for eyes in ("left", "both"):
@@ -208,7 +208,7 @@ def tinted(seq: int) -> Frame:
 @pytest.mark.parametrize(("way", "better_db"), [("online", 0.1), ("offline", 0.2), ("live", 4)])
 def test_each_eye_keeps_its_own_colours(way, better_db, monkeypatch):
     """A tint of one eye appears in its own rendered picture and not in that of the other eye."""
-    monkeypatch.setattr(offline, "DENSIFY_ROUNDS", 1)
+    monkeypatch.setattr(streaming, "DENSIFY_ROUNDS", 1)
     frames = [tinted(seq) for seq in range(4)]
     if way == "live":
         config = dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True)

@@ -1,4 +1,4 @@
-"""Birth-death moves between offline training steps: Gaussians that raise the loss make place for copies of others.
+"""The strategy `birth_death`, birth-death moves between offline training steps: Gaussians that raise the loss make place for copies of others.
 
 Births and deaths are drawn from φ = ∂L/∂ln o (`gsplat_core.regression.birth_death`), which follows from the gradients that the
 optimiser has averaged. Copies take the opacities and scales that keep the picture (Kheradmand et al. 2024, "3D Gaussian
@@ -15,8 +15,9 @@ from torch import Tensor
 
 from gsplat_core.regression.birth_death import probabilities
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.growth.densification import UNSEEN_PX, Shares, halves
 from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.strategies.scene import StrategyKind
+from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares, halves
 
 RATE = 0.05
 """Deaths per Gaussian and round at one standard deviation of φ."""
@@ -70,3 +71,7 @@ def relocated(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
         replace(each, logit_opacities=logits.clone(), log_scales=log_scales.clone()) for each in halves(parents)
     )
     return first, second
+
+
+KIND = StrategyKind(lambda plan: Rounds(plan, birth_death))
+"""The strategy's entry in `STRATEGIES`."""

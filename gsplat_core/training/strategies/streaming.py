@@ -1,4 +1,4 @@
-"""Densification between offline training steps: removes invisible Gaussians and splits those with large errors.
+"""The strategy `streaming`, for scenes that start complete: removes invisible Gaussians and splits those with large errors.
 
 A Gaussian's share of the error is computed by the gradient trick of Rota Bulò et al. 2024 ("Revising Densification in
 Gaussian Splatting", section 3.1). The gradient of a colour common to all Gaussians, for a picture weighted by the
@@ -18,6 +18,7 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.strategies.scene import Plan, StrategyKind
 
 UNSEEN_PX = 0.5
 """Sum of blending weights in every picture, in pixels, below which a Gaussian counts as invisible."""
@@ -73,8 +74,60 @@ def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor
     return found
 
 
-Growth = Callable[[TrainingStep, Shares, int], None]
-"""Change of the Gaussians in a round: the step, visibility and error of each Gaussian, and the wanted number."""
+DENSIFY_ROUNDS = 6
+"""Number of rounds, spread evenly."""
+DENSIFY_UNTIL = 0.7
+"""Share of the steps after which the last round takes place."""
+DENSIFY_FRAMES = 12
+"""Number of random frames in which each round measures the error."""
+
+
+def densification_rounds(steps: int) -> list[int]:
+    """Return the step numbers of the rounds."""
+    return [round(steps * DENSIFY_UNTIL * (k + 1) / DENSIFY_ROUNDS) for k in range(DENSIFY_ROUNDS)]
+
+
+class Rounds:
+    """Strategy that changes the Gaussians in a few rounds, by their visibility and error in random frames."""
+
+    def __init__(self, plan: Plan, change: Callable[[TrainingStep, Shares, int], None]) -> None:
+        """Create the strategy.
+
+        Args:
+            plan: the training.
+            change: called in each round with the step, the Gaussians' visibility and error, and their wanted number.
+        """
+        self._plan, self._change = plan, change
+        self._first_count = plan.step.gaussians.count
+        self._rounds = densification_rounds(plan.steps)
+
+    def before_step(self, number: int, rate_scale: float) -> bool:
+        """See `SceneStrategy`."""
+        changed = False
+        while self._rounds and number >= self._rounds[0] > 0:
+            self._round(1 - (len(self._rounds) - 1) / DENSIFY_ROUNDS, rate_scale)
+            self._rounds.pop(0)
+            changed = True
+        return changed
+
+    def _round(self, share: float, rate_scale: float) -> None:
+        """Run a round that raises the number of Gaussians in proportion to `share`, the share of all rounds completed
+        with it.
+        """
+        step, observations = self._plan.step, self._plan.observations
+        step.settle(observations[-1], rate_scale=rate_scale)
+        order = self._plan.random.permutation(len(observations)).tolist()
+        chosen, others = (
+            [observations[index] for index in part] for part in (order[:DENSIFY_FRAMES], order[DENSIFY_FRAMES:])
+        )
+        shares = shares_of(step, chosen)
+        # Gaussians hidden in all chosen pictures may be visible in others.
+        hidden = ~on_tissue(step, chosen)
+        if bool(hidden.any()):
+            seen_px = torch.where(hidden & on_tissue(step, others), shares.seen_px.clamp(min=UNSEEN_PX), shares.seen_px)
+            shares = replace(shares, seen_px=seen_px)
+        first, most = self._first_count, self._plan.most_gaussians
+        self._change(step, shares, round(first + (most - first) * share))
 
 
 @torch.no_grad()
@@ -107,3 +160,7 @@ def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
     w, q = unit[:, :1], unit[:, 1:]
     across = torch.linalg.cross(q, vectors)
     return vectors + 2 * (w * across + torch.linalg.cross(q, across))
+
+
+KIND = StrategyKind(lambda plan: Rounds(plan, densify))
+"""The strategy's entry in `STRATEGIES`."""
