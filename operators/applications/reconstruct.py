@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -32,8 +32,13 @@ from operators.applications.session import (
     saves_model,
 )
 from operators.errors import NothingShown
-from operators.settings import check_option
+from operators.settings import OfflineSection, check_option
 from operators.sources.source import FrameSource
+
+
+@dataclass(frozen=True)
+class ReconstructSettings(ReplaySettings, OfflineSection):
+    """Settings of an offline reconstruction. Raises InvalidSetting for a value out of range."""
 
 
 class FittedModel:
@@ -74,7 +79,8 @@ def reconstruct(
     """Train offline, then evaluate, and write the same files as a replay.
 
     Args:
-        settings: settings of the run; held-out frames are always excluded.
+        settings: settings of the run, `ReconstructSettings` for options of offline training; held-out frames are always
+            excluded.
         steps: number of optimiser steps.
         progress: called after each step or frame.
         stop_requested: polled. True during training saves the model without evaluation; True during

@@ -345,11 +345,10 @@ def reconstruct(
     recording: RecordingArgument, out: OutOption, options: Mapping[str, Any], json: JsonOption = False
 ) -> int:
     """Reconstruct offline: train on all training frames, then evaluate the held-out ones."""
-    from operators.applications.replay import ReplaySettings
+    from operators.applications.reconstruct import ReconstructSettings
     from services.cli.runs import reconstruct_command
 
-    chosen = ReconstructOptions(**options)
-    return reconstruct_command(ReplaySettings(recording, out, **chosen.options(JobOptions)), chosen.steps, as_json=json)
+    return reconstruct_command(ReconstructSettings(recording, out, **options), as_json=json)
 
 
 @app.command()

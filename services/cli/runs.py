@@ -20,7 +20,7 @@ from gsplat_core.io.sessions import WriterOptions
 from operators.applications.live import live
 from operators.applications.live_settings import LiveSettings
 from operators.applications.progress import ProgressCallback
-from operators.applications.reconstruct import reconstruct
+from operators.applications.reconstruct import ReconstructSettings, reconstruct
 from operators.applications.recording import new_recording_folder
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Report, RunOutcome
@@ -111,13 +111,15 @@ def replay_command(settings: ReplaySettings, *, as_json: bool) -> int:
     return report_run(lambda *callbacks: replay(settings, *callbacks), settings.out, as_json=as_json)
 
 
-def reconstruct_command(settings: ReplaySettings, steps: int, *, as_json: bool) -> int:
+def reconstruct_command(settings: ReconstructSettings, *, as_json: bool) -> int:
     """Reconstruct offline, write the reports and print their paths.
 
     Returns:
         The exit code.
     """
-    return report_run(lambda *callbacks: reconstruct(settings, steps, *callbacks), settings.out, as_json=as_json)
+    return report_run(
+        lambda *callbacks: reconstruct(settings, settings.steps, *callbacks), settings.out, as_json=as_json
+    )
 
 
 _KEPT = re.compile(r"(\d+(?:\.\d+)?) *([A-Za-z]+)", re.ASCII)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS
+from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS, STRATEGIES
 from gsplat_core.errors import InvalidSetting
+from operators.applications.reconstruct import ReconstructSettings
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS
 from operators.options import options_for
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
@@ -63,6 +64,7 @@ def given(monkeypatch, tmp_path):
                 found.update(options)
 
         monkeypatch.setattr("operators.applications.replay.ReplaySettings", keep)
+        monkeypatch.setattr("operators.applications.reconstruct.ReconstructSettings", keep)
         monkeypatch.setattr("services.cli.runs.live_settings", keep)
         monkeypatch.setattr(
             "services.cli.batch.batch_command", lambda folder, out, workers, options, **_: keep(**options)
@@ -206,6 +208,13 @@ def test_a_combination_that_does_not_work_is_refused_everywhere_with_one_that_do
 def test_losses_that_there_are_not_are_refused(value, message):
     with pytest.raises(InvalidSetting, match=message):
         ReplayOptions(losses=value)
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_reaches_the_reconstructor(name, given, tmp_path):
+    assert given("reconstruct", "--strategy", name).strategy == name
+    settings = ReconstructSettings(tmp_path, tmp_path / "out", strategy=name)
+    assert settings.reconstructor_config(offline=True).strategy == name
 
 
 @pytest.mark.parametrize("name", [*SINKS, ",".join(SINKS), "none"])
