@@ -30,6 +30,8 @@ OUTPUTS_OF: Mapping[str, tuple[str, ...]] = {
 """Outputs by renderer."""
 OWN_OPACITIES = ("weighted_sum",)
 """Renderers that train opacities of their own. Losses other than those of every step blend by the opacities of `alpha`."""
+WITH_OPACITIES_OF_ALPHA = ("adc", "mcmc")
+"""Strategies that rely on alpha blending as the renderer that trains the scene."""
 OF_EVERY_STEP = ("photometric", "depth")
 """Losses that every step computes by the trained renderer's picture."""
 
@@ -76,4 +78,17 @@ def check_losses(renderer: str, losses: Iterable[str]) -> None:
         raise InvalidSetting(
             f"loss {further[0]!r} uses the opacities of alpha blending, and renderer {renderer!r} trains others; choose"
             f" renderer alpha, or leave the losses {', '.join(further)} out"
+        )
+
+
+def check_strategy(renderer: str, strategy: str) -> None:
+    """Check that a strategy can change the Gaussians of a scene that `renderer` trains.
+
+    Raises:
+        InvalidSetting: otherwise.
+    """
+    if strategy in WITH_OPACITIES_OF_ALPHA and renderer in OWN_OPACITIES:
+        raise InvalidSetting(
+            f"strategy {strategy!r} uses the opacities of alpha blending, and renderer {renderer!r} trains others; choose"
+            f" renderer alpha, or strategy streaming"
         )

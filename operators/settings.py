@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS, STRATEGIES, Eyes
-from gsplat_core.combinations import STANDARD, check_losses, check_outputs, check_renderer_options
+from gsplat_core.combinations import STANDARD, check_losses, check_outputs, check_renderer_options, check_strategy
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
 from operators.graph.application import Engine
@@ -175,7 +175,7 @@ RENDERER_OPTIONS = ("samples", "supersampling", "order", "progressive", "storage
 
 
 def check_display(options: Mapping[str, Any]) -> None:
-    """Check the combination of the options `renderer`, those of the renderer, `outputs` and `losses`.
+    """Check the combination of the options `renderer`, those of the renderer, `outputs`, `losses` and `strategy`.
 
     Args:
         options: values by name; an absent one has its default.
@@ -187,6 +187,7 @@ def check_display(options: Mapping[str, Any]) -> None:
     check_renderer_options(renderer, [name for name in RENDERER_OPTIONS if options.get(name)])
     check_outputs(renderer, listed(options.get("outputs")) or ())
     check_losses(renderer, listed(options.get("losses")) or ())
+    check_strategy(renderer, options.get("strategy") or "streaming")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, STRATEGIES, Eyes
-from gsplat_core.combinations import check_losses
+from gsplat_core.combinations import check_losses, check_strategy
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
@@ -135,13 +135,9 @@ class ReconstructorConfig:
         MOTION_PRIORS.check(self.motion_prior)
         RENDERERS.check(self.renderer)
         STRATEGIES.check(self.strategy)
-        if self.trained_by != "alpha" and STRATEGIES[self.strategy].alpha_only:
-            raise InvalidSetting(
-                f"strategy {self.strategy!r} needs a scene that alpha blending trains, and renderer {self.renderer!r} trains"
-                f" by itself; choose strategy 'streaming' with it, or renderer 'alpha' with {self.strategy!r}"
-            )
         loss_weights(self.losses)
         check_losses(self.renderer, self.losses)
+        check_strategy(self.renderer, self.strategy)
         if self.motion_detail not in get_args(Detail):
             raise InvalidSetting(f"motion_detail is {self.motion_detail!r}; choose {' or '.join(get_args(Detail))}")
         check_eyes(self.eyes)
@@ -194,13 +190,6 @@ class ReconstructorConfig:
         share = origin.right_share_offline if all_known else None
         rates = self.rates if share is None else dataclasses.replace(self.rates, right_share=share)
         return dataclasses.replace(self, depth_weight=factor * self.depth_weight, rates=rates)
-
-    @property
-    def trained_by(self) -> str:
-        """Name of the renderer that trains the scene: `renderer`, or "alpha" if that has no gradients."""
-        if self.renderer == "alpha" or RENDERERS[self.renderer].capabilities.differentiable:
-            return self.renderer
-        return "alpha"
 
     @property
     def chosen_field(self) -> str:

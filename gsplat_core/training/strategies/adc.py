@@ -251,5 +251,5 @@ class SceneAdc:
         return True
 
 
-KIND = StrategyKind(SceneAdc, DefaultStrategy, screen_gradients=True, alpha_only=True)
+KIND = StrategyKind(SceneAdc, DefaultStrategy, screen_gradients=True)
 """The strategy's entry in `STRATEGIES`."""

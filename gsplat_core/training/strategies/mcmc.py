@@ -154,5 +154,5 @@ class SceneMcmc:
         return True
 
 
-KIND = StrategyKind(SceneMcmc, MCMCStrategy, losses={"opacity": 0.01, "scale": 0.01}, alpha_only=True)
+KIND = StrategyKind(SceneMcmc, MCMCStrategy, losses={"opacity": 0.01, "scale": 0.01})
 """The strategy's entry in `STRATEGIES`."""

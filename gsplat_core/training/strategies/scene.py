@@ -64,8 +64,6 @@ class StrategyKind:
     """Losses in `LOSSES` that the strategy adds to those of the user, with their weights."""
     screen_gradients: bool = False
     """True if it reads `TrainingStep.screen`. The step is then not captured as a CUDA graph."""
-    alpha_only: bool = False
-    """True if it relies on alpha blending as the renderer that trains the scene."""
 
 
 def every_of(steps: int) -> int:

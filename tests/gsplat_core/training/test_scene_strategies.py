@@ -136,7 +136,7 @@ def test_the_losses_of_mcmc_can_be_weighed_by_the_user(make_frame, camera):
 
 @pytest.mark.parametrize("name", ["adc", "mcmc"])
 def test_strategies_of_alpha_blending_name_what_works_with_other_renderers(name):
-    with pytest.raises(InvalidSetting, match=f"strategy '{name}' needs .*'streaming' with it, or renderer 'alpha'"):
+    with pytest.raises(InvalidSetting, match=f"strategy '{name}' uses .* choose renderer alpha, or strategy streaming"):
         ReconstructorConfig(renderer="weighted_sum", strategy=name)
     assert ReconstructorConfig(renderer="points", strategy=name).strategy == name
     assert STRATEGIES[name].library is not None
