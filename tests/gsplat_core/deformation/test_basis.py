@@ -75,6 +75,7 @@ def test_trimming_keeps_the_motion_of_the_new_window():
         torch.testing.assert_close(field.deltas(t).detach(), wanted, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_long_stream_keeps_its_size_and_precision():
     field = BasisField(5, (0.0, 2.0), spacing_s=0.2)
     sizes = set()

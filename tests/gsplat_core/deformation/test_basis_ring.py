@@ -50,6 +50,7 @@ def addresses(field: BasisField) -> list[tuple[int, tuple[int, ...]]]:
     return [(tensor.data_ptr(), tuple(tensor.shape)) for tensor in field.training_tensors()]
 
 
+@pytest.mark.slow
 def test_a_ring_is_the_field_that_keeps_everything_within_its_history():
     ring, everything = exact(online(6)), exact(online(6, history_s=None))
     newest = 0.0
@@ -68,6 +69,7 @@ def test_a_ring_is_the_field_that_keeps_everything_within_its_history():
         torch.testing.assert_close(ring.deltas(time_s), everything.deltas(time_s), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_ring_goes_on_learning():
     field, newest, errors = online(6), 0.0, []
     for frame in range(1000):
@@ -78,6 +80,7 @@ def test_a_ring_goes_on_learning():
     assert late < 0.02 and late < 1.1 * early
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_field_that_keeps_everything():
     ring, everything = exact(online(4)), exact(online(4, history_s=None))
     newest = 0.0
@@ -161,6 +164,7 @@ def test_new_bumps_start_their_moments_afresh():
         assert (field.columns.in_order(tensor)[:, -4] != 0).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_any_order_of_frames_gaps_and_gaussians_agrees_with_the_field_that_keeps_everything(seed):
     chance = random.Random(seed)

@@ -45,6 +45,7 @@ def right(folder: Path) -> Geometry:
     return measured(folder)
 
 
+@pytest.mark.slow
 def test_a_true_model_scores_as_one(right: Geometry) -> None:
     assert right.frames == FRAMES
     assert right.depth is not None and right.normals is not None and right.tracking is not None
@@ -68,6 +69,7 @@ def test_a_true_model_moves_each_pixel_as_its_tissue_moves(right: Geometry, fold
     assert still.mean_mm == pytest.approx(np.nanmean(lengths), rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_way_of_a_scope_is_part_of_the_flow_and_not_of_the_scene_flow(tmp_path: Path) -> None:
     size = {"width_px": 96, "height_px": 72}
     extras = Extras(flow=True)
@@ -93,6 +95,7 @@ def test_views_are_scored_beside_the_left_picture(right: Geometry) -> None:
         assert view.model.frames == FRAMES and 0.5 < view.seen < 1
 
 
+@pytest.mark.slow
 def test_a_model_without_scale_is_right_after_one_factor(folder: Path, right: Geometry) -> None:
     small = measured(folder, shrink=2.0)
     assert small.depth is not None and right.depth is not None

@@ -41,6 +41,7 @@ def squared_error(found: np.ndarray, z: np.ndarray) -> float:
     return float(np.square(found - z).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SURFACES)
 def test_no_tilt_fits_better_than_the_best_fit_plane(name: str) -> None:
     rays, z = RAYS.reshape(-1, 3), SURFACES[name].ravel()

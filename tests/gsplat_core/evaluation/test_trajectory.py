@@ -64,6 +64,7 @@ def test_a_scope_at_rest_has_no_figure_and_an_estimate_at_rest_has_the_baseline(
     assert errors.rigid_share == errors.similarity_share == errors.still_share > 0 and errors.scale == 0
 
 
+@pytest.mark.slow
 def test_too_few_poses_are_refused() -> None:
     with pytest.raises(InvalidInput, match=r"\[2, 4, 4\]"):
         evaluate_trajectory(_way(2), _way(2))

@@ -61,6 +61,7 @@ def test_a_constant_velocity_is_predicted_no_worse_than_by_the_last_motion() -> 
     assert of_velocity > flow - 0.2
 
 
+@pytest.mark.slow
 def test_a_still_scene_stays_still() -> None:
     model = learned(learner(), stream([0.0] * 12))
     newest_s = 11 * INTERVAL_S
@@ -96,11 +97,13 @@ def test_a_camera_that_moves_has_the_motion_of_the_flow_prior() -> None:
     assert all(torch.equal(a, b) for a, b in zip(*(model.tensors().values() for model in models), strict=True))
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_bytes() -> None:
     first, second = (learned(learner(), stream([0.0, 1.0, 2.0, 2.5, 2.0])).at(5 * INTERVAL_S) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), second.tensors().values(), strict=True))
 
 
+@pytest.mark.slow
 def test_publishing_changes_no_later_model() -> None:
     often, seldom = learner(), learner()
     for frame in stream([0.0, 1.0, 2.0, 3.0, 2.5]):
@@ -111,6 +114,7 @@ def test_publishing_changes_no_later_model() -> None:
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0, 255])
 def test_pictures_without_tissue_or_light_give_finite_models(value: int) -> None:
     frames = list(stream([0.0, 1.0, 2.0, 3.0, 4.0]))

@@ -44,6 +44,7 @@ def test_distances_are_not_shortened_by_noise() -> None:
     assert abs(np.median(found / in_cameras(points, tracks.poses)[..., 2]) - 1) < 0.01
 
 
+@pytest.mark.slow
 def test_what_a_tool_pulls_now_and_then_decides_nothing() -> None:
     tracks, points = seen()
     pulled = tracks.rays.copy()

@@ -75,6 +75,7 @@ def test_the_number_of_threads_does_not_change_a_bit():
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 def test_opcheck():
     parameter, first, second = state(10, 3)
     torch.library.opcheck(

@@ -59,6 +59,7 @@ def test_autograd_goes_through_the_compiled_backward():
         torch.testing.assert_close(parameter.grad, wanted.detach(), rtol=5e-5, atol=5e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 def test_ops_pass_opcheck():
     field = tuple(t.requires_grad_() for t in bumps(5, 7))

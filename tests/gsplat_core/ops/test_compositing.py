@@ -141,6 +141,7 @@ def test_empty_and_nearly_empty_scenes(count: int) -> None:
         assert 0 < (seen["alphas"] > 0).sum() <= 16
 
 
+@pytest.mark.slow
 def test_very_many_splats_in_one_tile() -> None:
     s = scene(20_000, 16, 16, median_px=8.0)
     s.opacities[:] = 0.004  # just visible, so that many are blended before the pixel ends
@@ -180,6 +181,7 @@ def test_the_same_bits_for_any_number_of_threads_and_every_time() -> None:
         assert all(torch.equal(other[name], value) for name, value in runs[0].items())
 
 
+@pytest.mark.slow
 def test_the_reference_gradient_is_the_derivative() -> None:
     s = scene(6, 5, 4, channels=2, median_px=2.0, seed=4)
     inputs = [t.double().requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities, torch.rand(1, 2))]

@@ -119,6 +119,7 @@ def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside():
     assert features[[0, 1, 3, 4]].isfinite().all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 def test_ops_pass_opcheck():
     ops, planes = torch.ops.gsplat_core, level(3)

@@ -143,6 +143,7 @@ def test_opcheck(deep):
         torch.library.opcheck(torch.ops.gsplat_core.image_loss, (image, target, mask, *depths, 0.2, 0.5, squared))
 
 
+@pytest.mark.slow
 def test_gradcheck_of_the_reference():
     image, target, mask, depth, target_depth = scene((6, 7, 3))
     image, depth = image.double().requires_grad_(), depth.double().requires_grad_()

@@ -274,6 +274,7 @@ def test_reference_gradcheck(make_scene, model):
 
 
 # opcheck itself reads .grad of tensors that are not leaves.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("covars", [False, True])
 @pytest.mark.parametrize("floor", [(), (0.0,)])

@@ -78,6 +78,7 @@ def test_the_same_bits_for_any_number_of_threads() -> None:
         assert all(torch.equal(other[name], value) for name, value in runs[0].items())
 
 
+@pytest.mark.slow
 def test_the_reference_gradient_is_the_derivative() -> None:
     s = ray_scene(6, 5, 4, channels=2)
     s.conics[:] = torch.tensor([0.1, 0.02, 0.15])  # no alpha crosses a cut-off within the differences

@@ -63,6 +63,7 @@ def test_boxes_equal_the_reference(tile_size: int, image_dims: tuple[int, ...], 
     assert_equal(isect_tiles(*args), reference.isect_tiles(*args))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("median_px", [0.5, 3.0, 40.0])
 @pytest.mark.parametrize("tile_size", [16, 5])
 def test_exact_test_lists_what_the_ellipse_touches_and_no_more(tile_size: int, median_px: float) -> None:
@@ -242,6 +243,7 @@ def test_wrong_arguments_are_named() -> None:
         isect_offset_encode(torch.tensor([5 << 40]), 1, 10, 20)
 
 
+@pytest.mark.slow
 def test_ops_pass_opcheck() -> None:
     means2d, radii, depths, conics, opacities = (t[0] for t in splats(40))
     ops = torch.ops.gsplat_core

@@ -156,6 +156,7 @@ def test_gradients_reach_means_and_rotations_of_the_second_state_only():
         assert float(render_flow(first, less, CAMERA, CAMERA).flow.square().mean()) < float(found.flow.square().mean())
 
 
+@pytest.mark.slow
 def test_gradient_of_the_deformation_gradients():
     first = wall(15.0).select(slice(0, 30)).to(dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)

@@ -96,6 +96,7 @@ def along_one_ray(gaussians: Gaussians, camera: Camera, column: int, row: int) -
     return mean_depth, median, math.sqrt((w @ ((d - mean_depth) ** 2 + v)) / w.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 20, 120])
 def test_every_ray_is_that_of_a_loop_over_the_splats(count, device):
     gaussians = cloud(count)

@@ -41,6 +41,7 @@ def by_autograd(gaussians, seen, relaxation):
     return torch.maximum(wanted, -colours.clamp(min=0)) / SH_C0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sh_degree", [0, 2])
 @pytest.mark.parametrize("depth_weight", [0.0, 0.5])
 @pytest.mark.parametrize(("width", "height", "tissue"), [(37, 29, 0.7), (1, 1, 1.0), (17, 3, 1.0), (33, 32, 0.01)])

@@ -35,6 +35,7 @@ def moving_away(make_frame, count):
         yield make_frame(seq, shift_px=-seq, pose=pose)
 
 
+@pytest.mark.slow
 @FIELDS
 def test_it_learns_what_a_scene_that_grows_learns(make_frame, camera, field):
     config = dataclasses.replace(CONFIG, field=field)
@@ -49,6 +50,7 @@ def test_it_learns_what_a_scene_that_grows_learns(make_frame, camera, field):
     assert fixed.snapshot().sha256() == grown.snapshot().sha256()
 
 
+@pytest.mark.slow
 def test_nothing_moves_while_gaussians_join_and_leave(make_frame, camera):
     config = dataclasses.replace(CONFIG, preallocate=True, history_s=1.0, window_frames=10)
     reconstructor = Reconstructor(config, camera)

@@ -91,6 +91,7 @@ def test_cells_are_unfilled_where_tissue_entered_that_the_scene_does_not_have():
     assert len(new.unfilled(everything, observation.mask)[0]) == 0 and not new.pixels(everything).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pixels_a_frame", "frames"), [(1, 60), (4, 60)])
 def test_a_camera_that_moves_on_does_not_drag_the_scene_along(device, pixels_a_frame, frames):
     config = ReconstructorConfig(

@@ -62,6 +62,7 @@ def test_the_first_depth_places_the_scene_and_its_picture_stays() -> None:
     assert made.snapshot().depth_source == DepthSource(DEPTH_ORIGINS["stereo"], metric=True)
 
 
+@pytest.mark.slow
 def test_rehearsal_looks_at_it() -> None:
     """The slope is what placing does not give: all of the depth but the first is left to the loss."""
     slope = np.linspace(70, 90, WIDTH, dtype=np.float32)[None, :]

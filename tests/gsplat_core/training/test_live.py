@@ -79,6 +79,7 @@ def test_rehearsal_before_the_first_frame_is_refused():
         reconstructor().rehearse(1)
 
 
+@pytest.mark.slow
 def test_rehearsal_keeps_the_past():
     forgetful, keeping = reconstructor(), reconstructor(recent_share=0.0)
     for k in range(6):
@@ -263,6 +264,7 @@ def test_a_scene_begins_at_the_plain_rate_and_goes_on_with_the_schedule(steps_ta
     assert [relaxation for *_, relaxation in steps_taken] == pytest.approx([0.8] * 6 + [0.4])
 
 
+@pytest.mark.slow
 def test_six_in_ten_rehearsal_steps_go_to_the_newest_frame_and_the_others_are_spread(steps_taken):
     made = reconstructor()
     run(made, [(1, 0)] * 8)

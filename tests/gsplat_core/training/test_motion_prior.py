@@ -112,6 +112,7 @@ def test_it_ends_at_its_horizon() -> None:
     assert torch.equal(model.at(newest_s + HORIZON_S).means, model.at(newest_s + 5.0).means)
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_not_trained_on_is_predicted_and_not_looked_at() -> None:
     shown = []
     for seed in (0, 1):
@@ -126,6 +127,7 @@ def test_a_frame_that_is_not_trained_on_is_predicted_and_not_looked_at() -> None
     assert shown[0].abs().max() > 0
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_bytes() -> None:
     first, second = (
         learned(learner(start_from_motion=True), stream([0.0, 1.0, 2.0, 2.5])).at(4 * INTERVAL_S) for _ in range(2)

@@ -85,6 +85,7 @@ def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
     assert roughness(2.0) < 0.8 * roughness(0.0)
 
 
+@pytest.mark.slow
 def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkeypatch):
     amounts = []
     monkeypatch.setattr(BasisField, "smooth_in_time", lambda self, amount: amounts.append(amount))
@@ -106,6 +107,7 @@ def test_neighbours_move_more_alike_the_more_rigid_tissue_is(tissue_video, camer
     assert unlike(2.0) < 0.7 * unlike(0.0)
 
 
+@pytest.mark.slow
 def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, camera):
     frames = tissue_video(5)
     config = dataclasses.replace(CONFIG, gaussians=60, max_gaussians=240)

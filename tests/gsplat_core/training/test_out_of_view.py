@@ -90,6 +90,7 @@ def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
     assert made.gaussians <= rows and shown[-1] > score(fresh, back[-1])
 
 
+@pytest.mark.slow
 def test_tissue_is_remembered_before_anything_is_learned_again():
     made = reconstructor(6000)
     watch(made, there_and_on(0, [0] * 30), steps=8)
@@ -97,6 +98,7 @@ def test_tissue_is_remembered_before_anything_is_learned_again():
     assert score(made, frame_at(100, 0, time_s=made.snapshot().time_window_s[1])) > 24
 
 
+@pytest.mark.slow
 def test_what_a_tool_hides_never_makes_room():
     made = reconstructor(310)  # fewer free rows than are kept free
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
@@ -167,6 +169,7 @@ def test_the_archive_is_bounded_and_counts_what_it_drops():
     assert len(archive) == 0 and archive.take_uncovered(CAMERA, ~covered, 9) is None
 
 
+@pytest.mark.slow
 def test_a_published_model_knows_what_was_not_seen(device):
     """A published model counts tissue as seen at first and as remembered once the scope has left it."""
     made = reconstructor(2000, device)

@@ -22,6 +22,7 @@ from tests.gsplat_core.geometry.moving_scope import (
 )
 
 
+@pytest.mark.slow
 def test_every_frame_of_a_short_recording_gets_depth() -> None:
     frames, cameras = video(6, SIDEWAYS)
     given, doubts, at_rest = ParallaxDepth().of_recording(frames, cameras)
@@ -36,6 +37,7 @@ def test_every_frame_of_a_short_recording_gets_depth() -> None:
     assert np.median(np.abs(given[0].depth / depth_of_surface() - 1)) < 0.02
 
 
+@pytest.mark.slow
 def test_only_what_is_believed_is_learned_from() -> None:
     frames, cameras = video(6, SIDEWAYS)
     frame = ParallaxDepth().of_recording(frames, cameras).frames[0]
@@ -47,6 +49,7 @@ def test_only_what_is_believed_is_learned_from() -> None:
     assert 0 < int((learned == 0).sum()) < learned.numel()
 
 
+@pytest.mark.slow
 def test_key_frames_are_spread_over_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiview, "MOST_OFFLINE", 3)
     frames, cameras = video(9, SIDEWAYS)

@@ -148,6 +148,7 @@ def swinging(seed, first, count, new_scene=None):
         yield Frame(seq, seq * 33_333_333, image, new_scene=new_scene if seq == first else None)
 
 
+@pytest.mark.slow
 def test_a_scope_that_comes_back_after_a_minute_goes_on_where_it_left(device):
     made = reconstructor(device)
     watch(made, swinging(1, 0, 60), steps=8)

@@ -74,6 +74,7 @@ def test_learns_a_moving_scene_as_it_arrives(small_hexplane, tissue_video, camer
     assert min(live) > 21
 
 
+@pytest.mark.slow
 @EACH_FIELD
 def test_offline_beats_one_picture_for_all_times(small_hexplane, tissue_video, camera, field, device):
     frames = tissue_video(9, amplitude_px=6)
@@ -194,6 +195,7 @@ def test_snapshots_count_up_and_never_change(tissue_video, camera, device):
     assert len({digest for _, digest, _ in published}) == 6
 
 
+@pytest.mark.slow
 @EACH_FIELD
 def test_tissue_that_comes_into_view_is_added(make_frame, camera, field, device):
     config = dataclasses.replace(CONFIG, field=field, first_frame_steps=4, max_gaussians=450)
@@ -210,6 +212,7 @@ def test_tissue_that_comes_into_view_is_added(make_frame, camera, field, device)
     assert type(model.field) is (BasisField if field == "basis" else HexPlaneField)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window_frames", [1, 30])
 def test_tissue_that_a_tool_hides_stays_as_it_was_last_seen(tissue_video, make_frame, camera, window_frames, device):
     frames = tissue_video(9)  # 2 px to the right in 0.4 s

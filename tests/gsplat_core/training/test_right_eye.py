@@ -151,6 +151,7 @@ def trained(eyes, frames=2, **fields):
     return learning
 
 
+@pytest.mark.slow
 def test_both_eyes_meet_in_one_surface():
     """Stereo is the only cue to the surface distance: the third view and depth improve with both eyes."""
     views, depths = {}, {}
@@ -174,6 +175,7 @@ def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
     assert psnr(picture[strip], seen(RIGHT)[0][strip]) > psnr(seen(RIGHT, alone)[0][strip], seen(RIGHT)[0][strip]) + 5
 
 
+@pytest.mark.slow
 def test_offline_training_takes_both_eyes(monkeypatch):
     monkeypatch.setattr(streaming, "DENSIFY_ROUNDS", 1)
     config = dataclasses.replace(CONFIG, depth_of_recording=None)
@@ -185,12 +187,14 @@ def test_offline_training_takes_both_eyes(monkeypatch):
     assert views["both"] > views["left"] + 1.5  # 2.8 dB or more with every instruction set
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_bytes():
     first, second = (trained("both", frames=3).snapshot() for _ in range(2))
     assert first.sha256() == second.sha256()
     assert first.sha256() != trained("left", frames=3).snapshot().sha256()
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_right_eye_trains_as_ever():
     alone = trained("both", frames=3, right_image=None).snapshot()
     assert alone.sha256() == trained("left", frames=3, right_image=None).snapshot().sha256()
@@ -205,6 +209,7 @@ def tinted(seq: int) -> Frame:
     return frame.with_fields(right_image=right.clip(0, 255).astype(np.uint8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("way", "better_db"), [("online", 0.1), ("offline", 0.2), ("live", 4)])
 def test_each_eye_keeps_its_own_colours(way, better_db, monkeypatch):
     """A tint of one eye appears in its own rendered picture and not in that of the other eye."""

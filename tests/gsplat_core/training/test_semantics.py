@@ -33,6 +33,7 @@ def intersection_over_union(shown: np.ndarray, wanted: np.ndarray) -> float:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
 def test_labels_on_some_frames_classify_the_others(field, tmp_path):
     config = replace(ReconstructorConfig.offline(), losses=("semantics",), gaussians=800, field=field)
@@ -48,6 +49,7 @@ def test_labels_on_some_frames_classify_the_others(field, tmp_path):
     assert torch.equal(again.surface(0.3).semantics, model.surface(0.3).semantics)
 
 
+@pytest.mark.slow
 def test_labels_change_neither_colours_nor_geometry():
     models = []
     for losses in ((), ("semantics",)):

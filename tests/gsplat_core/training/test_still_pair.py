@@ -41,6 +41,7 @@ def fitted(frames: list[Frame], steps: int = 60) -> Reconstructor:
     return learning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.25, 30.0], ids=["too near", "too far"])
 @pytest.mark.parametrize(
     "count, wrong_in",
@@ -57,6 +58,7 @@ def test_nothing_comes_before_the_camera_at_any_time(count: int, wrong_in: tuple
         assert depth.max() < 1.4 * farthest_mm
 
 
+@pytest.mark.slow
 def test_between_its_frames_a_still_pair_looks_as_in_them() -> None:
     """Depth of one frame of seven is wrong; the frame that was held out, and all times between, show the same picture."""
     frames = still_frames(8, (3,), 0.25)
@@ -70,6 +72,7 @@ def test_between_its_frames_a_still_pair_looks_as_in_them() -> None:
     assert min(scores) > max(scores) - 3.0 and max(scores) > 24.0
 
 
+@pytest.mark.slow
 def test_a_pair_that_moves_in_one_frame_alone_stays_before_the_camera() -> None:
     frames = [stereo_frame(seq, with_depth=True) for seq in range(6)]
     moved = frames[3]

@@ -60,6 +60,7 @@ def seen_throughout(recording, points: torch.Tensor) -> torch.Tensor:
     return shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 5, FRAMES - 1])
 @pytest.mark.parametrize("camera", ["fixed", "moving"])
 def test_points_go_where_the_tissue_goes(request, camera, number):
@@ -134,6 +135,7 @@ def test_between_what_is_known():
     torch.testing.assert_close(between_known(values, otherwise, times), expected)
 
 
+@pytest.mark.slow
 def test_a_model_has_the_motion_along_the_line_of_sight_after_few_steps(fixed):
     """Steps alone would not learn this motion, since positions move by hundredths of a pixel in a step."""
     config = replace(ReconstructorConfig.offline(), gaussians=1500, max_gaussians=2000)

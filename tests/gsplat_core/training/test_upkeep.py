@@ -165,6 +165,7 @@ def test_tissue_with_too_few_gaussians_gets_halves_of_the_busiest(make_frame, ca
     assert step.gaussians.count == count
 
 
+@pytest.mark.slow
 def test_a_stream_that_has_gone_on_for_days_learns_what_one_that_begins_learns(make_frame, camera, monkeypatch):
     """Bit for bit: 100 hours and all frame times, bump spacings and the history are multiples of 1/32 s, which float64 adds without rounding."""
     monkeypatch.setattr("gsplat_core.training.upkeep.RELAX_EVERY", 16)
@@ -242,6 +243,7 @@ def spread_of(depth, pixels):
     return float(rest.std() / depth.mean())
 
 
+@pytest.mark.slow
 def test_depths_come_back_to_a_surface_that_keeps_its_slope_and_its_picture(make_frame, camera):
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
