@@ -31,6 +31,8 @@ CLUSTERS = 1 << 16
 """Maximum number of clusters of the harmonics, so that their numbers fit in 16 bits."""
 CENTROID_BITS = 6
 KMEANS_STEPS = 5
+COARSE = 256
+"""Number of clusters that are divided again."""
 KMEANS_ROWS = 1 << 24
 """Bound of the distances computed at a time."""
 _PICTURES = {"means": 16, "scales": 8, "quats": 8, "opacities": 8, "sh0": 8}
@@ -133,14 +135,36 @@ def _write_clusters(folder: Path, name: str, rows: Tensor) -> dict[str, Any]:
 
 
 def clustered(rows: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """Return at most `most` centroids [M, D] of rows [N, D] and the nearest centroid of each row, by k-means (Lloyd 1982).
+    """Return at most `most` centroids [M, D] of rows [N, D] and the centroid of each row.
 
-    The first centroids are rows at equal distances in the order of the rows, so the result is the same in every run.
+    The rows are divided into `COARSE` clusters by k-means, and each of these again, into a number of clusters in proportion to
+    its rows. A row is compared with few centroids this way.
     """
     count = len(rows)
     if count <= most:
         return rows, torch.arange(count, device=rows.device)
-    centroids = rows[torch.linspace(0, count - 1, most).long().to(rows.device)]
+    if most <= COARSE:
+        return _k_means(rows, most)
+    _, coarse = _k_means(rows, COARSE)
+    order = torch.argsort(coarse, stable=True)
+    centroids, labels, taken = [], [], 0
+    for part in order.split(torch.bincount(coarse, minlength=COARSE).tolist()):
+        if len(part):
+            some, nearest = _k_means(rows[part], 1 + len(part) * (most - COARSE) // count)
+            centroids.append(some)
+            labels.append(nearest + taken)
+            taken += len(some)
+    return torch.cat(centroids), torch.cat(labels)[torch.argsort(order)]
+
+
+def _k_means(rows: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """Return centroids and the nearest one of each row (Lloyd 1982).
+
+    The first centroids are rows at equal distances in the order of the rows, so the result is the same in every run.
+    """
+    if len(rows) <= most:
+        return rows, torch.arange(len(rows), device=rows.device)
+    centroids = rows[torch.linspace(0, len(rows) - 1, most).long().to(rows.device)]
     labels = _nearest(rows, centroids)
     for _ in range(KMEANS_STEPS):
         order = torch.argsort(labels, stable=True)

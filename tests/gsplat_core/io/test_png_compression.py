@@ -82,6 +82,17 @@ def test_clusters_are_nearest_and_at_their_rows_mean():
     assert torch.equal(again, centroids)
 
 
+def test_clusters_in_two_levels_keep_close_rows_together(monkeypatch):
+    monkeypatch.setattr(png_compression, "COARSE", 4)
+    generator = torch.Generator().manual_seed(0)
+    middles = 10 * torch.randn(12, 5, generator=generator)
+    rows = (middles[:, None] + 0.01 * torch.randn(12, 30, 5, generator=generator)).reshape(-1, 5)
+    rows = rows[torch.randperm(len(rows), generator=generator)]
+    centroids, labels = png_compression.clustered(rows, 100)
+    assert len(centroids) <= 100
+    assert (centroids[labels] - rows).norm(dim=1).max() < 0.1
+
+
 def test_wrong_input_is_refused(tmp_path):
     given = splats()
     with pytest.raises(InvalidInput, match="lack shN"):

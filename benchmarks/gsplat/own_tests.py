@@ -1,0 +1,135 @@
+"""gsplat's own tests, run with this package in place of gsplat.
+
+    python benchmarks/gsplat/own_tests.py --tests FOLDER [--device cpu|cuda] [--only test_basic.py ...] [--out FILE]
+
+FOLDER holds the files `test_*.py` of gsplat 1.5.3's source distribution. They are copied to a temporary folder, in which
+`torch.device("cuda:0")` is replaced by the chosen device and `torch.cuda.is_available()` by True. gsplat's test scene
+`assets/test_garden.npz` is used if it is next to FOLDER. Otherwise a synthetic scene of the same layout takes its place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "methods"))
+
+import log
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = ("test_basic.py", "test_rasterization.py", "test_strategy.py", "test_2dgs.py", "test_compression.py")
+TIMEOUT_S = 3600
+EXCEPTIONS: dict[str, str] = {}
+"""Reason for each test that cannot pass, with its proof in float64."""
+
+
+def synthetic_scene(path: Path, points: int, width: int, height: int) -> None:
+    """Write points on a textured bowl and three cameras around them, in the layout of gsplat's test scene."""
+    random = np.random.default_rng(42)
+    plane = random.uniform(-1.9, 1.9, (points, 2))
+    z = 0.25 * (plane**2).sum(1) - 0.8 + 0.1 * np.sin(7 * plane[:, 0]) + random.normal(0, 0.01, points)
+    means = np.column_stack([plane, z])
+    colors = np.uint8(127 + 120 * np.sin(np.column_stack([5 * plane[:, 0], 4 * plane[:, 1], 6 * plane.sum(1)])))
+    viewmats = []
+    for angle in (-0.5, 0.0, 0.6):
+        eye = np.array([3 * np.sin(angle), 0.4, 3 * np.cos(angle)])
+        forward = -eye / np.linalg.norm(eye)
+        right = np.cross(forward, [0, 1, 0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+        viewmats.append(pose)
+    focal = 0.8 * width
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        path, means3d=np.float32(means), colors=colors, viewmats=np.float32(viewmats), Ks=np.float32([K] * 3), width=width, height=height
+    )  # fmt: skip
+
+
+def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace) -> str:
+    """Copy the tests for the device; return what the test scene is."""
+    tests = folder / "tests"
+    tests.mkdir()
+    for path in source.glob("test_*.py"):
+        text = path.read_text(encoding="utf-8")
+        text = text.replace('torch.device("cuda:0")', f'torch.device("{device}")')
+        text = text.replace("torch.cuda.is_available()", "True")
+        text = text.replace("/tmp/gsplat/compression", str(folder / "compressed"))
+        (tests / path.name).write_text(text, encoding="utf-8")
+    (folder / "compressed").mkdir()
+    scene = folder / "assets" / "test_garden.npz"
+    given = source.parent / "assets" / "test_garden.npz"
+    if given.exists():
+        scene.parent.mkdir()
+        shutil.copy(given, scene)
+        return "gsplat's test_garden.npz"
+    synthetic_scene(scene, chosen.points, chosen.width, chosen.height)
+    return f"synthetic, {chosen.points} points, 3 pictures of {chosen.width}x{chosen.height} px"
+
+
+def run(folder: Path, name: str, further: list[str]) -> dict[str, dict[str, Any]]:
+    """Run one file; return outcome and seconds of each test, with the first lines of its failure."""
+    report = folder / f"{name}.xml"
+    command = [sys.executable, "-m", "gsplat_core.as_gsplat", "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    command += [f"--junit-xml={report}", f"--rootdir={folder}", str(folder / "tests" / name), *further]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    try:
+        subprocess.run(command, cwd=folder, env=environment, check=False, timeout=TIMEOUT_S, stdout=subprocess.DEVNULL)
+    except subprocess.TimeoutExpired:
+        return {name: {"outcome": "failed", "seconds": TIMEOUT_S, "why": "time limit"}}
+    if not report.exists():
+        return {name: {"outcome": "failed", "seconds": 0.0, "why": "pytest wrote no report"}}
+    found: dict[str, dict[str, Any]] = {}
+    for case in ElementTree.parse(report).iter("testcase"):
+        trouble = [child for child in case if child.tag in ("failure", "error", "skipped")]
+        outcome = "passed" if not trouble else "skipped" if trouble[0].tag == "skipped" else "failed"
+        about: dict[str, Any] = {"outcome": outcome, "seconds": round(float(case.get("time", 0)), 2)}
+        if trouble:
+            about["why"] = (trouble[0].get("message") or "").replace(str(folder), "")[:300]
+        found[f"{name}::{case.get('name')}"] = about
+    return found
+
+
+def main() -> None:
+    parser = log.options(__doc__.splitlines()[0])
+    parser.add_argument("--tests", type=Path, required=True, help="folder of gsplat's tests")
+    parser.add_argument("--only", nargs="+", default=FILES, help="files to run")
+    parser.add_argument("--points", type=int, default=20_000, help="points of the synthetic scene")
+    parser.add_argument("--width", type=int, default=320, help="width of its pictures")
+    parser.add_argument("--height", type=int, default=240, help="height of its pictures")
+    parser.add_argument("-k", dest="selection", help="pytest's selection of tests")
+    chosen = parser.parse_args()
+    device = "cuda:0" if chosen.device == "cuda" else chosen.device
+    tests: dict[str, dict[str, Any]] = {}
+    files: dict[str, dict[str, int]] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scene = prepared(chosen.tests.resolve(), folder, device, chosen)
+        for file in chosen.only:
+            found = run(folder, file, ["-k", chosen.selection] if chosen.selection else [])
+            outcomes = [about["outcome"] for about in found.values()]
+            files[file] = {outcome: outcomes.count(outcome) for outcome in ("passed", "failed", "skipped")}
+            tests |= found
+            print(file, files[file], flush=True)
+    failed = {name: about.get("why", "") for name, about in tests.items() if about["outcome"] == "failed"}
+    for test, why in failed.items():
+        print(f"FAILED {test}: {why}")
+    exceptions = {test: EXCEPTIONS[test] for test in failed if test in EXCEPTIONS}
+    figures = {"gsplat": "1.5.3", "scene": scene, "files": files, "exceptions": exceptions, "tests": tests}
+    sys.argv[1:] = [word if word != str(chosen.tests) else "TESTS" for word in sys.argv[1:]]
+    log.write("own_tests", chosen, figures, "gsplat")
+
+
+if __name__ == "__main__":
+    main()
