@@ -17,13 +17,19 @@ _STRATEGIES = {
 }
 _OPERATIONS = "gsplat_core.training.strategies.operations"
 _CUDA = {
+    "FThetaCameraDistortionParameters": "gsplat_core.scene.distortion",
+    "FThetaPolynomialType": "gsplat_core.scene.distortion",
+    "RollingShutterType": "gsplat_core.poses.rolling_shutter",
+    "UnscentedTransformParameters": "gsplat_core.ops.unscented_projection.parameters",
     "fully_fused_projection": "gsplat_core.ops.projection.projection",
+    "fully_fused_projection_with_ut": "gsplat_core.ops.unscented_projection.unscented_projection",
     "isect_offset_encode": "gsplat_core.ops.tiles.tiles",
     "isect_tiles": "gsplat_core.ops.tiles.tiles",
     "proj": "gsplat_core.ops.projection.separate_steps",
     "quat_scale_to_covar_preci": "gsplat_core.ops.covariance.covariance",
     "rasterize_to_indices_in_range": "gsplat_core.ops.compositing.indices",
     "rasterize_to_pixels": "gsplat_core.ops.compositing.compositing",
+    "rasterize_to_pixels_eval3d": "gsplat_core.ops.world_blending.world_blending",
     "spherical_harmonics": "gsplat_core.ops.spherical_harmonics.spherical_harmonics",
     "world_to_cam": "gsplat_core.ops.projection.separate_steps",
 }
@@ -70,10 +76,8 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.relocation"},
     "gsplat.rendering": {
         **_RENDERING,
+        **_CUDA,
         "_rasterization": _PLAIN,
-        "fully_fused_projection": _CUDA["fully_fused_projection"],
-        "rasterize_to_pixels": _CUDA["rasterize_to_pixels"],
-        "spherical_harmonics": _CUDA["spherical_harmonics"],
     },
     "gsplat.strategy": _STRATEGIES,
     "gsplat.strategy.base": {"Strategy": _STRATEGIES["Strategy"]},
