@@ -1,4 +1,4 @@
-"""Modules of gsplat 1.5.3, and where `gsplat_core` defines each of their names."""
+"""Modules of gsplat 1.5.3 and of 1.6's `contrib.dynamic`, and where `gsplat_core` defines each of their names."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ _STRATEGIES = {
     "Strategy": "gsplat_core.training.strategies.strategy",
 }
 _OPERATIONS = "gsplat_core.training.strategies.operations"
+_DYNAMIC = "gsplat_core.contrib.dynamic"
+_DISTRIBUTED = "gsplat_core.rendering.distributed"
 _CUDA = {
     "FThetaCameraDistortionParameters": "gsplat_core.scene.distortion",
     "FThetaPolynomialType": "gsplat_core.scene.distortion",
@@ -52,9 +54,29 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.test_scene"},
     "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
     "gsplat.compression.png_compression": {"PngCompression": "gsplat_core.io.png_compression"},
+    "gsplat.contrib": {},
+    "gsplat.contrib.dynamic": {
+        "DeformNetwork": _DYNAMIC,
+        "DynamicStrategy": _DYNAMIC,
+        "HexPlaneField": _DYNAMIC,
+        "hexplane_regularization": _DYNAMIC,
+        "plane_smoothness": _DYNAMIC,
+        "time_l1": _DYNAMIC,
+        "time_smoothness": _DYNAMIC,
+    },
+    "gsplat.contrib.dynamic.deformation": {"DeformNetwork": _DYNAMIC},
+    "gsplat.contrib.dynamic.hexplane": {"HexPlaneField": _DYNAMIC},
+    "gsplat.contrib.dynamic.regulation": {
+        "hexplane_regularization": _DYNAMIC,
+        "plane_smoothness": _DYNAMIC,
+        "time_l1": _DYNAMIC,
+        "time_smoothness": _DYNAMIC,
+    },
+    "gsplat.contrib.dynamic.strategy": {"DynamicStrategy": _DYNAMIC},
     "gsplat.cuda": {},
     "gsplat.cuda._backend": {"_C": _ABSENT_EXTENSION},
     "gsplat.cuda._torch_impl": {
+        "_eval_sh_bases_fast": _PLAIN,
         "_fisheye_proj": _PLAIN,
         "_fully_fused_projection": _PLAIN,
         "_isect_offset_encode": _PLAIN,
@@ -69,7 +91,14 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "_world_to_cam": _PLAIN,
         "accumulate": "gsplat_core.ops.compositing.indices",
     },
-    "gsplat.cuda._wrapper": _CUDA,
+    "gsplat.cuda._wrapper": {**_CUDA, "CameraModel": "gsplat_core.scene.cameras"},
+    "gsplat.distributed": {
+        "all_gather_int32": _DISTRIBUTED,
+        "all_gather_tensor_list": _DISTRIBUTED,
+        "all_to_all_int32": _DISTRIBUTED,
+        "all_to_all_tensor_list": _DISTRIBUTED,
+        "cli": _DISTRIBUTED,
+    },
     "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.splats"},
     "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
     "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
@@ -77,6 +106,8 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.rendering": {
         **_RENDERING,
         **_CUDA,
+        "RasterizeMode": "gsplat_core.rendering.settings",
+        "RenderMode": "gsplat_core.rendering.settings",
         "_rasterization": _PLAIN,
     },
     "gsplat.strategy": _STRATEGIES,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.covariance import matrix_to_triu, quat_scale_to_covar_preci, quat_to_rotmat
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
-from gsplat_core.reference.spherical_harmonics import spherical_harmonics
+from gsplat_core.reference.spherical_harmonics import spherical_harmonics, spherical_harmonics_bases
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 
 _quat_to_rotmat = quat_to_rotmat
@@ -74,6 +75,10 @@ def _rasterize_to_pixels(
         flatten_ids,
         backgrounds,
     )
+
+
+def _eval_sh_bases_fast(basis_dim: int, dirs: Tensor) -> Tensor:
+    return spherical_harmonics_bases(math.isqrt(basis_dim) - 1, dirs)
 
 
 def _spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
