@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.ssim.ssim import fused_ssim
+    from gsplat_core.ops.surfel_blending.indices import accumulate_2dgs, rasterize_to_indices_in_range_2dgs
+    from gsplat_core.ops.surfel_blending.surfel_blending import rasterize_to_pixels_2dgs
+    from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
     from gsplat_core.ops.unscented_projection.parameters import UnscentedTransformParameters
     from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
     from gsplat_core.rendering.registry import RENDERERS, new_renderer
     from gsplat_core.rendering.renderer import Renderer
+    from gsplat_core.rendering.surfels import rasterization_2dgs, rasterization_2dgs_inria_wrapper
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.collection import GaussianCollection
     from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, FThetaPolynomialType
@@ -76,8 +80,10 @@ __all__ = [
     "Strategy",
     "UnscentedTransformParameters",
     "accumulate",
+    "accumulate_2dgs",
     "export_splats",
     "fully_fused_projection",
+    "fully_fused_projection_2dgs",
     "fully_fused_projection_with_ut",
     "fused_ssim",
     "isect_offset_encode",
@@ -89,9 +95,13 @@ __all__ = [
     "proj",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterization_2dgs",
+    "rasterization_2dgs_inria_wrapper",
     "rasterization_inria_wrapper",
     "rasterize_to_indices_in_range",
+    "rasterize_to_indices_in_range_2dgs",
     "rasterize_to_pixels",
+    "rasterize_to_pixels_2dgs",
     "rasterize_to_pixels_eval3d",
     "render",
     "save_bundle",
@@ -128,8 +138,10 @@ _HOME = {
     "Strategy": "training.strategies.strategy",
     "UnscentedTransformParameters": "ops.unscented_projection.parameters",
     "accumulate": "ops.compositing.indices",
+    "accumulate_2dgs": "ops.surfel_blending.indices",
     "export_splats": "io.exports.splats",
     "fully_fused_projection": "ops.projection.projection",
+    "fully_fused_projection_2dgs": "ops.surfel_projection.surfel_projection",
     "fully_fused_projection_with_ut": "ops.unscented_projection.unscented_projection",
     "fused_ssim": "ops.ssim.ssim",
     "isect_offset_encode": "ops.tiles.tiles",
@@ -141,9 +153,13 @@ _HOME = {
     "proj": "ops.projection.separate_steps",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering.rasterization",
+    "rasterization_2dgs": "rendering.surfels",
+    "rasterization_2dgs_inria_wrapper": "rendering.surfels",
     "rasterization_inria_wrapper": "rendering.inria",
     "rasterize_to_indices_in_range": "ops.compositing.indices",
+    "rasterize_to_indices_in_range_2dgs": "ops.surfel_blending.indices",
     "rasterize_to_pixels": "ops.compositing.compositing",
+    "rasterize_to_pixels_2dgs": "ops.surfel_blending.surfel_blending",
     "rasterize_to_pixels_eval3d": "ops.world_blending.world_blending",
     "render": "rendering.rasterization",
     "save_bundle": "io.bundle",

@@ -24,19 +24,24 @@ _CUDA = {
     "RollingShutterType": "gsplat_core.poses.rolling_shutter",
     "UnscentedTransformParameters": "gsplat_core.ops.unscented_projection.parameters",
     "fully_fused_projection": "gsplat_core.ops.projection.projection",
+    "fully_fused_projection_2dgs": "gsplat_core.ops.surfel_projection.surfel_projection",
     "fully_fused_projection_with_ut": "gsplat_core.ops.unscented_projection.unscented_projection",
     "isect_offset_encode": "gsplat_core.ops.tiles.tiles",
     "isect_tiles": "gsplat_core.ops.tiles.tiles",
     "proj": "gsplat_core.ops.projection.separate_steps",
     "quat_scale_to_covar_preci": "gsplat_core.ops.covariance.covariance",
     "rasterize_to_indices_in_range": "gsplat_core.ops.compositing.indices",
+    "rasterize_to_indices_in_range_2dgs": "gsplat_core.ops.surfel_blending.indices",
     "rasterize_to_pixels": "gsplat_core.ops.compositing.compositing",
+    "rasterize_to_pixels_2dgs": "gsplat_core.ops.surfel_blending.surfel_blending",
     "rasterize_to_pixels_eval3d": "gsplat_core.ops.world_blending.world_blending",
     "spherical_harmonics": "gsplat_core.ops.spherical_harmonics.spherical_harmonics",
     "world_to_cam": "gsplat_core.ops.projection.separate_steps",
 }
 _RENDERING = {
     "rasterization": "gsplat_core.rendering.rasterization",
+    "rasterization_2dgs": "gsplat_core.rendering.surfels",
+    "rasterization_2dgs_inria_wrapper": "gsplat_core.rendering.surfels",
     "rasterization_inria_wrapper": "gsplat_core.rendering.inria",
 }
 
@@ -49,6 +54,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "SelectiveAdam": "gsplat_core.training.steps.selective_adam",
         "__version__": "gsplat_core.as_gsplat.names:VERSION",
         "accumulate": "gsplat_core.ops.compositing.indices",
+        "accumulate_2dgs": "gsplat_core.ops.surfel_blending.indices",
         "export_splats": "gsplat_core.io.exports.splats",
     },
     "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.test_scene"},
@@ -91,6 +97,11 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "_world_to_cam": _PLAIN,
         "accumulate": "gsplat_core.ops.compositing.indices",
     },
+    "gsplat.cuda._torch_impl_2dgs": {
+        "_fully_fused_projection_2dgs": _PLAIN,
+        "_rasterize_to_pixels_2dgs": _PLAIN,
+        "accumulate_2dgs": "gsplat_core.ops.surfel_blending.indices",
+    },
     "gsplat.cuda._wrapper": {**_CUDA, "CameraModel": "gsplat_core.scene.cameras"},
     "gsplat.distributed": {
         "all_gather_int32": _DISTRIBUTED,
@@ -124,8 +135,8 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "split": _OPERATIONS,
     },
     "gsplat.utils": {
-        "depth_to_normal": _FUNCTIONS,
-        "depth_to_points": _FUNCTIONS,
+        "depth_to_normal": "gsplat_core.rendering.depth_maps",
+        "depth_to_points": "gsplat_core.rendering.depth_maps",
         "get_projection_matrix": _FUNCTIONS,
         "inverse_log_transform": _FUNCTIONS,
         "log_transform": _FUNCTIONS,

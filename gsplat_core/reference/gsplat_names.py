@@ -10,11 +10,14 @@ from torch import Tensor
 
 from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
+from gsplat_core.ops.surfel_projection.arguments import DenseSurfels
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.covariance import matrix_to_triu, quat_scale_to_covar_preci, quat_to_rotmat
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics, spherical_harmonics_bases
+from gsplat_core.reference.surfel_blending import rasterize_to_pixels_2dgs
+from gsplat_core.reference.surfel_projection import fully_fused_projection_2dgs
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 
 _quat_to_rotmat = quat_to_rotmat
@@ -87,3 +90,26 @@ def _spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> T
 
 def _rasterization(*arguments: Any, batch_per_iter: int = 100, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
     return rasterization(*arguments, packed=False, **options)
+
+
+def _fully_fused_projection_2dgs(
+    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int,
+    near_plane: float = 0.01, far_plane: float = 1e10, eps: float = 0,
+) -> DenseSurfels:  # fmt: skip
+    projected = fully_fused_projection_2dgs(
+        means, quats, scales, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane
+    )
+    assert isinstance(projected, DenseSurfels)
+    return projected
+
+
+def _rasterize_to_pixels_2dgs(
+    means2d: Tensor, ray_transforms: Tensor, colors: Tensor, normals: Tensor, opacities: Tensor, image_width: int,
+    image_height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, backgrounds: Tensor | None = None,
+    batch_per_iter: int = 100,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    colors, alphas, normals, _, _ = rasterize_to_pixels_2dgs(
+        means2d, ray_transforms, colors, opacities, normals, torch.zeros_like(means2d), image_width, image_height,
+        tile_size, isect_offsets, flatten_ids, backgrounds,
+    )  # fmt: skip
+    return colors, alphas, normals

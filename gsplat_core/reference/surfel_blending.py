@@ -163,15 +163,14 @@ class _Tiles:
 
 
 def falloff(means2d: Tensor, transforms: Tensor, pixels: Tensor) -> Tensor:
-    """Return exp(-sigma) of surfels at pixels, 0 where a ray is parallel to the surfel.
+    """Return exp(-sigma) [P, N] of surfels at pixels; 0 where a ray is parallel to the surfel.
 
     Args:
-        means2d: [..., 2], broadcast against the other arguments.
-        transforms: [N, 3, 3], N being the last dimension of the result.
-        pixels: pixel centres [P, 2], or [N, 2] with `transforms` [N, 3, 3] for one pixel per surfel.
+        means2d: [P, N, 2] or [N, 2].
+        transforms: [N, 3, 3].
+        pixels: pixel centres [P, 2].
     """
-    if means2d.dim() == 3:
-        pixels = pixels[:, None]
+    pixels = pixels[:, None]
     x, y, w = transforms.unbind(-2)
     across, down = pixels[..., :1] * w - x, pixels[..., 1:] * w - y
     crossing = torch.linalg.cross(across, down)

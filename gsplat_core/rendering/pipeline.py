@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from torch.nn.functional import pad
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, Pairs
+from gsplat_core.ops.surfel_projection.arguments import DenseSurfels
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.rendering.settings import (
     CONSTANTS,
@@ -262,9 +263,12 @@ class Signal(NamedTuple):
         return (values + 0.5).clamp_min(0) if self.clamped else values + 0.5
 
 
+Dense = TypeVar("Dense", DenseProjection, DenseSurfels)
+
+
 def view_colors(
-    ops: StepOperations, means: Tensor, signals: Sequence[Signal], viewmats: Tensor, dense: DenseProjection
-) -> tuple[Tensor, DenseProjection]:
+    ops: StepOperations, means: Tensor, signals: Sequence[Signal], viewmats: Tensor, dense: Dense
+) -> tuple[Tensor, Dense]:
     """Return the channels [..., C, N, D] of all signals seen by each camera; cull Gaussians with non-finite ones.
 
     On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They have no effect: culled
@@ -555,7 +559,7 @@ class Stepped(NamedTuple):
 
 def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> Stepped:
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals = arguments
-    batch_dims, n_gaussians = _check_shapes(arguments, settings)
+    batch_dims, n_gaussians = check_shapes(arguments, settings)
     if settings.distributed:
         from gsplat_core.rendering.distributed import all_cameras, check_distributed, exchanged
 
@@ -706,7 +710,7 @@ def _meta(
     }
 
 
-def _check_shapes(arguments: Arguments, settings: RenderSettings) -> tuple[tuple[int, ...], int]:
+def check_shapes(arguments: Arguments, settings: RenderSettings) -> tuple[tuple[int, ...], int]:
     """Check shapes and return the batch dimensions and number of Gaussians.
 
     The projection checks the remaining arguments.

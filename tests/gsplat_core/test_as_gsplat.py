@@ -13,6 +13,7 @@ import torch
 import gsplat_core
 from gsplat_core.as_gsplat import finder, install, names
 from gsplat_core.as_gsplat import functions as utils
+from gsplat_core.rendering.depth_maps import depth_to_normal, depth_to_points
 
 PROGRAM = """
 import sys
@@ -90,12 +91,12 @@ def test_a_point_of_a_depth_map_is_projected_back_to_its_pixel():
     pose[:3, :3] = utils.normalized_quat_to_rotmat(torch.tensor([0.5, 0.5, 0.5, 0.5]))
     pose[:3, 3] = torch.tensor([1.0, 2, 3])
     depths = 2 + torch.rand(8, 12, 1, generator=torch.Generator().manual_seed(0))
-    points = utils.depth_to_points(depths, pose, K)
+    points = depth_to_points(depths, pose, K)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     torch.testing.assert_close(local[..., 2:], depths)
     pixels = (local @ K.T)[..., :2] / local[..., 2:]
     torch.testing.assert_close(pixels[3, 4], torch.tensor([4.5, 3.5]))
-    along_ray = utils.depth_to_points(depths, pose, K, z_depth=False)
+    along_ray = depth_to_points(depths, pose, K, z_depth=False)
     torch.testing.assert_close((along_ray - pose[:3, 3]).norm(dim=-1, keepdim=True), depths)
 
 
@@ -105,7 +106,7 @@ def test_the_normals_of_a_plane_are_its_normal():
     y, x = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(12) + 0.5, indexing="ij")
     rays = torch.stack([(x - 6) / 20, (y - 4) / 20, torch.ones_like(x)], -1)
     depths = (-3 / (rays @ normal))[..., None]
-    normals = utils.depth_to_normal(depths, torch.eye(4), K)
+    normals = depth_to_normal(depths, torch.eye(4), K)
     torch.testing.assert_close(normals[1:-1, 1:-1], normal.expand(6, 10, 3), rtol=1e-4, atol=1e-4)
     assert not normals[0].any()
 

@@ -38,8 +38,10 @@ PUBLIC = [
     "Strategy",
     "UnscentedTransformParameters",
     "accumulate",
+    "accumulate_2dgs",
     "export_splats",
     "fully_fused_projection",
+    "fully_fused_projection_2dgs",
     "fully_fused_projection_with_ut",
     "fused_ssim",
     "isect_offset_encode",
@@ -51,9 +53,13 @@ PUBLIC = [
     "proj",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterization_2dgs",
+    "rasterization_2dgs_inria_wrapper",
     "rasterization_inria_wrapper",
     "rasterize_to_indices_in_range",
+    "rasterize_to_indices_in_range_2dgs",
     "rasterize_to_pixels",
+    "rasterize_to_pixels_2dgs",
     "rasterize_to_pixels_eval3d",
     "render",
     "save_bundle",
@@ -84,6 +90,13 @@ SIGNATURES = {
     ),
     "spherical_harmonics": "degrees_to_use dirs coeffs masks",
     "quat_scale_to_covar_preci": "quats scales compute_covar compute_preci triu",
+    "fully_fused_projection_2dgs": (
+        "means quats scales viewmats Ks width height eps2d near_plane far_plane radius_clip packed sparse_grad"
+    ),
+    "rasterize_to_pixels_2dgs": (
+        "means2d ray_transforms colors opacities normals densify image_width image_height tile_size isect_offsets"
+        " flatten_ids backgrounds masks packed absgrad distloss"
+    ),
 }
 
 

@@ -7,7 +7,7 @@ differentiates the result. Sums are in a fixed order. The memory grows with the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -67,6 +67,34 @@ def rasterize_to_indices_in_range(
     """
     dims = require_trailing("means2d", means2d, (2,), "[..., N, 2]")
     _check_splats(dims, conics, opacities)
+    values = torch.cat([means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1, 1)], -1)
+    return blended_pairs(
+        range_start, range_end, transmittances, dims, values, lambda some, x, y: _alphas(some, x, y, max_alpha),
+        image_width, image_height, tile_size, isect_offsets, flatten_ids,
+    )  # fmt: skip
+
+
+def blended_pairs(
+    range_start: int,
+    range_end: int,
+    transmittances: Tensor,
+    dims: tuple[int, ...],
+    values: Tensor,
+    alphas_of: Callable[[Tensor, Tensor, Tensor], Tensor],
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the blended pairs of any kind of splat; see `rasterize_to_indices_in_range` for the other arguments.
+
+    Args:
+        dims: dimensions [..., N] of the splats.
+        values: numbers of each splat, [splats, ...].
+        alphas_of: function of some splats' values [L, 1, ...] and pixel coordinates x and y [L, P] that returns their
+            alphas [L, P]; 0 where a splat is not blended.
+    """
     n, image_dims = dims[-1], dims[:-1]
     require_shape("transmittances", transmittances, (*image_dims, image_height, image_width), "[..., H, W]")
     tile_height, tile_width = isect_offsets.shape[-2:]
@@ -77,13 +105,12 @@ def rasterize_to_indices_in_range(
         raise InvalidInput(
             f"{tile_height} x {tile_width} tiles of {tile_size} px do not cover a picture of {image_width} x {image_height} px"
         )
-    block, device = tile_size * tile_size, means2d.device
+    block, device = tile_size * tile_size, values.device
     starts = isect_offsets.reshape(-1).long()
     ends = torch.cat([starts[1:], starts.new_tensor([len(flatten_ids)])])
     first = torch.minimum(starts + int(range_start) * block, ends)
     last = torch.minimum(starts + min(int(range_end), len(flatten_ids) // block + 1) * block, ends)
     lengths = (last - first).clamp(min=0)
-    values = torch.cat([means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1, 1)], -1)
     through = transmittances.reshape(-1)
     inside = torch.arange(block, device=device)
     row, column = inside // tile_size, inside % tile_size
@@ -97,7 +124,7 @@ def rasterize_to_indices_in_range(
         image, within = tile // (tile_height * tile_width), tile % (tile_height * tile_width)
         y = (within // tile_width * tile_size)[:, None] + row
         x = (within % tile_width * tile_size)[:, None] + column
-        alphas = _alphas(values[ids][:, None], x, y, max_alpha)
+        alphas = alphas_of(values[ids][:, None], x, y)
         covered = (x < image_width) & (y < image_height)
         pixel = (image[:, None] * image_height + y) * image_width + x
         # Transmittance after each entry: the logarithms are summed over the entries of the same tile, in float64.
@@ -151,27 +178,54 @@ def accumulate(
     """
     dims = require_trailing("means2d", means2d, (2,), "[..., N, 2]")
     _check_splats(dims, conics, opacities)
-    image_dims, images = dims[:-1], math.prod(dims[:-1])
     if tuple(colors.shape[:-1]) != dims:
         raise InvalidInput(f"colors must be [..., N, D] with [..., N] = {list(dims)}, got {list(colors.shape)}")
+    values = torch.cat([means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1, 1)], -1)
+    picture = blend_pairs(
+        dims, values, colors.reshape(-1, colors.shape[-1]),
+        lambda some, x, y: _alphas(some, x, y, max_alpha, cut=False), gaussian_ids, pixel_ids, image_ids, image_width,
+        image_height,
+    )  # fmt: skip
+    return picture[..., :-1], picture[..., -1:]
+
+
+def blend_pairs(
+    dims: tuple[int, ...],
+    values: Tensor,
+    colors: Tensor,
+    alphas_of: Callable[[Tensor, Tensor, Tensor], Tensor],
+    gaussian_ids: Tensor,
+    pixel_ids: Tensor,
+    image_ids: Tensor,
+    image_width: int,
+    image_height: int,
+) -> Tensor:
+    """Return the sums [..., H, W, D + 1] of weight times colour, and of weight, of any kind of splat.
+
+    Args:
+        dims: dimensions [..., N] of the splats.
+        values: numbers of each splat, [splats, ...].
+        colors: colours [splats, D].
+        alphas_of: function of the pairs' values [P, ...] and pixel coordinates x and y [P] that returns their alphas.
+        gaussian_ids: as in `accumulate`, with the remaining arguments.
+    """
+    image_dims, images = dims[:-1], math.prod(dims[:-1])
     for name, ids in (("pixel_ids", pixel_ids), ("image_ids", image_ids)):
         require_shape(name, ids, tuple(gaussian_ids.shape), "[P]")
     pixels, order = torch.sort(image_ids * (image_height * image_width) + pixel_ids, stable=True)
     rows = (image_ids * dims[-1] + gaussian_ids)[order]
-    values = torch.cat([means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1, 1)], -1)[rows]
     at = pixels % (image_height * image_width)
-    alphas = _alphas(values, at % image_width, torch.div(at, image_width, rounding_mode="floor"), max_alpha, cut=False)
+    alphas = alphas_of(values[rows], at % image_width, torch.div(at, image_width, rounding_mode="floor"))
     lengths = torch.bincount(pixels, minlength=images * image_height * image_width)
     ends = torch.cumsum(lengths, 0)
     logs = torch.cumsum(torch.log1p(-alphas.double()), 0)
     before = torch.cat([logs.new_zeros(1), logs])
     weights = alphas * torch.exp(before[:-1] - before[(ends - lengths)[pixels]]).to(alphas.dtype)
-    blended = torch.cat([weights[:, None] * colors.reshape(-1, colors.shape[-1])[rows], weights[:, None]], 1)
+    blended = torch.cat([weights[:, None] * colors[rows], weights[:, None]], 1)
     # Differences of one running sum instead of atomic additions, for the same bits in every run.
     sums = torch.cat([blended.new_zeros(1, blended.shape[1], dtype=torch.float64), torch.cumsum(blended.double(), 0)])
-    picture = (sums[ends] - sums[ends - lengths]).to(means2d.dtype)
-    picture = picture.reshape(*image_dims, image_height, image_width, blended.shape[1])
-    return picture[..., :-1], picture[..., -1:]
+    picture = (sums[ends] - sums[ends - lengths]).to(values.dtype)
+    return picture.reshape(*image_dims, image_height, image_width, blended.shape[1])
 
 
 def _check_splats(dims: tuple[int, ...], conics: Tensor, opacities: Tensor) -> None:

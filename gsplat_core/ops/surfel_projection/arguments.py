@@ -73,8 +73,11 @@ def check_surfel_arguments(
     require_same_kind(means=means, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks)
     if width < 1 or height < 1:
         raise InvalidInput(f"the image must be at least 1x1 px, got width={width}, height={height}")
-    if sparse_grad and not packed:
-        raise InvalidInput("sparse_grad=True needs packed=True, because only packed rows name the visible surfels")
+    if sparse_grad and (not packed or batch_dims):
+        raise InvalidInput(
+            f"sparse_grad=True needs packed=True and means [N, 3] without batch dimensions, got packed={packed} and"
+            f" {list(means.shape)}"
+        )
     return batch_dims
 
 

@@ -63,6 +63,9 @@ def fully_fused_projection_2dgs(
     inputs = {"means": means, "quats": quats, "scales": scales, "viewmats": viewmats, "Ks": Ks}
     batch_dims = check_surfel_arguments(**inputs, width=width, height=height, packed=packed, sparse_grad=sparse_grad)
     require_float32("fully_fused_projection_2dgs", **inputs)
+    visible: list[Tensor] = []
+    if sparse_grad:
+        means, quats, scales = sparse_gradients(means, quats, scales, visible)
     b, n, c = math.prod(batch_dims), means.shape[-2], viewmats.shape[-3]
     means2d, depths, ray_transforms, normals, radii = torch.ops.gsplat_core.project_surfels(
         means.reshape(b, n, 3), quats.reshape(b, n, 4), scales.reshape(b, n, 3), viewmats.reshape(b, c, 4, 4),
@@ -73,7 +76,35 @@ def fully_fused_projection_2dgs(
         radii.reshape(*rows, 2), means2d.reshape(*rows, 2), depths.reshape(rows), ray_transforms.reshape(*rows, 3, 3),
         normals.reshape(*rows, 3),
     )  # fmt: skip
+    visible.append(dense.radii)
     return pack_surfels(dense) if packed else dense
+
+
+def sparse_gradients(
+    means: Tensor, quats: Tensor, scales: Tensor, radii: list[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the tensors with gradients that are sparse COO tensors of the visible surfels.
+
+    Args:
+        means, quats, scales: of surfels without batch dimensions.
+        radii: list to which the caller appends the radii [C, N, 2] before the backward pass.
+    """
+    apply: Any = _SparseGradient.apply
+    return apply(means, radii), apply(quats, radii), apply(scales, radii)
+
+
+class _SparseGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, radii: list[Tensor]) -> Tensor:
+        ctx.radii = radii
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, *v: Tensor) -> tuple[Tensor, None]:
+        (gradient,), rows = v, (ctx.radii[-1][..., 0] > 0).any(0).nonzero()[:, 0]
+        return torch.sparse_coo_tensor(
+            rows[None], gradient[rows], gradient.shape, is_coalesced=True, check_invariants=False
+        ), None
 
 
 @torch.library.register_fake("gsplat_core::project_surfels")
