@@ -380,7 +380,8 @@ def json_examples(name: str) -> list[dict]:
 
 
 def test_the_calibration_files_in_the_guide_are_read_as_it_says(tmp_path):
-    cameras, described, views = json_examples("recordings.md")
+    cameras, described, distorted, views = json_examples("recordings.md")
+    assert set(distorted) == {*cameras, "distortion"} - {"model", "fps"}
     (tmp_path / "cameras" / "images").mkdir(parents=True)
     cv2.imwrite(
         str(tmp_path / "cameras" / "images" / "000000.png"),

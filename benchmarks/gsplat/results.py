@@ -82,10 +82,41 @@ def static(logs: Logs) -> str:
     return f"{said}\n\n{table(head, rows)}"
 
 
+def cameras(logs: Logs) -> str:
+    """Return the errors of unscented projection, and the PSNR of rolling shutters."""
+    rows = []
+    for device, log in logs.items():
+        for model in ("pinhole", "fisheye"):
+            rows += [
+                [f"{model}: means to OpenCV, worst", device, f"{log[f'{model}_mean_px_worst']:.4f} px"],
+                [
+                    f"{model}: covariance to samples (4 px), median / worst",
+                    device,
+                    f"{100 * log[f'{model}_covariance_4px_median']:.2f} / {100 * log[f'{model}_covariance_4px_worst']:.2f} %",
+                ],
+                [f"{model}: pixel to ray and back, worst", device, f"{log[f'{model}_inversion_px_worst']:.5f} px"],
+            ]
+        for name, words in (("picture_plane", "blended in the picture plane"), ("eval3d", "`with_eval3d`")):
+            found, still = log[f"shutter_{name}_psnr_db"], log[f"shutter_{name}_global_psnr_db"]
+            moved = log["shutter_motion_px_median"]
+            rows.append(
+                [
+                    f"rolling shutter to pictures of each row, {words} (motion {moved:.1f} px; a global shutter scores {still:.1f} dB)",
+                    device,
+                    f"{found:.1f} dB",
+                ]
+            )
+        count = log["timed_gaussians"]
+        for name in ("linear", "unscented"):
+            rows.append([f"{name} projection of {count} Gaussians, forward", device, f"{log[f'{name}_ms']:.2f} ms"])
+    return table(("figure", "device", "value"), rows)
+
+
 SECTIONS: tuple[tuple[str, str, Callable[[Logs], str]], ...] = (
     ("gsplat's own tests", "own_tests", own_tests),
     ("Typical calls", "calls", calls),
     ("Static scenes: `intrasplat train`", "static", static),
+    ("Cameras", "cameras", cameras),
 )
 """Title, stem of the log files, and function of each topic."""
 

@@ -1,8 +1,9 @@
-"""Rectification of calibrated stereo pairs: undistorted pictures with parallel axes and aligned rows."""
+"""Undistortion of pictures, and rectification of calibrated stereo pairs: parallel axes and aligned rows."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -106,3 +107,86 @@ class Rectification:
     def plane(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Rectify a mask [H, W] of the left picture with nearest-neighbour sampling; 0 outside."""
         return np.asarray(cv2.remap(plane, *self._left, cv2.INTER_NEAREST), np.uint8)
+
+
+class Undistortion:
+    """Maps from pictures of a distorted lens to those of the same camera without distortion.
+
+    A pinhole lens becomes a pinhole, a fisheye lens an equidistant fisheye. The focal lengths and the principal point are
+    chosen so that the picture's sides touch those of the distorted picture; parts of its corners are lost.
+
+    Args:
+        camera: distorted camera.
+        coefficients: OpenCV's distortion coefficients: 4, 5, 8 or 12 of a pinhole, 4 of a fisheye lens.
+
+    Raises:
+        InvalidInput: for another number of coefficients, or a lens that does not see the middle of the picture's sides.
+    """
+
+    def __init__(self, camera: Camera, coefficients: Sequence[float]) -> None:
+        # Imported lazily, as in `Camera`.
+        import torch
+
+        from gsplat_core.scene.distortion import Lens
+
+        if camera.model == "ortho":
+            raise InvalidInput("a camera with model ortho has no distortion")
+        lens = Lens.from_opencv(coefficients, camera.model, dtype=torch.float64)
+        ideal = Lens(camera.model)
+        width, height = camera.width_px, camera.height_px
+        K = torch.tensor(camera.K)[None]
+        flat = torch.eye(3, dtype=torch.float64)[None]
+
+        def undistorted(
+            x: NDArray[np.float64], y: NDArray[np.float64]
+        ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+            rays = lens.rays(torch.tensor(np.stack(np.broadcast_arrays(x, y), -1))[None], K)
+            seen = ideal.project(rays.directions, flat)
+            return seen.points[0].numpy(), (rays.valid & seen.valid)[0].numpy()
+
+        along_x, along_y = np.linspace(0, width, 65), np.linspace(0, height, 65)
+        limits = []
+        for x, y, axis, inner in (
+            (np.zeros(65), along_y, 0, np.max),
+            (np.full(65, float(width)), along_y, 0, np.min),
+            (along_x, np.zeros(65), 1, np.max),
+            (along_x, np.full(65, float(height)), 1, np.min),
+        ):
+            points, known = undistorted(x, y)
+            if not known[32]:
+                raise InvalidInput(
+                    f"the distortion {[float(each) for each in coefficients]} folds the picture of {width}x{height} px over"
+                    " before its border"
+                )
+            limits.append(float(inner(points[known, axis])))
+        left, right, top, bottom = limits
+        if not (right - left > 1e-6 and bottom - top > 1e-6):
+            raise InvalidInput(f"the distortion {[float(each) for each in coefficients]} leaves nothing of the picture")
+        fx, fy = width / (right - left), height / (bottom - top)
+        self.camera = replace(camera, K=np.array([[fx, 0, -left * fx], [0, fy, -top * fy], [0, 0, 1]]))
+        """Camera without distortion, at the pose of the distorted one."""
+        rows, columns = torch.meshgrid(
+            torch.arange(height, dtype=torch.float64) + PIXEL_CENTRE,
+            torch.arange(width, dtype=torch.float64) + PIXEL_CENTRE,
+            indexing="ij",
+        )
+        rays = ideal.rays(torch.stack([columns, rows], -1).reshape(1, -1, 2), torch.tensor(self.camera.K)[None])
+        source = lens.project(rays.directions, K)
+        known = (rays.valid & source.valid)[0, :, None]
+        places = torch.where(known, source.points[0] - PIXEL_CENTRE, -2.0)  # outside of the picture
+        self._map = places.reshape(height, width, 2).float().numpy()
+        inside = self.plane(np.ones((height, width), np.uint8))
+        self.inside: NDArray[np.uint8] | None = None if inside.all() else inside
+        """Mask uint8 [H, W]: 1 where the undistorted picture has content; None if everywhere."""
+
+    def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Undistort a picture [H, W, 3]."""
+        return np.asarray(cv2.remap(image, self._map, None, cv2.INTER_CUBIC), np.uint8)
+
+    def plane(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Undistort a mask [H, W] with nearest-neighbour sampling; 0 outside."""
+        return np.asarray(cv2.remap(plane, self._map, None, cv2.INTER_NEAREST), np.uint8)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Undistort z [H, W] with nearest-neighbour sampling; 0 (unknown) outside."""
+        return np.asarray(cv2.remap(depth, self._map, None, cv2.INTER_NEAREST), np.float32)

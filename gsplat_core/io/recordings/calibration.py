@@ -54,6 +54,8 @@ class Calibration:
     source: str
     assumed: bool = False
     """True if the intrinsics are a guess because the recording does not contain any."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's distortion coefficients of the pictures in the files; empty if they are not distorted."""
 
 
 def default_calibration(
@@ -185,6 +187,27 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
         )
         return None
     return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height), model=model)
+
+
+MAX_DISTORTION = 1e3
+"""Largest absolute value of a distortion coefficient."""
+
+
+def read_distortion(path: Path, content: dict[str, Any], findings: Findings) -> tuple[float, ...] | None:
+    """Read the optional `distortion` of a camera's JSON object; () if there is none, None after a problem."""
+    stated = content.get("distortion", [])
+    values = [number(each) for each in stated] if isinstance(stated, list) and len(stated) <= 12 else [None]
+    lengths = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (0, 4)}.get(str(content.get("model", "pinhole")), (0,))
+    known = tuple(each for each in values if each is not None and abs(each) <= MAX_DISTORTION)
+    if len(known) != len(values) or len(known) not in lengths:
+        findings.problem(
+            path,
+            f"the distortion is {stated!r:.120}",
+            "Give OpenCV's coefficients: k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]] of a pinhole, k1 to k4 of a"
+            " fisheye, none of an ortho camera",
+        )
+        return None
+    return known if any(known) else ()
 
 
 def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Findings) -> NDArray[np.float64] | None:

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.rectification import Rectification
+from gsplat_core.depth.rectification import Rectification, Undistortion
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.io.recordings.calibration import Calibration
@@ -71,6 +71,8 @@ class Contents:
     stereo_baseline_mm: float | None = None
     rectification: Rectification | None = None
     """Rectification of both eyes; `calibration` is then that of the rectified left camera."""
+    undistortion: Undistortion | None = None
+    """Maps of a distorted lens; `calibration` is then that of the camera without distortion."""
     other_files: tuple[Path, ...] = ()
     """Calibration and description files."""
 
@@ -148,6 +150,10 @@ class Contents:
             image, outside = self.rectification.left(image), self.rectification.inside
             other = None if other is None else self.rectification.right(other)
             mask = None if mask is None else self.rectification.plane(mask)
+        if self.undistortion is not None:
+            image, outside = self.undistortion.picture(image), self.undistortion.inside
+            mask = None if mask is None else self.undistortion.plane(mask)
+            depth = None if depth is None else self.undistortion.depth(depth)
         return Frame(
             seq=index,
             pts_ns=round((index if times is None else times[index]) * 1e9 / self.fps),

@@ -26,13 +26,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from gsplat_core.depth.rectification import Rectification
+from gsplat_core.depth.rectification import Rectification, Undistortion
+from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.calibration import (
     POSES_FILE,
     Calibration,
     default_calibration,
     invert_poses,
     number,
+    read_distortion,
     read_json,
     read_pinhole,
     rectified_by_file,
@@ -137,12 +139,12 @@ def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calib
     content = read_json(path, findings)
     if content is None:
         return None
-    camera = read_pinhole(path, content, findings)
+    camera, distortion = read_pinhole(path, content, findings), read_distortion(path, content, findings)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
         findings.problem(path, f"frames is {entries!r:.40}", 'Give a list of {"file": …, "camera_to_world": 4x4}')
         return None
-    if camera is None:
+    if camera is None or distortion is None:
         return None
     files: list[Path] = []
     poses: list[Any] = []
@@ -164,7 +166,7 @@ def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calib
         if fps is None or not 0.1 <= fps <= 1000:
             findings.problem(path, f"the frame rate is {stated!r:.40}", "Give frames per second from 0.1 to 1000")
             return None
-    calibration = Calibration(camera.with_pose(world_to_camera[0]), world_to_camera, path.name)
+    calibration = Calibration(camera.with_pose(world_to_camera[0]), world_to_camera, path.name, distortion=distortion)
     return ImageFiles(files, *size, fps), calibration
 
 
@@ -353,8 +355,6 @@ def _with_sidecars(
         return None
     if not _fits_eyes(root, eyes, right is not None, depth is not None, findings):
         return None
-    if valid_mask is not None and eyes.rectification is not None:
-        valid_mask = eyes.rectification.plane(valid_mask)
     fps = described.get("fps") or images.fps
     if fps is None:
         findings.warn(root, "the frame rate is not stated", f"{DEFAULT_FPS:g} frames/s are assumed")
@@ -376,6 +376,7 @@ def _with_sidecars(
         tool_share=tool_share,
         stereo_baseline_mm=eyes.baseline_mm,
         rectification=eyes.rectification,
+        undistortion=eyes.undistortion,
         other_files=(*beside.files(), *eyes.files),
     )
 
@@ -387,6 +388,7 @@ class _Calibrated(NamedTuple):
     baseline_mm: float | None
     rectification: Rectification | None = None
     files: tuple[Path, ...] = ()
+    undistortion: Undistortion | None = None
 
 
 def _calibrated(
@@ -408,19 +410,42 @@ def _calibrated(
     if rectified is not None:
         found = rectified.calibration
     elif found is None and stated is not None:
-        found = Calibration(stated, None, DESCRIPTION_FILE)
+        found = Calibration(stated, None, DESCRIPTION_FILE, distortion=described.get("distortion", ()))
     elif found is None:
         found = default_calibration(root, *size, findings, poses_known=poses is not None)
     elif stated is not None:
-        found = replace(found, camera=stated.with_pose(found.camera.world_to_camera))
+        camera = stated.with_pose(found.camera.world_to_camera)
+        found = replace(found, camera=camera, distortion=described.get("distortion", ()))
     if poses is not None:
         poses = poses if rectified is None else rectified.by.turn @ poses
         camera = found.camera.with_pose(poses[0])
         source = f"{POSES_FILE}, and the camera of {found.source}"
-        found = Calibration(camera, poses, source, found.assumed)
+        found = replace(found, camera=camera, poses=poses, source=source)
     if rectified is None:
-        return _Calibrated(found, described.get("stereo_baseline_mm"))
+        baseline_mm = described.get("stereo_baseline_mm")
+        if not found.distortion:
+            return _Calibrated(found, baseline_mm)
+        return _undistorted(root, found, baseline_mm, stereo, findings)
     return _Calibrated(found, rectified.baseline_mm, rectified.by, rectified.files)
+
+
+def _undistorted(
+    root: Path, found: Calibration, baseline_mm: float | None, stereo: bool, findings: Findings
+) -> _Calibrated:
+    """Return the calibration without distortion, and the maps to its pictures."""
+    if stereo:
+        findings.problem(
+            root,
+            f"{found.source} states the distortion of one eye, and there are two",
+            "Give a stereo calibration file, or undistort and rectify the pictures and leave out distortion",
+        )
+        return _Calibrated(found, baseline_mm)
+    try:
+        undistortion = Undistortion(found.camera, found.distortion)
+    except InvalidInput as error:
+        findings.problem(root, f"{found.source}: {error}", "Calibrate again, with fewer coefficients")
+        return _Calibrated(found, baseline_mm)
+    return _Calibrated(replace(found, camera=undistortion.camera), baseline_mm, undistortion=undistortion)
 
 
 def _fits_eyes(root: Path, eyes: _Calibrated, stereo: bool, has_depth: bool, findings: Findings) -> bool:

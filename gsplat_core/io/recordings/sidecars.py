@@ -19,6 +19,7 @@ from gsplat_core.io.recordings.calibration import (
     POSES_FILE,
     Calibration,
     number,
+    read_distortion,
     read_json,
     read_pinhole,
     read_poses,
@@ -178,12 +179,12 @@ def _read_description(path: Path, size: tuple[int, int], findings: Findings) -> 
         if not isinstance(described, dict):
             findings.problem(path, f"camera is {described!r:.40}", "Give width, height, fx, fy, cx and cy in pixels")
             return None
-        camera = read_pinhole(path, described, findings)
+        camera, distortion = read_pinhole(path, described, findings), read_distortion(path, described, findings)
         if camera is not None and (camera.width_px, camera.height_px) != size:
             findings.problem(
                 path,
                 f"its camera is {camera.width_px}x{camera.height_px}, the images are {size[0]}x{size[1]}",
                 "Give the camera of these images",
             )
-        read["camera"] = camera
+        read |= {"camera": camera, "distortion": distortion or ()}
     return read
