@@ -115,9 +115,42 @@ def cameras(logs: Logs) -> str:
     return table(("figure", "device", "value"), rows)
 
 
+def memory(logs: Logs) -> str:
+    """Return bytes of gradients and peak memory by the share of visible Gaussians."""
+    rows = []
+    for device, log in logs.items():
+        for each in log["rows"]:
+            held, peak = (f"{each[name] / 2**20:,.1f} MiB" for name in ("gradient_bytes", "peak_bytes"))
+            rows.append([f"{each['share']:.0%}", each["mode"], device, held, peak])
+    counts = ", ".join(f"{log['gaussians']:,} ({device})" for device, log in logs.items())
+    said = (
+        f"One forward and backward pass of {counts} Gaussians with spherical harmonics of degree 3, one camera. Peak memory is"
+        " the increase during the pass. `sparse_grad=True` concerns means, quats and scales as in gsplat, `'all'` opacities and"
+        " colours, too."
+    )
+    return f"{said}\n\n{table(('visible', 'mode', 'device', 'gradients', 'peak'), rows)}"
+
+
+def processes(logs: Logs) -> str:
+    """Return the difference between one process and several."""
+    head = ("device", "processes", "backend", "Gaussians", "cameras", "picture", "gradients")
+    rows = [
+        [device, log["processes"], log["backend"], f"{log['gaussians']:,}", log["cameras"], f"{log['picture']:.1e}",
+         f"{log['gradients']:.1e}"]
+        for device, log in logs.items()
+    ]  # fmt: skip
+    said = (
+        "Largest difference of pictures and gradients of `distributed=True` from one process, packed and dense. Differences of"
+        " gradients are relative to the largest gradient of the same tensor. Required: 1e-4."
+    )
+    return f"{said}\n\n{table(head, rows)}"
+
+
 SECTIONS: tuple[tuple[str, str, Callable[[Logs], str]], ...] = (
     ("gsplat's own tests", "own_tests", own_tests),
     ("Typical calls", "calls", calls),
+    ("Memory of packed and sparse gradients", "memory", memory),
+    ("Several processes", "processes", processes),
     ("Static scenes: `intrasplat train`", "static", static),
     ("Cameras", "cameras", cameras),
 )
