@@ -70,6 +70,52 @@ def require_kernels(op: str, name: str, tensor: Tensor) -> None:
     )
 
 
+TILE_SIZE = 16
+"""Side in pixels of the tiles of ops that blend one image."""
+
+
+def require_tiled_splats(
+    op: str, size_px: tuple[int, int], isect_offsets: Tensor, flatten_ids: Tensor, opacities: Tensor,
+    **rows: tuple[Tensor, int],
+) -> None:  # fmt: skip
+    """Check the splats of one image and their lists, for an op that blends tiles of 16 pixels.
+
+    Args:
+        op: name of the op for messages.
+        size_px: width and height of the image.
+        isect_offsets: int32 [tile_height, tile_width].
+        flatten_ids: int32 [M].
+        opacities: float32 [N].
+        rows: further float32 tensors [N, K] by name, each with K.
+
+    Raises:
+        InvalidInput: for wrong shapes or dtypes, or if the tiles do not cover the image.
+    """
+    require_float32(op, opacities=opacities, **{name: tensor for name, (tensor, _) in rows.items()})
+    if opacities.ndim != 1:
+        raise InvalidInput(f"opacities must be [N], got {list(opacities.shape)}")
+    for name, (tensor, width) in rows.items():
+        require_shape(name, tensor, (len(opacities), width), f"[N, {width}]")
+    for name, tensor in {"isect_offsets": isect_offsets, "flatten_ids": flatten_ids}.items():
+        if tensor.dtype != torch.int32:
+            raise InvalidInput(f"{name} must be int32 as bin_splats returns it, got {tensor.dtype}")
+    if isect_offsets.ndim != 2 or flatten_ids.ndim != 1:
+        raise InvalidInput(
+            "isect_offsets must be [tile_height, tile_width] and flatten_ids [M], got"
+            f" {list(isect_offsets.shape)} and {list(flatten_ids.shape)}"
+        )
+    if any(tiles * TILE_SIZE < side for tiles, side in zip(reversed(isect_offsets.shape), size_px, strict=True)):
+        raise InvalidInput(
+            f"{list(isect_offsets.shape)} tiles of {TILE_SIZE} px do not cover the image of {size_px[0]} x {size_px[1]} px"
+        )
+
+
+def check_max_alpha(max_alpha: float) -> None:
+    """Raise InvalidInput unless the upper limit of alpha is from 1/255 to below 1."""
+    if not 1 / 255 <= max_alpha < 1:
+        raise InvalidInput(f"max_alpha must be from 1/255 to below 1, got {max_alpha}")
+
+
 def check_covariance_arguments(quats: Tensor, scales: Tensor) -> None:
     """Raise InvalidInput unless quats are [..., 4] and scales [..., 3], of one dtype and device."""
     leading = require_trailing("quats", quats, (4,), "[..., 4] (wxyz)")

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32, require_shape
+from gsplat_core.argument_checks import require_tiled_splats
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS
@@ -16,7 +16,6 @@ from gsplat_core.scene.cameras import Camera
 
 PLANE_NUMBERS = 12
 """Values of a splat that move a point on a ray: the vector a, then the rows of the matrix B."""
-TILE_SIZE = 16
 
 
 def blend_flow(
@@ -54,14 +53,10 @@ def blend_flow(
     Raises:
         InvalidInput: for wrong shapes, dtypes or camera models.
     """
-    require_float32("blend_flow", means2d=means2d, conics=conics, opacities=opacities, rays=rays, planes=planes)
-    count = opacities.shape[0] if opacities.ndim else -1
-    widths = {"means2d": 2, "conics": 3, "rays": RAY_NUMBERS, "planes": PLANE_NUMBERS}
-    for (name, width), tensor in zip(widths.items(), (means2d, conics, rays, planes), strict=True):
-        require_shape(name, tensor, (count, width), f"[N, {width}]")
-    for name, tensor in {"isect_offsets": isect_offsets, "flatten_ids": flatten_ids}.items():
-        if tensor.dtype != torch.int32:
-            raise InvalidInput(f"{name} must be int32 as bin_splats returns it, got {tensor.dtype}")
+    require_tiled_splats(
+        "blend_flow", (before.width_px, before.height_px), isect_offsets, flatten_ids, opacities,
+        means2d=(means2d, 2), conics=(conics, 3), rays=(rays, RAY_NUMBERS), planes=(planes, PLANE_NUMBERS),
+    )  # fmt: skip
     for camera in (before, after):
         if camera.model != "pinhole":
             raise InvalidInput(f"blend_flow takes pinhole cameras, got {camera.model!r}")

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <vector>
 
+#include "../compositing/tiled_splats.h"
 #include "host_call.h"
 #if !defined(GSPLAT_CUDA)
 #include "../compositing/tile_pass.h"
@@ -13,34 +14,20 @@
 namespace gsplat::flow_blending {
 namespace {
 
-constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
-
 // Checked inputs of either pass. The tensors own the memory that `in` points to.
 struct Arguments {
-  Tensor means2d, conics, opacities, rays, planes, offsets, flatten_ids;
+  compositing::TiledSplats splats;
+  Tensor rays, planes;
   Inputs in = {};
 
-  Arguments(const Call& call, const Tensor& means2d_, const Tensor& conics_, const Tensor& opacities_, const Tensor& rays_,
-            const Tensor& planes_, const Tensor& offsets_, const Tensor& flatten_ids_, const std::vector<double>& intrinsics,
+  Arguments(const Call& call, const Tensor& means2d, const Tensor& conics, const Tensor& opacities, const Tensor& rays_,
+            const Tensor& planes_, const Tensor& offsets, const Tensor& flatten_ids, const std::vector<double>& intrinsics,
             int64_t width, int64_t height)
-      : means2d(call.floats(means2d_, "means2d")),
-        conics(call.floats(conics_, "conics")),
-        opacities(call.floats(opacities_, "opacities")),
+      : splats(call, "blend_flow", means2d, conics, opacities, offsets, flatten_ids, width, height),
         rays(call.floats(rays_, "rays")),
-        planes(call.floats(planes_, "planes")),
-        offsets(call.ints(offsets_, "isect_offsets")),
-        flatten_ids(call.ints(flatten_ids_, "flatten_ids")) {
-    const int64_t count = opacities.numel();
-    check(offsets.dim() == 2, "blend_flow: isect_offsets must be [tile_height, tile_width]");
-    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && rays.numel() == kRayNumbers * count &&
-              planes.numel() == kPlaneNumbers * count,
-          "blend_flow: means2d, conics, opacities, rays and planes must be of the same splats");
-    const int64_t tile_height = offsets.size(0), tile_width = offsets.size(1);
-    check(width >= 0 && height >= 0 && width < kMaxInts && height < kMaxInts && tile_width * kTileSize >= width &&
-              tile_height * kTileSize >= height,
-          "blend_flow: the tiles of isect_offsets do not cover the image");
-    check(count < kMaxInts && flatten_ids.numel() <= kMaxInts && offsets.numel() <= kMaxInts,
-          "blend_flow: more than 2^31 - 1 splats, instances or tiles");
+        planes(call.floats(planes_, "planes")) {
+    splats.check_rows("blend_flow", "rays", rays, kRayNumbers);
+    splats.check_rows("blend_flow", "planes", planes, kPlaneNumbers);
     check(intrinsics.size() == 8, "blend_flow: intrinsics must be fx, fy, cx, cy of both cameras");
     const auto pinhole = [&](size_t first) {
       const Pinhole p = {float(intrinsics[first]), float(intrinsics[first + 1]), float(intrinsics[first + 2]),
@@ -48,19 +35,7 @@ struct Arguments {
       check(p.fx > 0 && p.fy > 0, "blend_flow: focal lengths must be positive");
       return p;
     };
-    in.means2d = data(means2d);
-    in.conics = data(conics);
-    in.opacities = data(opacities);
-    in.offsets = offsets.const_data_ptr<int32_t>();
-    in.flatten_ids = flatten_ids.const_data_ptr<int32_t>();
-    in.count = count;
-    in.instances = flatten_ids.numel();
-    in.images = 1;
-    in.width = int32_t(width);
-    in.height = int32_t(height);
-    in.tile_size = kTileSize;
-    in.tile_width = int32_t(tile_width);
-    in.tile_height = int32_t(tile_height);
+    static_cast<compositing::Inputs&>(in) = splats.in;
     in.rays = data(rays);
     in.planes = data(planes);
     in.before = pinhole(0);

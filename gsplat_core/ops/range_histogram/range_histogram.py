@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32
+from gsplat_core.argument_checks import check_max_alpha, require_float32, require_tiled_splats
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.splat_rays.splat_rays import RAY_NUMBERS
@@ -67,31 +67,16 @@ def range_histogram(
     Raises:
         InvalidInput: for wrong shapes, dtypes, bins or limits.
     """
-    count = opacities.shape[0] if opacities.ndim == 1 else -1
-    expected = {"means2d": (count, 2), "conics": (count, 3), "opacities": (count,), "rays": (count, RAY_NUMBERS)}
-    given = {"means2d": means2d, "conics": conics, "opacities": opacities, "rays": rays}
-    for name, shape in expected.items():
-        if tuple(given[name].shape) != shape:
-            raise InvalidInput(f"{name} must have shape {['N', *shape[1:]]} with one N, got {list(given[name].shape)}")
-    require_float32("range_histogram", **given, factors=factors)
-    for name, tensor in {"isect_offsets": isect_offsets, "flatten_ids": flatten_ids}.items():
-        if tensor.dtype != torch.int32:
-            raise InvalidInput(f"{name} must be int32 as bin_splats returns it, got {tensor.dtype}")
-    if isect_offsets.ndim != 2 or flatten_ids.ndim != 1:
-        raise InvalidInput(
-            "isect_offsets must be [tile_height, tile_width] and flatten_ids [M], got"
-            f" {list(isect_offsets.shape)} and {list(flatten_ids.shape)}"
-        )
-    if isect_offsets.shape[0] * 16 < image_height or isect_offsets.shape[1] * 16 < image_width:
-        raise InvalidInput(
-            f"{list(isect_offsets.shape)} tiles of 16 px do not cover the image of {image_width} x {image_height} px"
-        )
+    require_tiled_splats(
+        "range_histogram", (image_width, image_height), isect_offsets, flatten_ids, opacities,
+        means2d=(means2d, 2), conics=(conics, 3), rays=(rays, RAY_NUMBERS),
+    )  # fmt: skip
+    require_float32("range_histogram", opacities=opacities, factors=factors)
     if factors is not None and tuple(factors.shape) != (image_height, image_width):
         raise InvalidInput(f"factors must be [{image_height}, {image_width}], got {list(factors.shape)}")
     if not (1 <= bins.number <= MOST_BINS and bins.width > 0):
         raise InvalidInput(f"bins must be 1 to {MOST_BINS} of positive width, got {bins.number} of {bins.width}")
-    if not 1 / 255 <= max_alpha < 1:
-        raise InvalidInput(f"max_alpha must be from 1/255 to below 1, got {max_alpha}")
+    check_max_alpha(max_alpha)
     return torch.ops.gsplat_core.range_histogram(
         means2d,
         conics,

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "../compositing/alpha_limit.h"
+#include "../compositing/tiled_splats.h"
 #include "host_call.h"
 #if !defined(GSPLAT_CUDA)
 #include "../compositing/tile_pass.h"
@@ -15,53 +16,23 @@ namespace {
 
 // Checked inputs of either pass. The tensors own the memory that `in` points to.
 struct Arguments {
-  Tensor means2d, conics, opacities, rays, offsets, flatten_ids;
+  compositing::TiledSplats splats;
+  Tensor rays;
   OptionalTensor factors;
   Inputs in;
 
-  Arguments(const Call& call, const Tensor& means2d_, const Tensor& conics_, const Tensor& opacities_, const Tensor& rays_,
-            const Tensor& offsets_, const Tensor& flatten_ids_, const OptionalTensor& factors_, double nearest, double bin,
+  Arguments(const Call& call, const Tensor& means2d, const Tensor& conics, const Tensor& opacities, const Tensor& rays_,
+            const Tensor& offsets, const Tensor& flatten_ids, const OptionalTensor& factors_, double nearest, double bin,
             int64_t bins, int64_t width, int64_t height, double max_alpha)
-      : means2d(call.floats(means2d_, "means2d")),
-        conics(call.floats(conics_, "conics")),
-        opacities(call.floats(opacities_, "opacities")),
+      : splats(call, "range_histogram", means2d, conics, opacities, offsets, flatten_ids, width, height,
+               compositing::limit_of(max_alpha)),
         rays(call.floats(rays_, "rays")),
-        offsets(call.ints(offsets_, "isect_offsets")),
-        flatten_ids(call.ints(flatten_ids_, "flatten_ids")),
         factors(call.floats(factors_, "factors")) {
-    constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
-    check(offsets.dim() == 2, "range_histogram: isect_offsets must be [tile_height, tile_width]");
-    const int64_t count = opacities.numel(), tile_height = offsets.size(0), tile_width = offsets.size(1);
-    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && rays.numel() == kRayNumbers * count,
-          "range_histogram: means2d, conics, opacities and rays must be of the same splats");
-    check(width >= 0 && height >= 0 && tile_width * kTileSize >= width && tile_height * kTileSize >= height &&
-              tile_width * tile_height < kMaxInts,
-          "range_histogram: the tiles of isect_offsets do not cover the image");
-    check(count < kMaxInts && flatten_ids.numel() <= kMaxInts, "range_histogram: more than 2^31 - 1 splats or instances");
+    splats.check_rows("range_histogram", "rays", rays, kRayNumbers);
     check(bins >= 1 && bins <= kMaxBins && bin > 0, "range_histogram: 1 to ", kMaxBins, " bins of positive width, got ", bins,
           " of ", bin);
     check(!factors || factors->numel() == width * height, "range_histogram: factors must be [", height, ", ", width, "]");
-    in = {.splats = {.splats = {.means2d = data(means2d),
-                                .conics = data(conics),
-                                .colors = nullptr,
-                                .opacities = data(opacities),
-                                .offsets = offsets.const_data_ptr<int32_t>(),
-                                .flatten_ids = flatten_ids.const_data_ptr<int32_t>(),
-                                .backgrounds = nullptr,
-                                .masks = nullptr,
-                                .count = count,
-                                .instances = flatten_ids.numel(),
-                                .images = 1,
-                                .channels = 0,
-                                .width = int32_t(width),
-                                .height = int32_t(height),
-                                .tile_size = kTileSize,
-                                .tile_width = int32_t(tile_width),
-                                .tile_height = int32_t(tile_height),
-                                .alpha = compositing::limit_of(max_alpha)},
-                     .rays = data(rays),
-                     .values = nullptr,
-                     .channels = 0},
+    in = {.splats = {.splats = splats.in, .rays = data(rays), .values = nullptr, .channels = 0},
           .factors = data(factors),
           .nearest = float(nearest),
           .bin = float(bin),

@@ -4,6 +4,7 @@
 #include <tuple>
 
 #include "../compositing/alpha_limit.h"
+#include "../compositing/tiled_splats.h"
 #include "host_call.h"
 #if !defined(GSPLAT_CUDA)
 #include "../compositing/tile_pass.h"
@@ -12,56 +13,24 @@
 namespace gsplat::ray_blending {
 namespace {
 
-constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
-
 // Checked inputs of either pass. The tensors own the memory that `in` points to.
 struct Arguments {
-  Tensor means2d, conics, opacities, rays, values, offsets, flatten_ids;
+  compositing::TiledSplats splats;
+  Tensor rays, values;
   Inputs in;
 
-  Arguments(const Call& call, const Tensor& means2d_, const Tensor& conics_, const Tensor& opacities_, const Tensor& rays_,
-            const Tensor& values_, const Tensor& offsets_, const Tensor& flatten_ids_, int64_t width, int64_t height,
+  Arguments(const Call& call, const Tensor& means2d, const Tensor& conics, const Tensor& opacities, const Tensor& rays_,
+            const Tensor& values_, const Tensor& offsets, const Tensor& flatten_ids, int64_t width, int64_t height,
             double max_alpha)
-      : means2d(call.floats(means2d_, "means2d")),
-        conics(call.floats(conics_, "conics")),
-        opacities(call.floats(opacities_, "opacities")),
+      : splats(call, "blend_rays", means2d, conics, opacities, offsets, flatten_ids, width, height,
+               compositing::limit_of(max_alpha)),
         rays(call.floats(rays_, "rays")),
-        values(call.floats(values_, "values")),
-        offsets(call.ints(offsets_, "isect_offsets")),
-        flatten_ids(call.ints(flatten_ids_, "flatten_ids")) {
-    check(offsets.dim() == 2 && values.dim() == 2,
-          "blend_rays: isect_offsets must be [tile_height, tile_width] and values [N, D]");
-    const int64_t count = opacities.numel(), channels = values.size(1);
-    const int64_t tile_height = offsets.size(0), tile_width = offsets.size(1);
-    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && rays.numel() == kRayNumbers * count &&
-              values.size(0) == count,
-          "blend_rays: means2d, conics, opacities, rays and values must be of the same splats");
+        values(call.floats(values_, "values")) {
+    check(values.dim() == 2 && values.size(0) == splats.in.count, "blend_rays: values must be [", splats.in.count, ", D]");
+    splats.check_rows("blend_rays", "rays", rays, kRayNumbers);
+    const int64_t channels = values.size(1);
     check(channels <= kMaxChannels, "blend_rays: at most ", kMaxChannels, " channels, found ", channels);
-    check(width >= 0 && height >= 0 && tile_width * kTileSize >= width && tile_height * kTileSize >= height &&
-              tile_width * tile_height < kMaxInts,
-          "blend_rays: the tiles of isect_offsets do not cover the image");
-    check(count < kMaxInts && flatten_ids.numel() <= kMaxInts, "blend_rays: more than 2^31 - 1 splats or instances");
-    in = {.splats = {.means2d = data(means2d),
-                     .conics = data(conics),
-                     .colors = nullptr,
-                     .opacities = data(opacities),
-                     .offsets = offsets.const_data_ptr<int32_t>(),
-                     .flatten_ids = flatten_ids.const_data_ptr<int32_t>(),
-                     .backgrounds = nullptr,
-                     .masks = nullptr,
-                     .count = count,
-                     .instances = flatten_ids.numel(),
-                     .images = 1,
-                     .channels = 0,
-                     .width = int32_t(width),
-                     .height = int32_t(height),
-                     .tile_size = kTileSize,
-                     .tile_width = int32_t(tile_width),
-                     .tile_height = int32_t(tile_height),
-                     .alpha = compositing::limit_of(max_alpha)},
-          .rays = data(rays),
-          .values = data(values),
-          .channels = int32_t(channels)};
+    in = {.splats = splats.in, .rays = data(rays), .values = data(values), .channels = int32_t(channels)};
   }
 };
 

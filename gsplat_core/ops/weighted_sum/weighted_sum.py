@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32, require_shape
+from gsplat_core.argument_checks import require_float32, require_shape, require_tiled_splats
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
@@ -61,16 +61,12 @@ def weighted_sums(
             f"weighted_sums takes opacities [N] and channels [N, D] with D from 1 to {MOST_CHANNELS}, got"
             f" {list(opacities.shape)} and {list(channels.shape)}"
         )
-    for name, tensor, shape, form in (
-        ("means2d", means2d, (count, 2), "[N, 2]"),
-        ("conics", conics, (count, 3), "[N, 3]"),
-        ("channels", channels, (count, channels.shape[1]), "[N, D]"),
-        ("weights", weights, (count,), "[N]"),
-    ):
-        require_shape(name, tensor, shape, form)
-    require_float32(
-        "weighted_sums", means2d=means2d, conics=conics, channels=channels, opacities=opacities, weights=weights
-    )
+    require_float32("weighted_sums", opacities=opacities, weights=weights)
+    require_shape("weights", weights, (count,), "[N]")
+    require_tiled_splats(
+        "weighted_sums", (width, height), isect_offsets, flatten_ids, opacities,
+        means2d=(means2d, 2), conics=(conics, 3), channels=(channels, channels.shape[1]),
+    )  # fmt: skip
     return torch.ops.gsplat_core.weighted_sums(
         means2d, conics, channels, opacities, weights, isect_offsets, flatten_ids, width, height
     )

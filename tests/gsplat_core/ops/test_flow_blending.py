@@ -120,7 +120,7 @@ def test_wrong_arguments_are_refused():
     for arguments, message in cases:
         with pytest.raises(InvalidInput, match=message):
             blend_flow(*arguments)
-    with pytest.raises(RuntimeError, match="do not cover the image"):
+    with pytest.raises(InvalidInput, match="do not cover the image"):
         blend_flow(*scene, BEFORE, AFTER, offsets[:1].contiguous(), ids)
     with pytest.raises(RuntimeError, match="flatten_ids must be in"):
         blend_flow(*scene, BEFORE, AFTER, offsets, torch.full_like(ids, 5))

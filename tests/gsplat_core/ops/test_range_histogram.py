@@ -102,5 +102,5 @@ def test_wrong_arguments_are_refused():
         range_histogram(*inputs, *lists, Bins(0, 1, 0), 20, 20)
     with pytest.raises(InvalidInput, match=r"factors must be \[20, 20\]"):
         range_histogram(*inputs, *lists, BINS, 20, 20, factors=torch.ones(3, 20))
-    with pytest.raises(InvalidInput, match="rays must have shape"):
+    with pytest.raises(InvalidInput, match=r"rays must be \[N, 10\]"):
         range_histogram(*inputs[:3], inputs[3][:, :9], *lists, BINS, 20, 20)

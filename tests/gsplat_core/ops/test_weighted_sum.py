@@ -155,7 +155,7 @@ def test_wrong_arguments_are_refused():
     ]:
         with pytest.raises(InvalidInput, match=message):
             weighted_sums(*inputs[:at], wrong, *inputs[at + 1 :], 32, 32, offsets, ids)
-    with pytest.raises(RuntimeError, match="do not cover the image"):
+    with pytest.raises(InvalidInput, match="do not cover the image"):
         weighted_sums(*inputs, 40, 32, offsets, ids)
     with pytest.raises(RuntimeError, match=r"flatten_ids must be in \[0, 5\)"):
         weighted_sums(*inputs, 32, 32, torch.zeros_like(offsets), torch.full((1,), 5, dtype=torch.int32))
