@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from gsplat_core.rendering.frame_renderer import FrameRenderer
     from gsplat_core.rendering.inria import rasterization_inria_wrapper
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
+    from gsplat_core.rendering.rasterizer import Rasterizer
     from gsplat_core.rendering.registry import RENDERERS, new_renderer
     from gsplat_core.rendering.renderer import Renderer
     from gsplat_core.rendering.surfels import rasterization_2dgs, rasterization_2dgs_inria_wrapper
@@ -69,6 +70,7 @@ __all__ = [
     "MCMCStrategy",
     "Model",
     "PngCompression",
+    "Rasterizer",
     "Reconstructor",
     "ReconstructorConfig",
     "RenderOutput",
@@ -127,6 +129,7 @@ _HOME = {
     "MCMCStrategy": "training.strategies.mcmc",
     "Model": "models.model",
     "PngCompression": "io.png_compression",
+    "Rasterizer": "rendering.rasterizer",
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",

@@ -300,6 +300,11 @@ class FrameRenderer:
         self._captured: CapturedSequence[Frame] | None = None
         self._captured_capacity = self.capacity
 
+    @property
+    def picture_shape(self) -> tuple[int, int, str]:
+        """Width and height in pixels, and camera model of every frame."""
+        return self._camera.width_px, self._camera.height_px, self._camera.model
+
     def render(self, camera: Camera | None = None, time_s: float = 0.0) -> LaunchedFrame:
         """Enqueue the picture of `camera` at `time_s` on the current stream."""
         camera = camera or self._camera

@@ -27,6 +27,7 @@ PUBLIC = [
     "Model",
     "PngCompression",
     "RENDERERS",
+    "Rasterizer",
     "Reconstructor",
     "ReconstructorConfig",
     "RenderOutput",
