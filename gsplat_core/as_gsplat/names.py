@@ -17,6 +17,7 @@ _STRATEGIES = {
 }
 _OPERATIONS = "gsplat_core.training.strategies.operations"
 _DYNAMIC = "gsplat_core.contrib.dynamic"
+_SURGICAL = "gsplat_core.contrib.surgical"
 _DISTRIBUTED = "gsplat_core.rendering.distributed"
 _CUDA = {
     "FThetaCameraDistortionParameters": "gsplat_core.scene.distortion",
@@ -111,8 +112,16 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "cli": _DISTRIBUTED,
     },
     "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.splats"},
+    "gsplat.init_utils": {"knn_scale_init": _SURGICAL, "multi_frame_depth_unprojection": _SURGICAL},
+    "gsplat.losses": {
+        "binocular_disparity_l1": _SURGICAL,
+        "masked_l1": _SURGICAL,
+        "masked_ssim": _SURGICAL,
+        "pearson_depth_loss": _SURGICAL,
+    },
     "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
     "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
+    "gsplat.regularizers": {"compute_tv_loss_targeted": _SURGICAL},
     "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.relocation"},
     "gsplat.rendering": {
         **_RENDERING,
@@ -134,6 +143,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "sample_add": _OPERATIONS,
         "split": _OPERATIONS,
     },
+    "gsplat.training": {"TwoStageScheduleStep": _SURGICAL, "TwoStageScheduler": _SURGICAL},
     "gsplat.utils": {
         "depth_to_normal": "gsplat_core.rendering.depth_maps",
         "depth_to_points": "gsplat_core.rendering.depth_maps",
