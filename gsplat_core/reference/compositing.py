@@ -12,7 +12,10 @@ from torch.utils.checkpoint import checkpoint
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_STOP = 1e-4
-SPLATS_AT_A_TIME = 2048  # bounds the memory of a tile with very many splats
+SPLATS_AT_A_TIME = 2048
+"""Bound of the splats of a tile that are blended together, for memory."""
+FIRST_SPLATS = 64
+"""Splats that are blended first; each further part has twice as many, so that few are computed behind opaque ones."""
 
 
 def rasterize_to_pixels(
@@ -114,8 +117,8 @@ class _Instances:
         """Return colours [P, D] and remaining transmittance [P] at the pixel centres [P, 2] of a tile."""
         colors = pixels.new_zeros(len(pixels), self.values[tile].shape[-1] - 6)
         product = through = pixels.new_ones(len(pixels))
-        parts = zip(self.ids[tile].split(SPLATS_AT_A_TIME), self.values[tile].split(SPLATS_AT_A_TIME), strict=True)
-        for ids, values in parts:
+        sizes = _part_sizes(len(self.ids[tile]))
+        for ids, values in zip(self.ids[tile].split(sizes), self.values[tile].split(sizes), strict=True):
             if not len(ids) or not bool((product > TRANSMITTANCE_STOP).any()):
                 break
             if torch.is_grad_enabled() and values.requires_grad:
@@ -164,3 +167,13 @@ class _Instances:
         length = blended.sum(1, keepdim=True)
         left = torch.where(length[:, 0] > 0, after.gather(1, (length - 1).clamp(min=0))[:, 0], through)
         return weights @ colors, after[:, -1], left
+
+
+def _part_sizes(length: int) -> list[int]:
+    """Return sizes of consecutive parts of a list."""
+    sizes, size = [], FIRST_SPLATS
+    while length > 0:
+        sizes.append(min(size, length))
+        length -= sizes[-1]
+        size = min(2 * size, SPLATS_AT_A_TIME)
+    return sizes or [0]
