@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -11,6 +12,17 @@ from types import ModuleType
 from typing import Any
 
 from gsplat_core.as_gsplat.names import MODULES
+from gsplat_core.errors import InvalidInput
+
+CONSTANTS = ("1.6", "1.5.3")
+_OLD_CONSTANTS: Mapping[str, Mapping[str, Any]] = {
+    "accumulate": {"max_alpha": 0.999},
+    "fully_fused_projection": {"compensation_floor": 0.0},
+    "rasterization": {"constants": "1.5.3"},
+    "rasterize_to_indices_in_range": {"max_alpha": 0.999},
+    "rasterize_to_pixels": {"max_alpha": 0.999},
+}
+"""Options that give functions the constants of gsplat 1.5.3, as in `gsplat_core.rendering.settings.CONSTANTS`."""
 
 
 class AliasModule(ModuleType):
@@ -18,8 +30,9 @@ class AliasModule(ModuleType):
 
     __all__: list[str]
 
-    def __init__(self, name: str, homes: Mapping[str, str]) -> None:
+    def __init__(self, name: str, homes: Mapping[str, str], options: Mapping[str, Mapping[str, Any]]) -> None:
         super().__init__(name, f"`gsplat_core` under the name {name}.")
+        self._options = options
         self._homes = dict(homes)
         self._children = [each for each in MODULES if each.rpartition(".")[0] == name]
         self.__all__ = sorted(homes)
@@ -30,7 +43,7 @@ class AliasModule(ModuleType):
         full = f"{self.__name__}.{name}"
         if name in self._homes:
             home, _, known_as = self._homes[name].partition(":")
-            value = getattr(importlib.import_module(home), known_as or name)
+            value = _with_options(getattr(importlib.import_module(home), known_as or name), self._options.get(name))
         elif full in self._children:
             value = importlib.import_module(full)
         else:
@@ -44,8 +57,25 @@ class AliasModule(ModuleType):
         return sorted([*self.__all__, *(child.rpartition(".")[2] for child in self._children)])
 
 
+@functools.cache
+def _bound(function: Any, options: tuple[tuple[str, Any], ...]) -> Any:
+    @functools.wraps(function)
+    def call(*arguments: Any, **given: Any) -> Any:
+        return function(*arguments, **dict(options) | given)
+
+    return call
+
+
+def _with_options(value: Any, options: Mapping[str, Any] | None) -> Any:
+    """Return a function with other default values of options; the same object for every module."""
+    return value if options is None else _bound(value, tuple(options.items()))
+
+
 class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Finds the modules of `MODULES` before any installed gsplat."""
+
+    def __init__(self, constants: str) -> None:
+        self.constants = constants
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -59,18 +89,25 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
         """Return the module, without importing what it names."""
-        return AliasModule(spec.name, MODULES[spec.name])
+        return AliasModule(spec.name, MODULES[spec.name], _OLD_CONSTANTS if self.constants == "1.5.3" else {})
 
     def exec_module(self, module: ModuleType) -> None:
         """Do nothing: attributes are imported when they are used."""
 
 
-def install() -> None:
+def install(constants: str = "1.6") -> None:
     """Make `import gsplat` find this package, in this process, before any installed gsplat.
 
+    Args:
+        constants: version of gsplat whose numerical constants its functions have, "1.6" or "1.5.3". On CUDA, those of 1.6 are
+            faster.
+
     Raises:
-        ImportError: if another gsplat has been imported already.
+        ImportError: if another gsplat has been imported already, or this one with other constants.
+        InvalidInput: for an unknown version.
     """
+    if constants not in CONSTANTS:
+        raise InvalidInput(f"unknown constants {constants!r}; the versions are {', '.join(CONSTANTS)}")
     for name in MODULES:
         loaded = sys.modules.get(name)
         if loaded is not None and not isinstance(loaded, AliasModule):
@@ -78,5 +115,8 @@ def install() -> None:
                 f"{name} has been imported from {getattr(loaded, '__file__', 'elsewhere')}; call install() before the"
                 " first import of gsplat"
             )
-    if not any(isinstance(each, Finder) for each in sys.meta_path):
-        sys.meta_path.insert(0, Finder())
+    present = [each for each in sys.meta_path if isinstance(each, Finder)]
+    if any(each.constants != constants for each in present):
+        raise ImportError(f"gsplat has been installed with other constants than {constants}; call install() once")
+    if not present:
+        sys.meta_path.insert(0, Finder(constants))

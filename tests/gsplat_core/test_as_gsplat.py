@@ -36,9 +36,9 @@ print(__name__, gsplat.__version__, tuple(colors.shape), sys.argv[1:])
 
 
 @pytest.fixture
-def installed():
+def installed(request):
     before = dict(sys.modules)
-    install()
+    install(getattr(request, "param", "1.6"))
     yield
     sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, finder.Finder)]
     for name in names.MODULES:
@@ -69,6 +69,23 @@ def test_names_are_those_of_the_package_itself(installed):
     for name in names.MODULES["gsplat"]:
         if name in gsplat_core.__all__:
             assert getattr(module, name) is getattr(gsplat_core, name)
+
+
+@pytest.mark.parametrize(("installed", "most"), [("1.6", 0.99), ("1.5.3", 0.999)], indirect=["installed"])
+def test_the_constants_are_those_of_the_chosen_version(installed, most):
+    gsplat = importlib.import_module("gsplat")
+    assert importlib.import_module("gsplat.rendering").rasterization is gsplat.rasterization
+    opaque = torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.5), torch.ones(1)
+    camera = torch.eye(4)[None], torch.tensor([[[20.0, 0, 8.5], [0, 20, 8.5], [0, 0, 1]]])
+    _, alphas, meta = gsplat.rasterization(*opaque, torch.ones(1, 3), *camera, 16, 16, packed=False)
+    assert float(alphas.max()) == pytest.approx(most)
+    splats = meta["means2d"], meta["conics"], torch.ones(1, 1)
+    lists = 16, 16, 16, meta["isect_offsets"], meta["flatten_ids"]
+    pairs = gsplat.rasterize_to_indices_in_range(0, 1, torch.ones(1, 16, 16), *splats, *lists)
+    _, accumulated = gsplat.accumulate(*splats, torch.ones(1, 1, 3), *pairs, 16, 16)
+    torch.testing.assert_close(accumulated, alphas)
+    with pytest.raises(ImportError, match="other constants"):
+        install("1.5.3" if most == 0.99 else "1.6")
 
 
 def test_an_unknown_name_is_reported_with_those_that_exist(installed):
