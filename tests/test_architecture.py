@@ -19,6 +19,7 @@ MAY_IMPORT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["operators", "services"])
 def test_no_modules_import_each_other_not_even_in_functions_or_for_type_checkers(package):
     assert circles(imports(parsed(ROOT, [package]), everything=True)) == []
@@ -56,6 +57,7 @@ def imports_reference(path: Path) -> bool:
     return any(name == REFERENCE or name.startswith(f"{REFERENCE}.") for name in imported_modules(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", MAY_IMPORT)
 def test_the_reference_is_imported_by_tests_only(package):
     reference = ROOT / REFERENCE.replace(".", "/")
@@ -77,6 +79,7 @@ def test_every_way_to_import_the_reference_is_seen(tmp_path, line):
     assert imports_reference(tmp_path / "module.py")
 
 
+@pytest.mark.slow
 def test_experimental_methods_are_named_by_registries_only():
     """An import path in a registry is a string. An import statement would make an experimental method part of another module."""
     folder = ROOT / "gsplat_core/experimental"
@@ -149,6 +152,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_import_opens_no_socket_starts_no_process_and_compiles_nothing():
     packages = (*MAY_IMPORT, "gsplat_core.rendering.rasterization", "gsplat_core.reference")
     done = subprocess.run([sys.executable, "-c", PROGRAM, *packages], capture_output=True, text=True, cwd=ROOT)
@@ -204,6 +208,7 @@ def test_the_client_and_the_schemas_load_no_server_framework():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_control_plane_loads_neither_torch_nor_opencv():
     """Import all modules in one process and check for torch and OpenCV after each."""
     program = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\n    assert not {'torch', 'cv2'} & set(sys.modules), name"

@@ -167,6 +167,7 @@ def test_absgrad(scene, packed):
     assert (absolute >= plain.abs() * (1 - 1e-4) - 1e-6).all() and absolute.sum() > 1.2 * plain.abs().sum()
 
 
+@pytest.mark.slow
 def test_absgrad_matches_the_reference(make_scene, assert_near):
     def absolute(module, dtype):
         scene = make_scene(30).to(dtype)

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsplat_core import rasterization
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of torch's compiler, about its own parts
 def test_a_compiled_render_is_one_graph_and_equals_the_eager_one(make_scene, assert_compiled_equal):
     scene = make_scene(60).to(torch.float32)

@@ -81,6 +81,7 @@ def cuda_library() -> None:
     pytest.skip(f"the CUDA kernels are {native.CUDA_MISSING}")
 
 
+@pytest.mark.slow
 def test_the_sources_implement_what_has_a_schema():
     on_cuda = implemented("CUDA")
     assert len(on_cuda) >= 12
@@ -103,6 +104,7 @@ def test_ci_builds_for_every_gpu(cuda_library):
     assert native.cuda_build().endswith(" for 8.0, 9.0")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in SCHEMAS if name != "active_isa"])
 def test_every_op_has_a_fake_kernel(name):
     assert has_kernel(name, "Meta")
@@ -139,6 +141,7 @@ def test_a_picture_is_traced_on_cuda_without_a_gpu(cuda_library):
         assert (v_means.shape, v_quats.shape, v_scales.shape) == ((1, N, 3), (1, N, 4), (1, N, 3)) and v_means.is_cuda
 
 
+@pytest.mark.slow
 def test_a_frame_and_its_gradient_are_traced_on_cuda_without_a_gpu(cuda_library):
     with FakeTensorMode():
         raw = gaussians(16)

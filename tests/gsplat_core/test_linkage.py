@@ -67,6 +67,7 @@ def test_our_sources_throw_by_our_own_check():
         assert [p.name for p in sources if p.name != "torch_abi.h" and theirs in p.read_text()] == []
 
 
+@pytest.mark.slow
 def test_an_argument_is_refused_with_a_static_runtime():
     """Link the CPU library's objects with this toolchain's static libstdc++ and libgcc, in a separate process."""
     build = ROOT / "build" / "editable"

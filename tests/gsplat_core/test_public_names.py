@@ -7,6 +7,8 @@ import inspect
 import subprocess
 import sys
 
+import pytest
+
 import gsplat_core
 from gsplat_core import reference
 
@@ -145,6 +147,7 @@ def test_an_unknown_name_is_an_attribute_error():
         raise AssertionError("an unknown name was found")
 
 
+@pytest.mark.slow
 def test_the_reference_works_without_the_compiled_library():
     program = (
         "import pathlib, sys\n"

@@ -68,6 +68,7 @@ EVENTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("event", EVENTS)
@@ -129,6 +130,7 @@ def test_an_unsteady_clock_is_no_other_frame_rate():
     assert not any(found)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):

@@ -61,6 +61,7 @@ def test_without_a_change_the_gains_are_exactly_one(recordings_dir, name):
     assert {estimator.observe(image, None, k * FRAME_NS) for k, image in enumerate(images)} == {UNCHANGED}
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("change", CHANGES)
 def test_changes_in_cutting_are_recovered(recordings_dir, change):
@@ -137,6 +138,7 @@ def test_another_scene_has_its_own_colours():
     assert {estimator.observe(image // 2, None, k * FRAME_NS) for k, image in enumerate(texture(5, 20))} == {UNCHANGED}
 
 
+@pytest.mark.slow
 def test_hours_of_changes_do_not_add_up_to_a_drift():
     estimator, images, rng = ExposureEstimator(), texture(6, 64), np.random.default_rng(0)
     gain, worst = 1.0, 0.0

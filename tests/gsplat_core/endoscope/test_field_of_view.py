@@ -127,6 +127,7 @@ def test_text_that_appears_in_the_surround_leaves_the_field_as_it_is():
     assert found[-1] is found[0] is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", [(10, 10, 12), (190, 195, 200)])
 def test_a_tool_at_the_rim_takes_nothing_away(colour):
     images = seen_through(disc(), count=95)
@@ -144,6 +145,7 @@ def test_text_in_the_surround_is_not_in_the_field():
     assert overlap(masks(images)[-1], disc()) > 0.92
 
 
+@pytest.mark.slow
 def test_a_larger_field_is_taken_soon_and_a_smaller_one_after_a_while():
     small, large = disc(radius=80), disc(radius=120)
     found = masks([*seen_through(small, count=60), *seen_through(large, count=60), *seen_through(small, count=150)])
@@ -151,6 +153,7 @@ def test_a_larger_field_is_taken_soon_and_a_smaller_one_after_a_while():
     assert overlap(found[140], large) > 0.91 and overlap(found[-1], small) > 0.91
 
 
+@pytest.mark.slow
 def test_a_field_that_is_gone_is_gone_after_a_while():
     found = masks([*seen_through(disc(), count=30), *texture(4, 160, WIDTH, HEIGHT)])
     assert found[29] is not None and found[-1] is None

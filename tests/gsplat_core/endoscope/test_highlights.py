@@ -66,6 +66,7 @@ def test_a_large_picture_has_the_same_ones():
     assert (again & found).sum() / (again | found).sum() > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 def test_in_recordings_they_are_small_and_white(recordings_dir, name):

@@ -35,6 +35,7 @@ def test_progressive_video_is_not_touched(recordings_dir, name):
         assert comb_share(image) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 def test_interlaced_video_is_found_and_comes_nearer_to_its_even_field(recordings_dir, name):

@@ -42,6 +42,7 @@ def test_a_change_that_is_slower_than_what_pictures_are_compared_with_is_renewed
     assert all(renewed) and not all(kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [

@@ -67,6 +67,7 @@ def outside_of(image):
     return None if evidence is None else evidence.outside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OUTSIDE)
 def test_every_picture_from_outside_is_withheld_at_once(name):
     for seed in SEEDS:
@@ -99,6 +100,7 @@ def test_pictures_without_evidence_pass(rng, name):
     assert gate.judge(WITHOUT_EVIDENCE[name](rng)) is None and gate.inside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", UNUSUAL)
 def test_unusual_tissue_passes(change):
     for seed in SEEDS:
@@ -121,6 +123,7 @@ def test_no_frame_of_a_recording_is_withheld(recordings_dir, name):
     assert {outside_of(image) for image in recorded(recordings_dir, name, every=2 if name in VIDEOS else 1)} == {None}
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", [*VIDEOS, *STILLS])
 def test_no_frame_of_a_changed_recording_is_withheld(recordings_dir, name):

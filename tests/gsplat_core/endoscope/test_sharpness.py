@@ -94,6 +94,7 @@ def test_smoke_that_gathers_slowly_is_found():
     assert found[:30] == [None] * 30 and set(found[70:]) == {"smoke"}
 
 
+@pytest.mark.slow
 def test_between_the_limits_a_frame_stays_what_the_one_before_was():
     sharp = texture(2, 40, 320, 256)
     usual = appearance(sharp[0]).rows
@@ -106,6 +107,7 @@ def test_between_the_limits_a_frame_stays_what_the_one_before_was():
     assert faults([*sharp[:10], defocused(sharp[10]), *soft[11:14], sharp[14]])[10:] == ["blur"] * 4 + [None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [5.0, 30.0, 60.0])
 @pytest.mark.parametrize("spoil", [defocused, smoky])
 def test_a_stream_that_changes_for_good_is_withheld_for_a_moment_only(fps, spoil):
@@ -118,6 +120,7 @@ def test_a_stream_that_changes_for_good_is_withheld_for_a_moment_only(fps, spoil
     assert set(found[until:]) <= {None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [5.0, 30.0])
 def test_no_stretch_of_blur_however_it_comes_leaves_the_display_without_a_frame_for_a_second(fps):
     rng = np.random.default_rng(5)
@@ -143,6 +146,7 @@ def test_a_recording_that_is_soft_throughout_passes_and_sudden_blur_in_it_does_n
     assert found[:15] + found[20:] == [None] * 25 and set(found[15:20]) == {"blur"}
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize(("name", "most"), [("laparoscopy", 4), ("stereomis_like", 4), ("resting_bowel", 0)])
 def test_few_frames_of_a_moving_scope_are_withheld_and_none_for_a_second(recordings_dir, name, most):

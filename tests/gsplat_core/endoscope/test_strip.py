@@ -70,6 +70,7 @@ def test_tissue_alone_has_none():
     assert last_mask(texture(2, FRAMES, WIDTH, HEIGHT)) is None
 
 
+@pytest.mark.slow
 def test_a_strip_that_goes_away_is_gone_after_a_while():
     images = texture(3, 2 * FRAMES, WIDTH, HEIGHT)
     detector = StripDetector()

@@ -74,6 +74,7 @@ def test_a_grey_tool_is_found_whatever_the_light(rng, change):
     assert (mask[tool] == 0).mean() > 0.95  # tissue may be lost at the edge, tool pixels must not
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flip", [0, 1, -1])
 @pytest.mark.parametrize("size", [(128, 160), (257, 319), (512, 640), (1024, 1280), (576, 200)])
 def test_size_and_orientation_do_not_matter(rng, size, flip):

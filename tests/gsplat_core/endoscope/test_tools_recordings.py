@@ -25,6 +25,7 @@ def tool_ious(folder: Path, change) -> list[float]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gains", [(1, 1, 1), (0.4, 0.4, 0.4), (1.15, 1, 0.85), (0.8, 1, 1.1)], ids=["as it is", "dark", "warm", "cold"]
 )
@@ -35,6 +36,7 @@ def test_the_tool_of_cutting_is_found(recordings_dir, gains):
     assert len(found) == 39 and np.mean(found) >= 0.75 and min(found) > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("sinus", 0.0), ("colon", 0.0)])
 def test_no_tool_is_found_where_there_is_none(recordings_dir, name, most):
     finder = ToolFinder()

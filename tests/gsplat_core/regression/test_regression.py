@@ -87,6 +87,7 @@ def test_births_replace_deaths(single):
     assert len(births_and_deaths(torch.ones(5), 0.5, torch.Generator()).dying) == 0
 
 
+@pytest.mark.slow
 def test_a_fit_from_one_corner_leaves_it(device):
     points, values = bumps(3, points=400)
     g = torch.Generator().manual_seed(4)

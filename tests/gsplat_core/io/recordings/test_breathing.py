@@ -44,6 +44,7 @@ def test_the_rate_wanders_as_far_as_asked_and_keeps_its_mean() -> None:
     assert rates.mean() == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_tissue_breathes_as_asked() -> None:
     asked = RenderSettings(frames=3, width_px=48, height_px=40, fps=1, seed=2)
     usual, other = (
@@ -69,6 +70,7 @@ def test_a_point_of_the_tissue_rises_and_falls_as_asked(ratio: float) -> None:
     assert np.std(z - 2.4 * others) > 0.5
 
 
+@pytest.mark.slow
 def test_seeds_have_ways_of_their_own_where_that_is_asked_for() -> None:
     def way(seed: int, path: str) -> np.ndarray:
         scene = SyntheticScene.from_seed(seed, 48, 40, 5, True, Extras(scope_path=path))

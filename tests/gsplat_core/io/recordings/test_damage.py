@@ -82,6 +82,7 @@ def _places(video: SimpleNamespace, count: int, length: int) -> list[int]:
     return [choice.randrange(begin, end - length) for begin, end in choice.choices(parts, k=count)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flip", "hole"])
 def test_damage_is_seen(video: SimpleNamespace, tmp_path: Path, kind: str) -> None:
     """Each changed frame is marked or the file refused, as often as the codec lets a decoder know."""

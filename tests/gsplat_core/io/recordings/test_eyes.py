@@ -105,6 +105,7 @@ def test_videos_of_two_eyes_are_a_stereo_recording(recordings_dir):
     assert (frames[0].image != frames[0].right_image).any()
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_scared_raw_is_rectified_to_half_a_pixel(recordings_dir):
     frame = next(iter(open_recording(recordings_dir / "scared_raw")))

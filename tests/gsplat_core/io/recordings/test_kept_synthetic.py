@@ -46,6 +46,7 @@ def test_the_second_time_it_comes_from_the_file_and_is_the_same(tmp_path, render
     assert (tmp_path / "kept").stat().st_mode & 0o777 == 0o700
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other", [{"seed": 1}, {"frames": 3}, {"stereo": False}, {"camera": "fixed"}, {"fps": 25.0}, {"width_px": 48}]
 )
@@ -73,6 +74,7 @@ def test_a_damaged_file_is_rendered_again(tmp_path, rendered, damage):
     assert len(rendered) == 2
 
 
+@pytest.mark.slow
 def test_what_was_not_used_for_longest_is_removed(tmp_path, rendered):
     folder = tmp_path / "kept"
     others = [RenderSettings(**{**SMALL.__dict__, "seed": seed}) for seed in range(1, 4)]
@@ -96,6 +98,7 @@ def test_one_that_is_larger_than_all_may_be_is_not_kept(tmp_path, rendered):
     assert not (tmp_path / "kept").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, rendered):
     folder = tmp_path / "kept"
     kept_recording(SMALL, folder)

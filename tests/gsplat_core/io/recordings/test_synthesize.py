@@ -29,6 +29,7 @@ def test_reads_back_without_a_note(synthetic_folder: Path) -> None:
     assert isinstance(share, float) and 0.02 < share < 0.4  # a tool is there, and the masks are the right way round
 
 
+@pytest.mark.slow
 def test_same_arguments_same_bytes(tmp_path: Path) -> None:
     arguments = {"frames": 2, "width_px": 48, "height_px": 40, "fps": 2, "seed": 11}
     first = _bytes(synthesize(tmp_path / "a", **arguments))
@@ -63,6 +64,7 @@ def test_description_states_the_ground_truth(synthetic_folder: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_replaces_its_own_work_and_nothing_else(tmp_path: Path) -> None:
     arguments = {"width_px": 48, "height_px": 40, "stereo": False}
     folder = synthesize(tmp_path / "x", frames=2, **arguments)

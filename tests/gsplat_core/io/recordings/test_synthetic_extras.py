@@ -150,6 +150,7 @@ def everything(tmp_path_factory) -> Path:
     return synthesize(tmp_path_factory.mktemp("extras") / "all", frames=3, fps=3, seed=5, extras=extras, **SIZE)
 
 
+@pytest.mark.slow
 def test_it_reads_back(everything: Path) -> None:
     recording = open_recording(everything)
     assert recording.notes == () and validate_recording(everything).ok
@@ -186,6 +187,7 @@ def test_training_does_not_get_what_is_for_evaluation(everything: Path, tmp_path
     assert open_truth(plain, 3).views == () and open_truth(plain, 3).tracks is None
 
 
+@pytest.mark.slow
 def test_smoke_and_exposure_change_pictures_alone() -> None:
     clear = SyntheticScene.from_seed(3, 64, 48, 2.0, False)
     smoky = SyntheticScene.from_seed(3, 64, 48, 2.0, False, Extras(smoke=1.0))
@@ -200,6 +202,7 @@ def test_smoke_and_exposure_change_pictures_alone() -> None:
     assert 1.3 < max(gains) <= 2 ** sum(EXPOSURE_STOPS) and min(gains) < 0.75
 
 
+@pytest.mark.slow
 def test_the_same_arguments_give_the_same_bytes(everything: Path, tmp_path: Path) -> None:
     again = synthesize(
         tmp_path / "again",

@@ -67,6 +67,7 @@ def test_the_session_is_as_the_tests_below_expect(session, frames):
     assert len(lines) == PER_SEGMENT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_cut_anywhere_it_plays_up_to_there(name, session, frames, tmp_path):
     size = (session / name).stat().st_size
