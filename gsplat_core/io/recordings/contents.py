@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,8 +22,10 @@ from gsplat_core.io.recordings.calibration import Calibration
 from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
 from gsplat_core.io.recordings.plain_files import Picture, UnreadableFile, open_plain
+from gsplat_core.io.recordings.sparse_files import LabelFiles, ScanFiles
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.range_sensors import RangeScan
 
 
 class FrameImages(Protocol):
@@ -50,6 +52,8 @@ class _Beside(NamedTuple):
     right: Picture | None = None
     depth: NDArray[np.float32] | None = None
     mask: NDArray[np.uint8] | None = None
+    labels: NDArray[np.uint8] | None = None
+    scan: RangeScan | None = None
     found: Findings = Findings()
 
 
@@ -67,6 +71,10 @@ class Contents:
     valid_mask: NDArray[np.uint8] | None = None
     """Mask uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue."""
     depth: DepthFiles | None = None
+    labels: LabelFiles | None = None
+    """Classes of some frames."""
+    scans: ScanFiles | None = None
+    """Scans of a range sensor at some frames."""
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
     rectification: Rectification | None = None
@@ -78,12 +86,14 @@ class Contents:
 
     @property
     def fields(self) -> frozenset[str]:
-        """Optional fields that every frame has."""
+        """Optional fields that every frame has; of `labels` and `ranges`, that some frames have."""
         has = {
             "right_image": self.right is not None,
             "depth": self.depth is not None,
             "mask": self.masks is not None or self.valid_mask is not None,
             "pose": self.calibration.poses is not None,
+            "labels": self.labels is not None,
+            "ranges": self.scans is not None,
         }
         return frozenset(name for name, there in has.items() if there)
 
@@ -107,16 +117,16 @@ class Contents:
         """
         pictures = islice(self.images.frames(findings), limit)
         with closing(self._beside()) as beside:
-            for index, (picture, (right, depth, mask, found)) in enumerate(zip(pictures, beside, strict=False)):
-                findings.add(found)
-                if picture is None or found.problems:
+            for index, (picture, found) in enumerate(zip(pictures, beside, strict=False)):
+                findings.add(found.found)
+                if picture is None or found.found.problems:
                     yield None
                     continue
-                yield self._frame(index, picture, right, depth, mask)
+                yield self._frame(index, picture, found)
 
     def _beside(self) -> Generator[_Beside, None, None]:
         """Return an iterator over the sidecar data of each image."""
-        if self.right is None and self.masks is None and self.depth is None:
+        if not any((self.right, self.masks, self.depth, self.labels, self.scans)):
             return (_Beside() for _ in range(self.images.frame_count))
         return read_ahead(self._read_beside(), f"read what lies beside the images of {printable(self.root.name)}")
 
@@ -128,16 +138,12 @@ class Contents:
             right = next(rights, None) if rights else None
             depth = self.depth.read(index, found) if self.depth else None
             mask = self.masks.read(index, found) if self.masks else None
-            yield _Beside(right, depth, mask, found.taken())
+            labels = self.labels.read(index, found) if self.labels else None
+            scan = self.scans.read(index, found) if self.scans else None
+            yield _Beside(right, depth, mask, labels, scan, found.taken())
 
-    def _frame(
-        self,
-        index: int,
-        picture: Picture,
-        right: Picture | None,
-        depth: NDArray[np.float32] | None,
-        mask: NDArray[np.uint8] | None,
-    ) -> Frame:
+    def _frame(self, index: int, picture: Picture, beside: _Beside) -> Frame:
+        right, depth, mask, labels = beside.right, beside.depth, beside.mask, beside.labels
         damage = picture.damage or (right.damage if right else None)
         if damage is not None:
             # No pixel is known to be tissue, so training and scoring skip the frame.
@@ -150,10 +156,12 @@ class Contents:
             image, outside = self.rectification.left(image), self.rectification.inside
             other = None if other is None else self.rectification.right(other)
             mask = None if mask is None else self.rectification.plane(mask)
+            labels = None if labels is None else _mapped_labels(labels, self.rectification.plane)
         if self.undistortion is not None:
             image, outside = self.undistortion.picture(image), self.undistortion.inside
             mask = None if mask is None else self.undistortion.plane(mask)
             depth = None if depth is None else self.undistortion.depth(depth)
+            labels = None if labels is None else _mapped_labels(labels, self.undistortion.plane)
         return Frame(
             seq=index,
             pts_ns=round((index if times is None else times[index]) * 1e9 / self.fps),
@@ -162,6 +170,8 @@ class Contents:
             right_camera=self.right_camera,
             depth=depth,
             mask=mask,
+            labels=labels,
+            ranges=beside.scan,
             loss_mask=outside,
             pose=None if poses is None else poses[index],
             status=FrameStatus.REPLAY if damage is None else FrameStatus.DAMAGED,
@@ -170,12 +180,19 @@ class Contents:
 
     def files(self) -> list[Path]:
         """Return every file that is read, sorted."""
-        parts = (self.images, self.right, self.masks, self.depth)
+        parts = (self.images, self.right, self.masks, self.depth, self.labels, self.scans)
         return sorted({*self.other_files, *(path for part in parts if part for path in part.files)})
 
     def digest(self) -> str:
         """Return the digest of all files; see `digest_of`."""
         return digest_of(self.root, self.files())
+
+
+def _mapped_labels(
+    labels: NDArray[np.uint8], plane: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
+) -> NDArray[np.uint8]:
+    """Return labels that were moved by a map whose pixels outside are 0; they become 255 (unknown)."""
+    return plane(labels + np.uint8(1)) - np.uint8(1)
 
 
 def digest_of(root: Path, files: Sequence[Path]) -> str:

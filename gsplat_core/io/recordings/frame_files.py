@@ -24,6 +24,7 @@ from gsplat_core.io.recordings.plain_files import (
     read_array,
     read_header,
 )
+from gsplat_core.io.recordings.sparse_files import resized_scan
 from gsplat_core.scene.frames import Frame
 
 POLARITY_SAMPLES = 16
@@ -259,15 +260,18 @@ def resize_nearest(plane: NDArray, width_px: int, height_px: int) -> NDArray:
 
 
 def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
-    """Resize a frame: images by area averaging, masks and depth by nearest-neighbour sampling."""
+    """Resize a frame: images and scans by area averaging, masks, labels and depth by nearest-neighbour sampling."""
     if (width_px, height_px) == (frame.width_px, frame.height_px):
         return frame
     planes = {
-        name: getattr(frame, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
+        name: getattr(frame, name)
+        for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "labels")
     }
+    scan = frame.ranges
     right, right_camera = frame.right_image, frame.right_camera
     return frame.with_fields(
         image=resize_area(frame.image, width_px, height_px),
+        ranges=None if scan is None else resized_scan(scan, width_px, height_px / frame.height_px),
         right_image=None if right is None else resize_area(right, width_px, height_px),
         right_camera=None if right_camera is None else right_camera.resized(width_px, height_px),
         **{name: resize_nearest(plane, width_px, height_px) for name, plane in planes.items() if plane is not None},

@@ -347,13 +347,20 @@ def _with_sidecars(
     right: FrameImages | None = right_eye or beside.right()
     masks, depth = beside.masks(), beside.depth(described.get("depth_unit_mm"))
     tool_share = masks.check_polarity(findings) if masks else None
-    valid_mask = beside.valid_mask()
+    valid_mask, labels, scans = beside.valid_mask(), beside.labels(), beside.scans()
     if len(findings.problems) > known:
         return None
     eyes = _calibrated(root, size, calibration, beside, findings, stereo=right is not None)
     if len(findings.problems) > known:
         return None
     if not _fits_eyes(root, eyes, right is not None, depth is not None, findings):
+        return None
+    if scans is not None and (eyes.rectification is not None or eyes.undistortion is not None):
+        findings.problem(
+            root / "scans",
+            "the scans belong to pictures that are not rectified",
+            "Rectify the pictures, or remove scans/",
+        )
         return None
     fps = described.get("fps") or images.fps
     if fps is None:
@@ -373,6 +380,8 @@ def _with_sidecars(
         masks=masks,
         valid_mask=valid_mask,
         depth=depth,
+        labels=labels,
+        scans=scans,
         tool_share=tool_share,
         stereo_baseline_mm=eyes.baseline_mm,
         rectification=eyes.rectification,

@@ -29,12 +29,14 @@ from gsplat_core.io.recordings.contents import FrameImages
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
 from gsplat_core.io.recordings.plain_files import (
+    IMAGE_SUFFIXES,
     UnreadableFile,
     all_stay_inside,
     decode_plane,
     list_images,
     stays_inside,
 )
+from gsplat_core.io.recordings.sparse_files import SENSOR_FILE, LabelFiles, ScanFiles, by_frame, read_sensor
 
 RECORDING_FORMAT = "intrasplat-recording"
 RECORDING_VERSION = 1
@@ -94,6 +96,24 @@ class Beside:
                 )
         return DepthFiles(files, *self._size, unit_mm)
 
+    def labels(self) -> LabelFiles | None:
+        """Return the reader of the labelled frames' classes, or None."""
+        found = self._some("labels", "label picture", IMAGE_SUFFIXES)
+        if not found or check_sizes(list(found.values()), self._size, "label picture", self._findings) is None:
+            return None
+        return LabelFiles(found)
+
+    def scans(self) -> ScanFiles | None:
+        """Return the reader of the scans of a range sensor, or None."""
+        found = self._some("scans", "scan", frozenset({".npy"}))
+        if not found:
+            return None
+        path = next(iter(found.values())).parent / SENSOR_FILE
+        if not stays_inside(path.parent, path, self._findings):
+            return None
+        sensor = read_sensor(path, self._findings)
+        return None if sensor is None else ScanFiles(found, sensor, self._size[0], path)
+
     def valid_mask(self) -> NDArray[np.uint8] | None:
         """Read the mask [H, W] of the scope's circular image; 1 is inside."""
         path = self._file("valid_mask.png")
@@ -108,6 +128,21 @@ class Beside:
         if self._folder is None or not os.path.lexists(self._folder / name):
             return None
         return self._folder / name
+
+    def _some(self, name: str, what: str, suffixes: frozenset[str]) -> dict[int, Path] | None:
+        """Return the files of a folder with a file for some of the frames, by index of the frame."""
+        folder = self._there(name)
+        if folder is None or not stays_inside(folder.parent, folder, self._findings):
+            return None
+        if not folder.is_dir():
+            self._findings.problem(
+                folder, "it is not a folder", f"Give a folder with a {what} for some frames, or remove it"
+            )
+            return None
+        files = list_images(folder, suffixes)
+        if not all_stay_inside(folder.parent, files, self._findings):
+            return None
+        return by_frame(self._images.numbers, files, folder, what, self._findings)
 
     def _sequence(self, name: str, what: str) -> Sequence[Path] | None:
         """Return the files of a folder with one file per frame."""
