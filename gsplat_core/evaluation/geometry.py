@@ -139,7 +139,9 @@ class Geometry:
     frames: int
     """Number of compared frames."""
     depth: DepthShare | None
+    """Errors of the blended depth of the Gaussians' centres."""
     normals: NormalErrors | None
+    """Errors of the normals of that depth."""
     views: tuple[NovelView, ...]
     """Scores rendered at the model's own scale, without scale alignment."""
     scaled_views: tuple[NovelView, ...]
@@ -152,6 +154,9 @@ class Geometry:
     """None also if the model uses the poses of the recording."""
     parts: PartShares | None
     """None if the model is static."""
+    ray_depth: DepthShare | None = None
+    """Errors of the depth along the rays; None if the renderer does not have it."""
+    ray_normals: NormalErrors | None = None
 
 
 def evaluate_geometry(
@@ -175,6 +180,7 @@ def evaluate_geometry(
     """
     own = lambda frame: _posed(camera, model_pose(frame))
     depth, normals, views = DepthShareSums(), NormalSums(), ViewSums(camera, shown, truth)
+    ray_depth, ray_normals = DepthShareSums(), NormalSums()
     followed = None if truth.tracks is None else FollowedPoints(model, camera, truth.tracks)
     flow = None if truth.motion is None else FlowSums(model, camera, truth.motion)
     parts = None if model.field is None else PartSums(model.at, sum(model.time_window_s) / 2)
@@ -190,8 +196,11 @@ def evaluate_geometry(
             count += 1
             picture, true = shown(own(frame), frame), truth.depth_of(frame)
             if true is not None:
+                known = _known(frame, true)
                 for each in (depth, normals):
-                    each.add(camera, true, picture.depth, _known(frame, true))
+                    each.add(camera, true, picture.depth, known)
+                for each in (ray_depth, ray_normals) if picture.ray_depth is not None else ():
+                    each.add(camera, true, picture.ray_depth, known)
             if followed is not None:
                 followed.add(frame, own(frame), picture.depth)
             if flow is not None:
@@ -216,6 +225,8 @@ def evaluate_geometry(
         flow=None if flow is None else flow.errors(scale),
         trajectory=_trajectory(ways),
         parts=None if parts is None else parts.shares,
+        ray_depth=ray_depth.errors,
+        ray_normals=ray_normals.errors,
     )
 
 

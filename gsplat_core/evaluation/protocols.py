@@ -24,7 +24,7 @@ from gsplat_core.io.recordings.split import is_heldout
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, standard_outputs
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db, psnrs_db
@@ -41,15 +41,29 @@ class Picture:
     depth: NDArray[np.float32]
     """Depth z [H, W] in the model's unit of length; 0 = empty."""
     model_version: int
+    ray_depth: NDArray[np.float32] | None = None
+    """Depth z [H, W] along the rays, 0 = empty; None if it was not requested or the renderer does not have it."""
 
 
 class PictureMaker:
     """Renderer of published models at a frame's time, pose and exposure; reuses one renderer."""
 
-    def __init__(self, camera: Camera, device: torch.device | str = "cpu", renderer: str = "alpha") -> None:
-        """Create the renderer; `camera` is used for frames without a pose of their own."""
+    def __init__(
+        self, camera: Camera, device: torch.device | str = "cpu", renderer: str = "alpha", *, ray_depth: bool = False
+    ) -> None:
+        """Create the renderer; `camera` is used for frames without a pose of their own.
+
+        Args:
+            camera: size and projection of the pictures.
+            device: device of the models.
+            renderer: name of the renderer.
+            ray_depth: True for the depth along the rays too, if the renderer has it.
+        """
         self.camera = camera
-        self._reads_snapshots = RENDERERS[renderer].capabilities.reads_snapshots
+        capabilities = RENDERERS[renderer].capabilities
+        self._reads_snapshots = capabilities.reads_snapshots
+        wanted = {*STANDARD_OUTPUTS, *(["ray_depth"] if ray_depth else [])}
+        self._outputs = tuple(name for name in capabilities.outputs if name in wanted)
         self._renderer: Renderer = new_renderer(renderer, camera, device)
         self._prepared: Model | Snapshot | None = None
 
@@ -68,7 +82,8 @@ class PictureMaker:
                 self._renderer.prepare(model if self._reads_snapshots else model.as_model())
                 # Do not keep a snapshot, because it would block its slot for training.
                 self._prepared = model if isinstance(model, Model) else None
-            output = self._renderer.render(camera, frame.time_s).result()
+            found = self._renderer.render(camera, frame.time_s, self._outputs).outputs()
+            output, along_rays = standard_outputs(found), found.get("ray_depth")
             picture = output.image
             if frame.exposure != (1.0, 1.0, 1.0):
                 picture = picture * picture.new_tensor(frame.exposure)
@@ -79,6 +94,7 @@ class PictureMaker:
                 unrounded=np.array(picture.cpu().numpy()),
                 depth=np.array(output.depth.cpu().numpy()),
                 model_version=model.version,
+                ray_depth=None if along_rays is None else np.array(along_rays.cpu().numpy()),
             )
 
 

@@ -127,7 +127,9 @@ class Evaluation:
 
 
 class SeenFromAnywhere:
-    """Renders a model from arbitrary cameras, with one renderer per picture size and projection."""
+    """Renders a model from arbitrary cameras, with one renderer per picture size and projection. Pictures have the depth
+    along the rays if the renderer has it.
+    """
 
     def __init__(self, device: str = "cpu", renderer: str = "alpha") -> None:
         self._device, self._renderer = device, renderer
@@ -138,7 +140,7 @@ class SeenFromAnywhere:
         lens = camera.with_pose(np.eye(4))
         maker = self._makers.get(lens)
         if maker is None:
-            maker = self._makers[lens] = PictureMaker(lens, self._device, self._renderer)
+            maker = self._makers[lens] = PictureMaker(lens, self._device, self._renderer, ray_depth=True)
         return maker(model, frame.with_fields(pose=camera.world_to_camera))
 
 

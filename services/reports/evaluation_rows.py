@@ -129,17 +129,20 @@ def scale_sentence(geometry: GeometryFacts) -> str | None:
 
 
 def _depth(geometry: GeometryFacts) -> Iterator[GeometryRow]:
-    depth, normals = geometry.depth, geometry.normals
-    if depth is not None:
+    for what, depth in (("Depth", geometry.depth), ("Ray depth", geometry.ray_depth)):
+        if depth is None:
+            continue
         baselines = f"level plane {_percent(depth.level_rmse_share)}, best-fit plane {_percent(depth.plane_rmse_share)}"
         unit = "root mean squared error, share of the median depth"
-        yield GeometryRow(f"Depth, {unit}", _percent(depth.rmse_share), baselines)
-        yield GeometryRow(f"Depth after one scale, {unit}", _percent(depth.scaled_rmse_share), baselines, True)
-    if normals is not None:
+        yield GeometryRow(f"{what}, {unit}", _percent(depth.rmse_share), baselines)
+        yield GeometryRow(f"{what} after one scale, {unit}", _percent(depth.scaled_rmse_share), baselines, True)
+    for what, normals in (("Normals", geometry.normals), ("Normals of ray depth", geometry.ray_normals)):
+        if normals is None:
+            continue
         baselines = f"best-fit plane {_degrees(normals.plane_mean_deg)}"
         if normals.level_mean_deg is not None:
             baselines = f"level plane {_degrees(normals.level_mean_deg)}, {baselines}"
-        yield GeometryRow("Normals, mean angle", _degrees(normals.mean_deg), baselines, True)
+        yield GeometryRow(f"{what}, mean angle", _degrees(normals.mean_deg), baselines, True)
 
 
 def _views(geometry: GeometryFacts) -> Iterator[GeometryRow]:

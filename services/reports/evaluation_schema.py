@@ -229,6 +229,9 @@ class GeometryFacts(Part):
     flow: FlowFacts | None = None
     trajectory: TrajectoryFacts | None
     parts: PartFacts | None
+    ray_depth: DepthShareFacts | None = None
+    """Depth along the rays; null if the renderer does not have it. `depth` is that of the Gaussians' centres."""
+    ray_normals: NormalFacts | None = None
 
 
 class SecondEyeFacts(Part):

@@ -29,7 +29,7 @@ def measured(folder: Path, moving: bool = False, **model: object) -> Geometry:
     recording = open_recording(folder)
     scene = SyntheticScene.from_seed(3, 96, 72, FRAMES / FPS, moving)
     made = true_model(scene, FRAMES / FPS, **model)  # type: ignore[arg-type]
-    pictures = PictureMaker(recording.camera)
+    pictures = PictureMaker(recording.camera, ray_depth=True)
     return evaluate_geometry(
         recording,
         recording.frame_count,
@@ -57,6 +57,13 @@ def test_a_true_model_scores_as_one(right: Geometry) -> None:
     assert right.tracking.still.median_mm > 1.0
     assert right.tracking.model.within_mm > right.tracking.still.within_mm
     assert right.scaled_views == right.views  # no scale is missing
+
+
+def test_the_depth_along_the_rays_is_measured_too(right: Geometry) -> None:
+    assert right.depth is not None and right.ray_depth is not None
+    assert right.normals is not None and right.ray_normals is not None
+    assert right.ray_depth.plane_rmse_share == pytest.approx(right.depth.plane_rmse_share, rel=0.02)
+    assert right.ray_depth.rmse_share < 0.006 and right.ray_normals.mean_deg < 0.5 * right.ray_normals.plane_mean_deg
 
 
 def test_a_true_model_moves_each_pixel_as_its_tissue_moves(right: Geometry, folder: Path) -> None:

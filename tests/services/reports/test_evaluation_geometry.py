@@ -11,7 +11,7 @@ from services.reports.evaluation_rows import geometry_lines, geometry_rows, geom
 
 NOTHING: dict[str, Any] = {
     "frames": 1200, "depth": None, "normals": None, "views": [], "scaled_views": [], "tracking": None, "flow": None,
-    "trajectory": None, "parts": None,
+    "trajectory": None, "parts": None, "ray_depth": None, "ray_normals": None,
 }  # fmt: skip
 
 
@@ -36,6 +36,15 @@ def view(ssim: float | None, psnr_db: float = 30.0) -> Any:
         name="right", model=Facts(psnr_tissue_db=psnr_db, ssim=ssim), left=Facts(psnr_tissue_db=20.0),
         shifted=Facts(psnr_tissue_db=25.5),
     )  # fmt: skip
+
+
+def test_the_depth_along_the_rays_has_rows_of_its_own() -> None:
+    normals = Facts(mean_deg=5, plane_mean_deg=12, level_mean_deg=None)
+    found = rows(depth=depth(), ray_depth=depth(), normals=normals, ray_normals=normals)
+    names = [what.split(",")[0] for what, *_ in found]
+    assert names == [
+        "Depth", "Depth after one scale", "Ray depth", "Ray depth after one scale", "Normals", "Normals of ray depth",
+    ]  # fmt: skip
 
 
 def test_nothing_measured_gives_no_row_and_no_section() -> None:
