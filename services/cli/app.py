@@ -18,6 +18,7 @@ from services.cli.options import (
     BenchVideoOption,
     CameraPathOption,
     DeviceOption,
+    EditedOption,
     EvaluatedArgument,
     EvaluatedRecordingArgument,
     EvaluateOptions,
@@ -26,6 +27,7 @@ from services.cli.options import (
     FolderArgument,
     JsonOption,
     LiveOutOption,
+    MergedOption,
     MeshArgument,
     ModelArgument,
     OrderOption,
@@ -142,6 +144,36 @@ def export(
     from services.cli.models import export_command
 
     return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)
+
+
+def edit(
+    model: ModelArgument,
+    out: EditedOption,
+    select: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="<selection>",
+            help="box:X,Y,Z,X,Y,Z, sphere:X,Y,Z,RADIUS or label:NUMBER. More than once: Gaussians in all of them.",
+            show_default="all Gaussians",
+        ),
+    ] = None,
+    outside: Annotated[bool, typer.Option("--outside", help="Select the other Gaussians.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Remove the selected Gaussians.")] = False,
+    recolour: Annotated[str | None, typer.Option(help="New colour as R,G,B, each 0 to 1.")] = None,
+    rotate: Annotated[
+        str | None, typer.Option(help="Rotation as X,Y,Z,DEGREES: an axis through the origin and an angle.")
+    ] = None,
+    scale: Annotated[float | None, typer.Option(help="Factor of positions and sizes, from the origin.")] = None,
+    translate: Annotated[str | None, typer.Option(help="Shift as X,Y,Z, in the model's unit.")] = None,
+    merge: MergedOption = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Select Gaussians of a model and delete, recolour, rotate, scale or move them, or add those of another model."""
+    from services.cli.edit import Edit, edit_command
+
+    changes = Edit(tuple(select or ()), outside, delete, recolour, rotate, scale, translate, merge)
+    return edit_command(model, out, changes, overwrite=overwrite, as_json=json)
 
 
 def measure(
@@ -395,6 +427,6 @@ def doctor(json: JsonOption = False) -> int:
     return doctor_command(as_json=json)
 
 
-for _command in (render, bench, pack, export, measure, compare, validate, poses):
+for _command in (render, bench, pack, export, edit, measure, compare, validate, poses):
     app.command()(_command)
 service.add_to(app)

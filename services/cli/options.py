@@ -102,6 +102,8 @@ CameraPathOption = Annotated[
     path_option("--path", "A camera path (.json), or the cameras.json of another trainer."),
 ]
 BenchVideoOption = Annotated[Path | None, path_option("--out", "A video (name.mp4) of the measured frames.")]
+EditedOption = Annotated[Path, path_option("--out", "A folder for the model, or a .ply, .splat or .spz file.")]
+MergedOption = Annotated[Path | None, path_option("--merge", "A model whose Gaussians are added, at its last time.")]
 RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a folder of images.")]
 
 
