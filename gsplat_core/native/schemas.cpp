@@ -29,6 +29,18 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "float eps2d, int camera_model, bool needs_viewmats, float compensation_floor=0.005) -> (Tensor v_means, Tensor v_covars, "
       "Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
 
+  // Unscented-transform projection. A row of `cameras` [B, C, 35] holds lens, fold-over limit, pose and motion.
+  m.def(
+      "project_unscented(Tensor means, Tensor quats, Tensor scales, Tensor? opacities, Tensor cameras, int model, int shutter, "
+      "bool distorted, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, "
+      "bool compensate, float compensation_floor, float spread, float weight, float center_weight, float margin, "
+      "bool all_inside) -> (Tensor means2d, Tensor depths, Tensor conics, Tensor compensations, Tensor radii)");
+  m.def(
+      "project_unscented_backward(Tensor means, Tensor quats, Tensor scales, Tensor cameras, Tensor radii, Tensor? v_means2d, "
+      "Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int model, int shutter, bool distorted, int width, "
+      "int height, float eps2d, float compensation_floor, float spread, float weight, float center_weight) -> (Tensor v_means, "
+      "Tensor v_quats, Tensor v_scales)");
+
   // As above for visible pairs of camera and Gaussian only, in ascending order of their ids: (batch * cameras + camera) *
   // gaussians + gaussian (int64 [rows]). The gradients have one row per pair. The host waits for the number of pairs.
   m.def(

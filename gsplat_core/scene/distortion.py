@@ -155,6 +155,19 @@ class Lens:
             each is not None for each in (self.radial, self.tangential, self.thin_prism)
         )
 
+    @torch.no_grad()
+    def fold_limit(self, Ks: Tensor) -> Tensor:
+        """Return the bound [..., C, 1] of points before the lens folds over.
+
+        It is the radius at z = 1 of a pinhole lens, and the angle to the axis in radians of a fisheye lens.
+        """
+        if self.model == "pinhole":
+            widest = math.tan(WIDEST_PINHOLE_RAD)
+            return _pinhole_limit(self.radial, Ks).clamp(max=widest).expand(*Ks.shape[:-2], 1)
+        if self.model == "fisheye":
+            return _fisheye_limit(self.radial, Ks).expand(*Ks.shape[:-2], 1)
+        return Ks.new_full((*Ks.shape[:-2], 1), math.inf)
+
     def project(self, points: Tensor, Ks: Tensor) -> Pixels:
         """Project camera-space points; values and gradients of invalid points are finite and meaningless.
 

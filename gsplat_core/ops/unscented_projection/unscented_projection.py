@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
@@ -44,6 +45,9 @@ def fully_fused_projection_with_ut(
     cameras and coefficients included. Gaussians are culled where the lens folds over, not where its radial factor falls
     to 0.8. The read-out time is continuous instead of rounded to rows. `camera_model` may be "ortho".
 
+    Compiled kernels project float32 Gaussians if no tensor of the camera needs a gradient. Otherwise, and for "ftheta", the
+    same is computed in torch operations.
+
     Args:
         means: floating point [..., N, 3]; `...` are any batch dimensions, common to all inputs.
         quats: [..., N, 4] wxyz, of any non-zero length.
@@ -77,10 +81,15 @@ def fully_fused_projection_with_ut(
     )  # fmt: skip
     limits = Limits(width, height, eps2d, near_plane, far_plane, radius_clip, compensation_floor)
     parameters = UnscentedTransformParameters() if ut_params is None else ut_params
-    return project_unscented(
-        means, quats, scales, None if opacities is None else opacities.detach(), shutter, Ks, lens, parameters, limits,
-        calc_compensations,
-    )  # fmt: skip
+    opacities = None if opacities is None else opacities.detach()
+    project = project_unscented
+    if means.dtype == torch.float32:
+        # Loaded when it is first needed, so that float64 works without the compiled library.
+        from gsplat_core.ops.unscented_projection.compiled import compiled_applies, project_compiled
+
+        if compiled_applies(means, quats, scales, shutter, Ks, lens):
+            project = project_compiled
+    return project(means, quats, scales, opacities, shutter, Ks, lens, parameters, limits, calc_compensations)
 
 
 def checked_camera(

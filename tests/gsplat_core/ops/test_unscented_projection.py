@@ -66,27 +66,28 @@ def test_blur_and_compensation_are_those_of_the_linear_projection():
 
 @pytest.mark.parametrize("coefficients", [DISTORTED, {"camera_model": "fisheye", "radial_coeffs": RADIAL[:, :4] / 5}])
 def test_moments_are_those_of_projected_samples(coefficients):
-    given = scene(count=4)
+    given = scene(count=2)
     ours = fully_fused_projection_with_ut(**given, width=W, height=H, eps2d=0.0, **coefficients)
     lens = Lens(
         coefficients.get("camera_model", "pinhole"), *(coefficients.get(f"{name}_coeffs") for name in ("radial", "tangential", "thin_prism"))
     )  # fmt: skip
     generator = torch.Generator().manual_seed(1)
-    noise = torch.randn(20_000, 3, generator=generator, dtype=torch.float64)
+    noise = torch.randn(8_000, 3, generator=generator, dtype=torch.float64)
     noise = torch.cat([noise, -noise])  # the sampled mean is exact to first order
     from gsplat_core.reference.covariance import quat_scale_to_covar_preci
 
     covars, _ = quat_scale_to_covar_preci(given["quats"], given["scales"])
-    for i in range(4):
+    for i in range(2):
         world = given["means"][i] + noise @ torch.linalg.cholesky(covars[i]).T
         pixels = lens.project(Shutter.of(given["viewmats"], None, None).to_camera(world[None]), given["Ks"]).points[0]
-        torch.testing.assert_close(ours.means2d[0, i], pixels.mean(0), atol=5e-3, rtol=0)
+        torch.testing.assert_close(ours.means2d[0, i], pixels.mean(0), atol=1e-2, rtol=0)
         a, b, c = ours.conics[0, i]
         covariance = torch.linalg.inv(torch.stack([torch.stack([a, b]), torch.stack([b, c])]))
         error = (covariance - torch.cov(pixels.T)).norm() / torch.cov(pixels.T).norm()
-        assert error < 0.02
+        assert error < 0.03
 
 
+@pytest.mark.slow
 def test_gradients_of_all_tensors_in_double_precision():
     given = scene(count=3)
     more = {
