@@ -7,7 +7,7 @@ differentiates the result. Sums are in a fixed order. The memory grows with the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -108,33 +108,33 @@ def blended_pairs(
     block, device = tile_size * tile_size, values.device
     starts = isect_offsets.reshape(-1).long()
     ends = torch.cat([starts[1:], starts.new_tensor([len(flatten_ids)])])
-    first = torch.minimum(starts + int(range_start) * block, ends)
-    last = torch.minimum(starts + min(int(range_end), len(flatten_ids) // block + 1) * block, ends)
-    lengths = (last - first).clamp(min=0)
-    through = transmittances.reshape(-1)
     inside = torch.arange(block, device=device)
     row, column = inside // tile_size, inside % tile_size
+    tiles = torch.arange(len(starts), device=device)
+    image, within = tiles // (tile_height * tile_width), tiles % (tile_height * tile_width)
+    x = (within % tile_width * tile_size)[:, None] + column
+    y = (within // tile_width * tile_size)[:, None] + row
+    pixel = (image[:, None] * image_height + y) * image_width + x
+    covered = (x < image_width) & (y < image_height)
+    # Transmittance in front of the next batch [tiles, pixels], in float64; 0 outside the picture.
+    through = torch.where(covered, transmittances.reshape(-1)[torch.where(covered, pixel, 0)].double(), 0)
     found_ids, found_pixels = [], []
-    for low, high in _groups(lengths.tolist(), max(1, PAIRS_AT_A_TIME // block)):
-        counts = lengths[low:high]
-        tile = torch.repeat_interleave(torch.arange(low, high, device=device), counts)
-        before = torch.cumsum(counts, 0) - counts
-        position = torch.arange(len(tile), device=device) - torch.repeat_interleave(before, counts)
-        ids = flatten_ids[first[tile] + position].long()
-        image, within = tile // (tile_height * tile_width), tile % (tile_height * tile_width)
-        y = (within // tile_width * tile_size)[:, None] + row
-        x = (within % tile_width * tile_size)[:, None] + column
-        alphas = alphas_of(values[ids][:, None], x, y)
-        covered = (x < image_width) & (y < image_height)
-        pixel = (image[:, None] * image_height + y) * image_width + x
-        # Transmittance after each entry: the logarithms are summed over the entries of the same tile, in float64.
-        logs = torch.cumsum(torch.log1p(-alphas.double()), 0)
-        ahead = torch.cat([logs.new_zeros(1, block), logs])[torch.repeat_interleave(before, counts)]
-        start = through[torch.where(covered, pixel, 0)].double()
-        used = covered & (alphas > 0) & (start * torch.exp(logs - ahead) > LEAST_TRANSMITTANCE)
-        entry, at = torch.nonzero(used, as_tuple=True)
-        found_ids.append(ids[entry])
-        found_pixels.append(pixel[entry, at])
+    for batch in range(int(range_start), min(int(range_end), len(flatten_ids) // block + 1)):
+        first = starts + batch * block
+        open_ = torch.nonzero((first < ends) & (through > LEAST_TRANSMITTANCE).any(1))[:, 0]
+        if not len(open_):
+            break
+        for some in open_.split(max(1, PAIRS_AT_A_TIME // (block * block))):
+            entries = first[some, None] + inside
+            listed = entries < ends[some, None]
+            ids = flatten_ids[torch.where(listed, entries, 0)].long()
+            alphas = alphas_of(values[ids][:, :, None], x[some, None], y[some, None])
+            alphas = torch.where(listed[:, :, None], alphas, 0)
+            after = through[some, None] * torch.exp(torch.cumsum(torch.log1p(-alphas.double()), 1))
+            tile, entry, at = torch.nonzero((alphas > 0) & (after > LEAST_TRANSMITTANCE), as_tuple=True)
+            found_ids.append(ids[tile, entry])
+            found_pixels.append(pixel[some][tile, at])
+            through[some] = after[:, -1]
     if not found_ids:
         none = torch.zeros(0, dtype=torch.int64, device=device)
         return none, none, none
@@ -242,15 +242,3 @@ def _alphas(values: Tensor, x: Tensor, y: Tensor, max_alpha: float, cut: bool = 
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alphas = (opacity * torch.exp(-sigma)).clamp(max=max_alpha)
     return torch.where((sigma >= 0) & (alphas >= MIN_ALPHA), alphas, 0) if cut else alphas
-
-
-def _groups(lengths: list[int], most: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of consecutive tiles with at most `most` entries together, or one tile with more."""
-    low, total = 0, 0
-    for high, length in enumerate(lengths):
-        if total and total + length > most:
-            yield low, high
-            low, total = high, 0
-        total += length
-    if total:
-        yield low, len(lengths)
