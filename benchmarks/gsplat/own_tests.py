@@ -1,10 +1,15 @@
 """gsplat's own tests, run with this package in place of gsplat.
 
-    python benchmarks/gsplat/own_tests.py --tests FOLDER [--device cpu|cuda] [--only test_basic.py ...] [--out FILE]
+    python benchmarks/gsplat/own_tests.py --tests FOLDER [--oracle FOLDER] [--device cpu|cuda] [--only test_basic.py ...]
 
 FOLDER holds the files `test_*.py` of gsplat 1.5.3's source distribution. They are copied to a temporary folder, in which
 `torch.device("cuda:0")` is replaced by the chosen device and `torch.cuda.is_available()` by True. gsplat's test scene
 `assets/test_garden.npz` is used if it is next to FOLDER. Otherwise a synthetic scene of the same layout takes its place.
+
+The tests compare functions with gsplat's own functions in plain torch. With `--oracle`, the folder `gsplat` of an unpacked
+wheel of 1.5.3, these are gsplat's (`cuda/_torch_impl.py`, `cuda/_torch_impl_2dgs.py`, `_rasterization`), and the constants
+are those of 1.5.3. Two functions of nerfacc that they call are part of this script. Without it they are this package's
+reference, and the tests compare the compiled functions with that.
 """
 
 from __future__ import annotations
@@ -30,6 +35,55 @@ FILES = ("test_basic.py", "test_rasterization.py", "test_strategy.py", "test_2dg
 TIMEOUT_S = 3600
 EXCEPTIONS: dict[str, str] = {}
 """Reason for each test that cannot pass, with its proof in float64."""
+NERFACC = """
+import torch
+
+
+def _starts(ray_indices, n_rays):
+    lengths = torch.bincount(ray_indices, minlength=n_rays)
+    ends = torch.cumsum(lengths, 0)
+    return ends - lengths, ends
+
+
+def render_weight_from_alpha(alphas, ray_indices, n_rays):
+    logs = torch.cumsum(torch.log1p(-alphas.double()), 0)
+    before = torch.cat([logs.new_zeros(1), logs])
+    starts, _ = _starts(ray_indices, n_rays)
+    trans = torch.exp(before[:-1] - before[starts[ray_indices]]).to(alphas.dtype)
+    return alphas * trans, trans
+
+
+def accumulate_along_rays(weights, values, ray_indices, n_rays):
+    terms = weights[:, None] if values is None else weights[:, None] * values
+    sums = torch.cat([terms.new_zeros(1, terms.shape[1], dtype=torch.float64), torch.cumsum(terms.double(), 0)])
+    starts, ends = _starts(ray_indices, n_rays)
+    return (sums[ends] - sums[starts]).to(weights.dtype)
+"""
+"""Module with the functions of nerfacc that gsplat's functions in plain torch call."""
+CONFTEST = """
+import importlib.util
+import sys
+from pathlib import Path
+
+import gsplat.cuda._wrapper
+import gsplat.rendering
+
+FOLDER = Path({folder!r})
+
+
+def loaded(name, path):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+gsplat.cuda._torch_impl = loaded("gsplat.cuda._torch_impl", "cuda/_torch_impl.py")
+gsplat.cuda._torch_impl_2dgs = loaded("gsplat.cuda._torch_impl_2dgs", "cuda/_torch_impl_2dgs.py")
+gsplat.rendering._rasterization = loaded("gsplat._own_rendering", "rendering.py")._rasterization
+"""
+"""conftest.py that puts gsplat's functions in plain torch in the place of this package's."""
 
 
 def synthetic_scene(path: Path, points: int, width: int, height: int) -> None:
@@ -68,6 +122,9 @@ def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace
         text = text.replace("/tmp/gsplat/compression", str(folder / "compressed"))
         (tests / path.name).write_text(text, encoding="utf-8")
     (folder / "compressed").mkdir()
+    if chosen.oracle is not None:
+        (tests / "nerfacc.py").write_text(NERFACC, encoding="utf-8")
+        (tests / "conftest.py").write_text(CONFTEST.format(folder=str(chosen.oracle.resolve())), encoding="utf-8")
     scene = folder / "assets" / "test_garden.npz"
     given = source.parent / "assets" / "test_garden.npz"
     if given.exists():
@@ -78,10 +135,11 @@ def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace
     return f"synthetic, {chosen.points} points, 3 pictures of {chosen.width}x{chosen.height} px"
 
 
-def run(folder: Path, name: str, further: list[str]) -> dict[str, dict[str, Any]]:
+def run(folder: Path, name: str, oracle: bool, further: list[str]) -> dict[str, dict[str, Any]]:
     """Run one file; return outcome and seconds of each test, with the first lines of its failure."""
     report = folder / f"{name}.xml"
-    command = [sys.executable, "-m", "gsplat_core.as_gsplat", "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "gsplat_core.as_gsplat", "--constants", "1.5.3" if oracle else "1.6"]
+    command += ["-m", "pytest", "-q", "-p", "no:cacheprovider"]
     command += [f"--junit-xml={report}", f"--rootdir={folder}", str(folder / "tests" / name), *further]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     try:
@@ -104,6 +162,7 @@ def run(folder: Path, name: str, further: list[str]) -> dict[str, dict[str, Any]
 def main() -> None:
     parser = log.options(__doc__.splitlines()[0])
     parser.add_argument("--tests", type=Path, required=True, help="folder of gsplat's tests")
+    parser.add_argument("--oracle", type=Path, help="folder gsplat of an unpacked wheel of 1.5.3")
     parser.add_argument("--only", nargs="+", default=FILES, help="files to run")
     parser.add_argument("--points", type=int, default=20_000, help="points of the synthetic scene")
     parser.add_argument("--width", type=int, default=320, help="width of its pictures")
@@ -117,7 +176,7 @@ def main() -> None:
         folder = Path(name)
         scene = prepared(chosen.tests.resolve(), folder, device, chosen)
         for file in chosen.only:
-            found = run(folder, file, ["-k", chosen.selection] if chosen.selection else [])
+            found = run(folder, file, chosen.oracle is not None, ["-k", chosen.selection] if chosen.selection else [])
             outcomes = [about["outcome"] for about in found.values()]
             files[file] = {outcome: outcomes.count(outcome) for outcome in ("passed", "failed", "skipped")}
             tests |= found
@@ -126,8 +185,17 @@ def main() -> None:
     for test, why in failed.items():
         print(f"FAILED {test}: {why}")
     exceptions = {test: EXCEPTIONS[test] for test in failed if test in EXCEPTIONS}
-    figures = {"gsplat": "1.5.3", "scene": scene, "files": files, "exceptions": exceptions, "tests": tests}
-    sys.argv[1:] = [word if word != str(chosen.tests) else "TESTS" for word in sys.argv[1:]]
+    oracle = "gsplat's functions in plain torch" if chosen.oracle else "this package's reference"
+    figures = {
+        "gsplat": "1.5.3",
+        "compared_with": oracle,
+        "scene": scene,
+        "files": files,
+        "exceptions": exceptions,
+        "tests": tests,
+    }
+    places = {str(chosen.tests): "TESTS", str(chosen.oracle): "GSPLAT"}
+    sys.argv[1:] = [places.get(word, word) for word in sys.argv[1:]]
     log.write("own_tests", chosen, figures, "gsplat")
 
 

@@ -31,12 +31,14 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 def own_tests(logs: Logs) -> str:
     """Return passed, failed and skipped tests of gsplat's own test files."""
-    rows = []
+    rows: list[Sequence[object]] = []
+    scenes: list[str] = []
     for device, log in logs.items():
         for name, counts in log["files"].items():
             rows.append([name, device, counts["passed"], counts["failed"], counts["skipped"]])
+        scenes.append(f"{device}: compared with {log['compared_with']}; scene of test_basic: {log['scene']}.")
     notes = [f"- `{test}`: {why}" for log in logs.values() for test, why in log.get("exceptions", {}).items()]
-    text = table(("file", "device", "passed", "failed", "skipped"), rows)
+    text = "\n\n".join([table(("file", "device", "passed", "failed", "skipped"), rows), *scenes])
     return text + ("\n\nNamed exceptions:\n\n" + "\n".join(dict.fromkeys(notes)) if notes else "")
 
 
