@@ -9,6 +9,7 @@ Figures per strategy: median and worst of three seeds.
 from __future__ import annotations
 
 import json
+import resource
 import statistics
 import subprocess
 import sys
@@ -52,10 +53,12 @@ def train(scene: Path, strategy: str, seed: int, chosen: Any) -> dict[str, Any]:
             *cap,
         ]
         words += ["--seed", str(seed), "--device", chosen.device, "--json"]
-        done = subprocess.run(
-            [sys.executable, "-m", "services.cli", *words], check=True, capture_output=True, text=True
-        )
-    return json.loads(done.stdout)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        command = [sys.executable, "-m", "services.cli", *words]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {**json.loads(done.stdout), "processor_s": processor_s}
 
 
 def summary(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
