@@ -20,6 +20,7 @@ GSPLAT_INLINE vfloat select(vint mask, vfloat a, vfloat b) { return mask ? a : b
 GSPLAT_INLINE vfloat min(vfloat a, vfloat b) { return a < b ? a : b; }
 GSPLAT_INLINE vfloat max(vfloat a, vfloat b) { return a > b ? a : b; }
 GSPLAT_INLINE vfloat fma(vfloat a, vfloat b, vfloat c) { return ::fmaf(a, b, c); }
+GSPLAT_INLINE vfloat reciprocal(vfloat x) { return 1.0f / x; }
 GSPLAT_INLINE vfloat sqrt(vfloat x) { return ::sqrtf(x); }
 GSPLAT_INLINE vfloat log2(vfloat x) { return ::log2f(x); }
 GSPLAT_INLINE vfloat ceil(vfloat x) { return ::ceilf(x); }

@@ -18,7 +18,9 @@ using math::Hit;
 
 constexpr int kBatch = 32;  // surfels per step of the backward pass
 
-__global__ void make_records(Inputs in, Record* records) {
+using Bounds = blending::Record<0>;
+
+__global__ void make_records(Inputs in, Record* records, Bounds* bounds) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.splats.count) return;
   const float *mean = in.splats.means2d + 2 * i, *transform = in.transforms + 9 * i;
@@ -26,22 +28,34 @@ __global__ void make_records(Inputs in, Record* records) {
   for (int k = 0; k < 9; ++k) usable = usable && isfinite(transform[k]);
   for (int k = 0; k < kNormal; ++k) usable = usable && isfinite(in.normals[kNormal * i + k]);
   for (int d = 0; d < in.splats.channels; ++d) usable = usable && isfinite(in.splats.colors[in.splats.channels * i + d]);
-  records[i] = math::record_of(mean, transform, in.splats.opacities[i], usable);
+  const math::Plane plane = math::plane_of(mean, transform);
+  records[i] = math::record_of(mean, plane, in.splats.opacities[i], usable);
+  bounds[i] = faint_record<0>();
+  if (!(records[i].l > -INFINITY)) return;
+  const Bound b = math::bound_of(mean, plane, in.splats.opacities[i]);
+  set_shape(bounds[i], b.x, b.y, b.conic, records[i].l);
 }
 
-const Record* records_of(const Inputs& in, CudaScratch& scratch, cudaStream_t stream) {
+struct Prepared {
+  const Record* records;
+  const Bounds* bounds;
+};
+Prepared prepare(const Inputs& in, CudaScratch& scratch, cudaStream_t stream) {
   Record* const records = scratch.array<Record>(in.splats.count);
-  if (in.splats.count > 0) make_records<<<blocks_for(in.splats.count), kThreads, 0, stream>>>(in, records);
-  return records;
+  Bounds* const bounds = scratch.array<Bounds>(in.splats.count);
+  if (in.splats.count > 0) make_records<<<blocks_for(in.splats.count), kThreads, 0, stream>>>(in, records, bounds);
+  return {records, bounds};
 }
 
 // Copy the surfel at a list position to shared memory: record, and normal with colours. A surfel that is unusable or whose
 // index is out of range reaches no pixel.
 template <int V>
-__device__ inline void stage(const Inputs& in, const Record* records, int position, Record& record, float* values) {
+__device__ inline void stage(const Inputs& in, const Prepared& surfels, int position, Record& record, Bounds& bounds,
+                             float* values) {
   const int id = in.splats.flatten_ids[position];
   const bool known = uint32_t(id) < uint64_t(in.splats.count);
-  record = known ? records[id] : math::unusable_record();
+  record = known ? surfels.records[id] : math::unusable_record();
+  bounds = known ? surfels.bounds[id] : faint_record<0>();
   const bool usable = known && record.l > -INFINITY;
   const int channels = in.splats.channels;
   for (int k = 0; k < kNormal; ++k) values[k] = usable ? in.normals[int64_t(id) * kNormal + k] : 0;
@@ -58,12 +72,6 @@ __device__ inline float reference_depth(const Inputs& in, const Window& w) {
   return isfinite(depth) ? depth : 0;
 }
 
-// Return false only if the surfel reaches no pixel centre of the quadrant whose first centre is (x, y).
-__device__ inline bool reaches(const Record& r, float x, float y) {
-  constexpr float kLast = float(kQuadrant - 1);
-  return r.left <= x + kLast && r.right >= x && r.top <= y + kLast && r.bottom >= y;
-}
-
 // Window of this block; without surfels if its tile is masked.
 __device__ inline Window window_of(const Inputs& in, const Place& place) {
   Window w = place.window(in.splats);
@@ -72,8 +80,9 @@ __device__ inline Window window_of(const Inputs& in, const Place& place) {
 }
 
 template <int V>
-__global__ void __launch_bounds__(kBlockThreads) blend(Inputs in, const Record* records, Pixels out) {
+__global__ void __launch_bounds__(kBlockThreads) blend(Inputs in, Prepared surfels, Pixels out) {
   __shared__ Record staged[kBlockThreads];
+  __shared__ Bounds staged_bounds[kBlockThreads];
   __shared__ float staged_values[kBlockThreads][V];
   const Place place(in.splats);
   const Window w = window_of(in, place);
@@ -94,12 +103,13 @@ __global__ void __launch_bounds__(kBlockThreads) blend(Inputs in, const Record* 
     if (!__syncthreads_or(open[0] || open[1])) break;
     const int own = begin + int(threadIdx.x);
     if (own < w.end)
-      stage<V>(in, records, own, staged[threadIdx.x], staged_values[threadIdx.x]);
+      stage<V>(in, surfels, own, staged[threadIdx.x], staged_bounds[threadIdx.x], staged_values[threadIdx.x]);
     else
-      staged[threadIdx.x] = math::unusable_record();
+      staged_bounds[threadIdx.x] = faint_record<0>();
     __syncthreads();
     for (int group = 0; group < kBlockThreads && __any_sync(kAll, open[0] || open[1]); group += 32) {
-      unsigned hits = __ballot_sync(kAll, reaches(staged[group + lane], float(w.quadrant_x) + 0.5f, float(w.quadrant_y) + 0.5f));
+      unsigned hits =
+          __ballot_sync(kAll, reaches(staged_bounds[group + lane], float(w.quadrant_x) + 0.5f, float(w.quadrant_y) + 0.5f));
       for (; hits != 0; hits &= hits - 1) {
         const int i = group + __ffs(int(hits)) - 1;
         const float* const value = staged_values[i];
@@ -197,10 +207,10 @@ __device__ inline void add_terms(const Hit& h, float power, float depth, const f
 
 // `rows` holds sums_of(V, kAbs) floats per instance and window.
 template <int V, bool kAbs>
-__global__ void __launch_bounds__(kBlockThreads)
-    blend_backward(Inputs in, const Record* records, PixelGradients from, float* rows) {
+__global__ void __launch_bounds__(kBlockThreads) blend_backward(Inputs in, Prepared surfels, PixelGradients from, float* rows) {
   constexpr int kSums = sums_of(V, kAbs), kPasses = passes_of(kSums);
   __shared__ Record staged[kBatch];
+  __shared__ Bounds staged_bounds[kBatch];
   __shared__ float staged_values[kBatch][V];
   __shared__ float sums[kWarps][kBatch][16 * kPasses + 1];  // padded against bank conflicts
   const Place place(in.splats);
@@ -244,14 +254,15 @@ __global__ void __launch_bounds__(kBlockThreads)
     __syncthreads();
     if (int(threadIdx.x) < kBatch) {
       if (int(threadIdx.x) < count)
-        stage<V>(in, records, first + int(threadIdx.x), staged[threadIdx.x], staged_values[threadIdx.x]);
+        stage<V>(in, surfels, first + int(threadIdx.x), staged[threadIdx.x], staged_bounds[threadIdx.x],
+                 staged_values[threadIdx.x]);
       else
-        staged[threadIdx.x] = math::unusable_record();
+        staged_bounds[threadIdx.x] = faint_record<0>();
     }
     for (int e = threadIdx.x; e < kWarps * kBatch * (16 * kPasses + 1); e += kBlockThreads) (&sums[0][0][0])[e] = 0;
     __syncthreads();
-    unsigned hits = __ballot_sync(
-        kAll, first + lane <= warp_furthest && reaches(staged[lane], float(w.quadrant_x) + 0.5f, float(w.quadrant_y) + 0.5f));
+    unsigned hits = __ballot_sync(kAll, first + lane <= warp_furthest &&
+                                            reaches(staged_bounds[lane], float(w.quadrant_x) + 0.5f, float(w.quadrant_y) + 0.5f));
     while (hits != 0) {
       const int i = 31 - __clz(int(hits)), position = first + i;
       hits &= ~(1u << i);
@@ -350,9 +361,9 @@ void with_values(int channels, const Run& run) {
 void blend_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream) {
   const int64_t blocks = in.splats.tiles() * in.splats.windows();
   if (blocks == 0) return;
-  const Record* const records = records_of(in, scratch, stream);
+  const Prepared surfels = prepare(in, scratch, stream);
   with_values(in.splats.channels, [&](auto values) {
-    blend<decltype(values)::value><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, out);
+    blend<decltype(values)::value><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, surfels, out);
   });
 }
 
@@ -362,19 +373,19 @@ void blend_backward_on_device(const Inputs& in, const PixelGradients& from, cons
   const bool absgrad = out.absolute != nullptr;
   const int row_size = sums_of(kNormal + padded_channels(in.splats.channels), absgrad);
   if (count > 0) {
-    const Record* const records = records_of(in, scratch, stream);
+    const Prepared surfels = prepare(in, scratch, stream);
     float* const rows = scratch.array<float>(in.splats.instances * windows * row_size);
     float* const sums = scratch.array<float>(count * row_size);
     if (blocks > 0)
       with_values(in.splats.channels, [&](auto values) {
         constexpr int V = decltype(values)::value;
         const auto kernel = absgrad ? blend_backward<V, true> : blend_backward<V, false>;
-        kernel<<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, from, rows);
+        kernel<<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, surfels, from, rows);
       });
     const Instances instances = compositing::by_splat(in.splats, scratch, stream);
     sum_rows<<<blocks_for(count * row_size), kThreads, 0, stream>>>(in, instances.positions, instances.ranges, rows, int(windows),
                                                                     row_size, sums);
-    convert_sums<<<blocks_for(count), kThreads, 0, stream>>>(in, records, sums, row_size, out);
+    convert_sums<<<blocks_for(count), kThreads, 0, stream>>>(in, surfels.records, sums, row_size, out);
   }
   if (out.backgrounds != nullptr && in.splats.images > 0)
     sum_backgrounds<<<unsigned(in.splats.images * in.splats.channels), kThreads, 0, stream>>>(in, from, out.backgrounds);

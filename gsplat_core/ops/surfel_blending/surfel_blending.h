@@ -33,12 +33,17 @@ struct Inputs {
 
 // One surfel prepared for blending, on one cache line.
 struct alignas(64) Record {
-  float x, y;                      // projected centre in pixels
-  float l;                         // log2 of the opacity; -infinity for an unusable surfel
-  float left, right, top, bottom;  // pixels where alpha may reach 1/255; left > right if there are none
-  float q[9];                      // q at the centre, and its derivatives by x and by y; scaled by a factor
+  float x, y;  // projected centre in pixels
+  float l;     // log2 of the opacity; -infinity for an unusable surfel
+  float q[9];  // q at the centre, and its derivatives by x and by y; scaled by a factor
 };
 static_assert(sizeof(Record) == 64);
+
+// Ellipse that contains all pixels where alpha may reach 1/255, as a splat: its alpha is 1/255 on the outline. The conic is 0
+// if it contains all pixels.
+struct Bound {
+  float x, y, conic[3];
+};
 
 struct Pixels {
   float* colors;       // [images, height, width, channels]
@@ -71,8 +76,9 @@ struct InputGradients {
 
 // CPU: surfels prepared for blending.
 struct Surfels : Inputs {
-  const Record* records;  // [count]
-  const float* values;    // [count, kNormal + padded channels]: normal, colours, zeros
+  const Record* records;                   // [count]
+  const compositing::SplatRecord* bounds;  // [count]: `Bound`, with the opacity of the surfel
+  const float* values;                     // [count, kNormal + padded channels]: normal, colours, zeros
 };
 
 struct GradientRows {
@@ -84,8 +90,8 @@ struct GradientRows {
 };
 
 struct Kernels {
-  // Fills the records and values of surfels [begin, end).
-  void (*records)(const Inputs& in, int64_t begin, int64_t end, Record* records, float* values);
+  // Fills the records, bounds and values of surfels [begin, end).
+  void (*records)(const Inputs& in, int64_t begin, int64_t end, Record* records, compositing::SplatRecord* bounds, float* values);
   void (*tile)(const Surfels& in, int64_t tile, const Pixels& out);
   void (*tile_backward)(const Surfels& in, int64_t tile, const PixelGradients& from, const GradientRows& out);
   // Sums the rows [first[i], first[i + 1]) of each surfel and converts them to gradients, for surfels [begin, end).

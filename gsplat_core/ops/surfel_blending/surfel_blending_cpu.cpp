@@ -17,6 +17,7 @@ using compositing::kBlockWidth;
 using compositing::kColumns;
 using compositing::kPixels;
 using compositing::place;
+using compositing::test_blocks;
 using compositing::Tile;
 using gsplat::compositing::kWindow;
 
@@ -30,22 +31,6 @@ GSPLAT_INLINE vint load_int(const int32_t* p) {
   return v;
 }
 GSPLAT_INLINE void store_int(int32_t* p, vint v) { __builtin_memcpy(p, &v, sizeof(v)); }
-
-// Return the set of blocks of the window at pixel (x0, y0) in which a surfel may have an effect.
-GSPLAT_INLINE uint64_t blocks_reached(const Record& r, int x0, int y0) {
-  const float x = float(x0) + 0.5f, y = float(y0) + 0.5f;
-  const float left = r.left - x, right = r.right - x, top = r.top - y, bottom = r.bottom - y;
-  constexpr float kLast = float(kWindow - 1);
-  if (!(left <= kLast && right >= 0 && top <= kLast && bottom >= 0 && r.left <= r.right)) return 0;
-  const int first_column = left > 0 ? int(left) / kBlockWidth : 0,
-            last_column = right < kLast ? int(right) / kBlockWidth : kColumns - 1;
-  const int first_row = top > 0 ? int(top) / kBlockHeight : 0;
-  const int last_row = bottom < kLast ? int(bottom) / kBlockHeight : kWindow / kBlockHeight - 1;
-  const uint64_t row = ((uint64_t(2) << last_column) - 1) & ~((uint64_t(1) << first_column) - 1);
-  uint64_t blocks = 0;
-  for (int i = first_row; i <= last_row; ++i) blocks |= row << (i * kColumns);
-  return blocks;
-}
 
 // First pixels' centres of a window's first block, and offsets of the blocks.
 struct Centers {
@@ -137,9 +122,9 @@ void blend_window(const Surfels& in, const Tile& tile, int x0, int y0, const Pix
     const int32_t* const ids = in.splats.flatten_ids + first;
     const int count = tile.end - first < kBatch ? int(tile.end - first) : kBatch;
     uint64_t surfels[kBlocks] = {};
-    for (int i = 0; i < count; ++i)
-      for (uint64_t blocks = blocks_reached(in.records[ids[i]], x0, y0) & alive; blocks != 0; blocks &= blocks - 1)
-        surfels[__builtin_ctzll(blocks)] |= uint64_t(1) << i;
+    for (int i = 0; i < count; i += kLanes)
+      test_blocks(in.bounds, ids + i, count - i, float(x0) + 0.5f, float(y0) + 0.5f,
+                  [&](int block, vmask hit) { surfels[block] |= uint64_t(lanes_of(hit)) << i; });
     for (uint64_t left = alive; left != 0; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       if (surfels[block] != 0)
@@ -240,7 +225,7 @@ void window_backward(const Surfels& in, const Tile& tile, int x0, int y0, int64_
   const int channels = in.splats.channels;
   const float* const background = in.splats.backgrounds != nullptr ? in.splats.backgrounds + tile.image * channels : nullptr;
   Backward<V> w = {};
-  int32_t block_last[kBlocks];
+  int32_t block_last[kBlocks], furthest = -1;
   for (int i = 0; i < kPixels; ++i) w.through[i] = 1, w.last[i] = -1, w.median_at[i] = -1;
   for (int block = 0; block < kBlocks; ++block) block_last[block] = -1;
   for (int y = 0; y < height; ++y)
@@ -267,27 +252,34 @@ void window_backward(const Surfels& in, const Tile& tile, int x0, int y0, int64_
       w.median_at[at] = from.median_at[pixel];
       int32_t& most = block_last[at / kLanes];
       most = w.last[at] > most ? w.last[at] : most;
+      furthest = most > furthest ? most : furthest;
     }
   const Centers centers(x0, y0);
   const float reference = reference_depth(in, tile, V);
-  for (int64_t position = tile.end - 1; position >= tile.begin; --position) {
-    const int32_t id = in.splats.flatten_ids[position];
-    float* const to = out.rows + int64_t(out.row_of[position]) * out.row_size;
-    uint64_t blocks = 0;
-    for (uint64_t reached = blocks_reached(in.records[id], x0, y0); reached != 0; reached &= reached - 1) {
-      const int block = __builtin_ctzll(reached);
-      if (block_last[block] >= position) blocks |= uint64_t(1) << block;
+  for (int64_t first = tile.begin + (tile.end - tile.begin - 1) / kLanes * kLanes; first >= tile.begin && first < tile.end;
+       first -= kLanes) {
+    const int count = tile.end - first < kLanes ? int(tile.end - first) : kLanes;
+    uint64_t touched[kLanes] = {};
+    if (first <= furthest)
+      test_blocks(in.bounds, in.splats.flatten_ids + first, count, float(x0) + 0.5f, float(y0) + 0.5f, [&](int block, vmask hit) {
+        for (uint32_t lanes = lanes_of(hit); lanes != 0; lanes &= lanes - 1) {
+          const int i = __builtin_ctz(lanes);
+          if (block_last[block] >= first + i) touched[i] |= uint64_t(1) << block;
+        }
+      });
+    for (int i = count - 1; i >= 0; --i) {
+      float* const to = out.rows + int64_t(out.row_of[first + i]) * out.row_size;
+      if (touched[i] == 0) {
+        if (!add)
+          for (int r = 0; r < kValues; ++r) to[r] = 0;
+        continue;
+      }
+      vfloat sum[kValues] = {};
+      surfel_backward<V, kAbs>(in, in.splats.flatten_ids[first + i], first + i, touched[i], reference, centers, w, sum);
+      float row[kValues];
+      sums<kValues>(sum, row);
+      for (int r = 0; r < kValues; ++r) to[r] = add ? to[r] + row[r] : row[r];
     }
-    if (blocks == 0) {
-      if (!add)
-        for (int r = 0; r < kValues; ++r) to[r] = 0;
-      continue;
-    }
-    vfloat sum[kValues] = {};
-    surfel_backward<V, kAbs>(in, id, position, blocks, reference, centers, w, sum);
-    float row[kValues];
-    sums<kValues>(sum, row);
-    for (int r = 0; r < kValues; ++r) to[r] = add ? to[r] + row[r] : row[r];
   }
 }
 
@@ -325,7 +317,8 @@ Tile tile_of(const Surfels& in, int64_t index) {
 
 }  // namespace
 
-void make_records(const Inputs& in, int64_t begin, int64_t end, Record* records, float* values) {
+void make_records(const Inputs& in, int64_t begin, int64_t end, Record* records, compositing::SplatRecord* bounds,
+                  float* values) {
   const int channels = in.splats.channels, row = kNormal + padded_channels(channels);
   for (int64_t i = begin; i < end; ++i) {
     const float *mean = in.splats.means2d + 2 * i, *transform = in.transforms + 9 * i, *color = in.splats.colors + channels * i;
@@ -335,7 +328,13 @@ void make_records(const Inputs& in, int64_t begin, int64_t end, Record* records,
     for (int k = 0; k < kNormal; ++k) check += 0 * normal[k];
     for (int d = 0; d < channels; ++d) check += 0 * color[d];
     const bool usable = check == 0;
-    records[i] = record_of(mean, transform, opacity, usable);
+    const Plane plane = plane_of(mean, transform);
+    records[i] = record_of(mean, plane, opacity, usable);
+    const bool visible = records[i].l > -kInfinity;
+    const Bound b = visible ? bound_of(mean, plane, opacity) : Bound{};
+    bounds[i] = {
+        b.x, b.y, -kHalfLog2E * b.conic[0], -2 * kHalfLog2E * b.conic[1], -kHalfLog2E * b.conic[2], records[i].l, kInfinity,
+        0,   {}};
     float* const to = values + row * i;
     for (int k = 0; k < kNormal; ++k) to[k] = usable ? normal[k] : 0;
     for (int d = 0; d < row - kNormal; ++d) to[kNormal + d] = usable && d < channels ? color[d] : 0;

@@ -83,21 +83,24 @@ void backward(Call& call, const Inputs& in, const PixelGradients& from, const In
 
 #else
 
-// Records and values of all surfels, and a parallel loop over all tiles.
+// Records, bounds and values of all surfels, and a parallel loop over all tiles.
 struct Pass {
   std::unique_ptr<Record[]> records;
+  std::unique_ptr<compositing::SplatRecord[]> bounds;
   std::unique_ptr<float[]> values;
   Surfels surfels;
 
   explicit Pass(const Inputs& in)
       : records(uninitialised<Record>(in.splats.count)),
+        bounds(uninitialised<compositing::SplatRecord>(in.splats.count)),
         values(uninitialised<float>(in.splats.count * (kNormal + padded_channels(in.splats.channels)))) {
     compositing::check_lists(in.splats);
     static_cast<Inputs&>(surfels) = in;
     surfels.records = records.get();
+    surfels.bounds = bounds.get();
     surfels.values = values.get();
     torch::stable::parallel_for(0, in.splats.count, 2048, [&](int64_t begin, int64_t end) {
-      kernels().records(in, begin, end, records.get(), values.get());
+      kernels().records(in, begin, end, records.get(), bounds.get(), values.get());
     });
   }
 };

@@ -52,14 +52,13 @@ GSPLAT_INLINE Plane plane_of(const float* mean, const float* transform) {
   return p;
 }
 
-GSPLAT_INLINE Record unusable_record() { return {0, 0, -__builtin_inff(), 1, 0, 1, 0, {}}; }
+GSPLAT_INLINE Record unusable_record() { return {0, 0, -__builtin_inff(), {}}; }
 
 // `usable`: all inputs of the surfel are finite.
-GSPLAT_INLINE Record record_of(const float* mean, const float* transform, float opacity, bool usable) {
+GSPLAT_INLINE Record record_of(const float* mean, const Plane& p, float opacity, bool usable) {
   constexpr float kFaint = gsplat::kAlphaCutoff * (1 - 1e-5f);
-  if (!usable || !(opacity >= kFaint)) return unusable_record();
-  const Plane p = plane_of(mean, transform);
-  Record r = {mean[0], mean[1], float(logarithm(opacity) * 1.4426950408889634), 0, 0, 0, 0, {}};
+  if (!usable || !(opacity >= kFaint) || !(p.scale > 0)) return unusable_record();
+  Record r = {mean[0], mean[1], float(logarithm(opacity) * 1.4426950408889634), {}};
   float check = 0;
   for (int k = 0; k < 3; ++k) {
     r.q[k] = float(p.a[k] * p.scale);
@@ -67,27 +66,25 @@ GSPLAT_INLINE Record record_of(const float* mean, const float* transform, float 
     r.q[6 + k] = float(p.c[k] * p.scale);
     check += 0 * r.q[k] + 0 * r.q[3 + k] + 0 * r.q[6 + k];
   }
-  if (!(p.scale > 0) || !(check == 0)) return unusable_record();
-  // The contour alpha = 1/255 is u^2 + v^2 = level, or a circle in pixels. The box of the former is as in
-  // ../surfel_projection for u and v in units of sqrt(level). It is unlimited if the surfel extends behind the camera.
+  return check == 0 ? r : unusable_record();
+}
+
+// Bound of a usable surfel. The contour alpha = 1/255 is u^2 + v^2 = level, or a circle in pixels. The image of the former is
+// an ellipse with the centre <m, w> / <w, w> and the matrix of second moments center center' - <m, m'> / <w, w>, where <a, b>
+// = level (a_0 b_0 + a_1 b_1) - a_2 b_2 (../surfel_projection). The sum of the matrices of two ellipses is that of one that
+// contains both. A surfel that extends behind the camera is not bounded.
+GSPLAT_INLINE Bound bound_of(const float* mean, const Plane& p, float opacity) {
   const double level = 2 * (logarithm(double(opacity) / gsplat::kAlphaCutoff) + 1e-3);
-  const double circle = square_root(level / kScreenFactor);
-  const double distance = level * (p.w[0] * p.w[0] + p.w[1] * p.w[1]) - p.w[2] * p.w[2];
-  double low[2], high[2];
-  for (int axis = 0; axis < 2; ++axis) {
-    const double* const m = axis == 0 ? p.x : p.y;
-    low[axis] = -1e30, high[axis] = 1e30;
-    if (distance < -1e-9 * p.w[2] * p.w[2]) {
-      const double center = (level * (m[0] * p.w[0] + m[1] * p.w[1]) - m[2] * p.w[2]) / distance;
-      const double square = center * center - (level * (m[0] * m[0] + m[1] * m[1]) - m[2] * m[2]) / distance;
-      const double half = square_root(square > 0 ? square : 0) * 1.00001;
-      low[axis] = center - half < -circle ? center - half : -circle;
-      high[axis] = center + half > circle ? center + half : circle;
-    }
-    low[axis] += mean[axis] - 0.01, high[axis] += mean[axis] + 0.01;
-  }
-  r.left = float(low[0]), r.right = float(high[0]), r.top = float(low[1]), r.bottom = float(high[1]);
-  return r;
+  const auto product = [&](const double* a, const double* b) { return level * (a[0] * b[0] + a[1] * b[1]) - a[2] * b[2]; };
+  const double distance = product(p.w, p.w);
+  if (!(distance < -1e-9 * p.w[2] * p.w[2])) return {mean[0], mean[1], {}};
+  const double x = product(p.x, p.w) / distance, y = product(p.y, p.w) / distance;
+  const double circle = square_root(level / kScreenFactor) + square_root(x * x + y * y) + 0.01;
+  const double xx = (x * x - product(p.x, p.x) / distance) * 1.0001 + circle * circle;
+  const double yy = (y * y - product(p.y, p.y) / distance) * 1.0001 + circle * circle;
+  const double xy = x * y - product(p.x, p.y) / distance, scale = level / (xx * yy - xy * xy);
+  if (!(scale > 0)) return {mean[0], mean[1], {}};
+  return {float(mean[0] + x), float(mean[1] + y), {float(yy * scale), float(-xy * scale), float(xx * scale)}};
 }
 
 // Intersection of the rays of pixels with a surfel.
@@ -105,7 +102,7 @@ GSPLAT_INLINE Hit hit_at(const Record& r, vfloat x, vfloat y) {
   vfloat q[3];
   for (int k = 0; k < 3; ++k) q[k] = fma(splat(r.q[6 + k]), h.dy, fma(splat(r.q[3 + k]), h.dx, splat(r.q[k])));
   h.denominator = q[2];
-  h.inverse = 1.0f / q[2];
+  h.inverse = reciprocal(q[2]);
   h.u = q[0] * h.inverse;
   h.v = q[1] * h.inverse;
   h.plane = fma(h.u, h.u, h.v * h.v);

@@ -83,6 +83,14 @@ def test_two_surfels_in_closed_form() -> None:
     assert median.item() == 2.0  # in front of the second the transmittance is 0.4
 
 
+def test_thin_tiny_and_very_large_surfels() -> None:
+    s = surfel_scene(60, 40, 33, scale=0.2)
+    s.scales[::3, 0] = 0.002
+    s.scales[1::6] = 0.001
+    s.scales[2::7] = 1.5  # extend behind the camera
+    assert_close(blend_scene(s))
+
+
 def test_edge_on_surfels_keep_the_size_of_a_pixel() -> None:
     s = surfel_scene(40)
     s.quats[:] = torch.tensor([math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 2e-3])
