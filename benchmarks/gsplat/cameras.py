@@ -34,7 +34,7 @@ TURN = (0.05, -0.02, 0.01, 0.004, 0.012, 0.02)
 """Motion during the read-out: translation in units of the scene, and rotation in radians."""
 
 
-def scene(count: int, sigma_px: float, device: str, seed: int) -> dict[str, Tensor]:
+def scene(count: int, sigma_px: float, device: str, seed: int) -> dict[str, Any]:
     """Return Gaussians over the whole picture with standard deviations of about `sigma_px` pixels."""
     generator = torch.Generator().manual_seed(seed)
     random = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)
@@ -52,7 +52,7 @@ def scene(count: int, sigma_px: float, device: str, seed: int) -> dict[str, Tens
     return {name: value.to(device) for name, value in made.items()}
 
 
-def placed(made: dict[str, Tensor], lens: Lens, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+def placed(made: dict[str, Any], lens: Lens, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
     """Return the Gaussians at the rays of their pixels, as arguments of the projection."""
     rays = lens.rays(made["pixels"][None], made["Ks"])
     means = rays.directions[0] / rays.directions[0, :, 2:] * made["depth"]

@@ -172,21 +172,22 @@ class Undistortion:
         )
         rays = ideal.rays(torch.stack([columns, rows], -1).reshape(1, -1, 2), torch.tensor(self.camera.K)[None])
         source = lens.project(rays.directions, K)
-        known = (rays.valid & source.valid)[0, :, None]
-        places = torch.where(known, source.points[0] - PIXEL_CENTRE, -2.0)  # outside of the picture
-        self._map = places.reshape(height, width, 2).float().numpy()
+        visible = (rays.valid & source.valid)[0, :, None]
+        places = torch.where(visible, source.points[0] - PIXEL_CENTRE, -2.0)  # outside of the picture
+        across, down = places.reshape(height, width, 2).float().unbind(-1)
+        self._maps = across.contiguous().numpy(), down.contiguous().numpy()
         inside = self.plane(np.ones((height, width), np.uint8))
         self.inside: NDArray[np.uint8] | None = None if inside.all() else inside
         """Mask uint8 [H, W]: 1 where the undistorted picture has content; None if everywhere."""
 
     def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistort a picture [H, W, 3]."""
-        return np.asarray(cv2.remap(image, self._map, None, cv2.INTER_CUBIC), np.uint8)
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_CUBIC), np.uint8)
 
     def plane(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistort a mask [H, W] with nearest-neighbour sampling; 0 outside."""
-        return np.asarray(cv2.remap(plane, self._map, None, cv2.INTER_NEAREST), np.uint8)
+        return np.asarray(cv2.remap(plane, *self._maps, cv2.INTER_NEAREST), np.uint8)
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Undistort z [H, W] with nearest-neighbour sampling; 0 (unknown) outside."""
-        return np.asarray(cv2.remap(depth, self._map, None, cv2.INTER_NEAREST), np.float32)
+        return np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST), np.float32)

@@ -33,6 +33,11 @@ class CameraCorrections(torch.nn.Module):
         InvalidInput: for a sigma that is not positive, or a fixed camera that does not exist.
     """
 
+    sigmas: Tensor
+    """Expected errors [6] of a twist."""
+    free: Tensor
+    """Factors [count, 1]: 0 for fixed cameras, else 1."""
+
     def __init__(
         self, count: int, *, translation_sigma: float, rotation_sigma: float, fixed: Sequence[int] = (0,)
     ) -> None:

@@ -46,7 +46,7 @@ class Shutter:
         Raises:
             InvalidInput: unless a rolling shutter has `viewmats_rs` [..., C, 4, 4], and a global one has none.
         """
-        name = getattr(kind, "name", "GLOBAL" if kind is None else None)
+        name = "GLOBAL" if kind is None else str(getattr(kind, "name", kind))
         if name not in RollingShutterType.__members__:
             kinds = ", ".join(RollingShutterType.__members__)
             raise InvalidInput(f"rolling_shutter must be a RollingShutterType ({kinds}), got {kind!r}")

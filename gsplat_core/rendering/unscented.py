@@ -91,19 +91,34 @@ def with_unscented_camera(
     options = camera.lens | {"camera_model": settings.camera_model}
     shutter = Shutter.of(viewmats, camera.viewmats_rs, camera.rolling_shutter)
 
-    def project(means: Tensor, covars: Tensor | None, quats: Tensor, scales: Tensor, middle: Tensor, Ks: Tensor, *size: int,
-                opacities: Tensor | None = None, packed: bool = False, sparse_grad: bool = False,
-                **limits: Any) -> DenseProjection:  # fmt: skip
-        limits = {name: value for name, value in limits.items() if name != "camera_model"}
+    def project(
+        means: Tensor, _covars: None, quats: Tensor, scales: Tensor, _middle: Tensor, Ks: Tensor, width: int, height: int,
+        *, opacities: Tensor | None = None, packed: bool = False, sparse_grad: bool = False,
+        camera_model: str = "", **limits: Any,
+    ) -> DenseProjection:  # fmt: skip
         return fully_fused_projection_with_ut(
-            means, quats, scales, opacities, viewmats, Ks, *size, ut_params=camera.ut_params, **options, **limits
+            means,
+            quats,
+            scales,
+            opacities,
+            viewmats,
+            Ks,
+            width,
+            height,
+            ut_params=camera.ut_params,
+            **options,
+            **limits,
         )
 
-    def blend(means2d: Tensor, conics: Tensor, channels: Tensor, opacities: Tensor, *rest: Any, packed: bool = False,
-              absgrad: bool = False, **limits: Any) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def blend(
+        _means2d: Tensor, _conics: Tensor, channels: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
+        isect_offsets: Tensor, flatten_ids: Tensor, *, backgrounds: Tensor | None = None, packed: bool = False,
+        absgrad: bool = False, max_alpha: float,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         return rasterize_to_pixels_eval3d(
-            means, quats, scales, channels, opacities, viewmats, arguments.Ks, *rest, **options, **limits
-        )
+            means, quats, scales, channels, opacities, viewmats, arguments.Ks, width, height, tile_size, isect_offsets,
+            flatten_ids, backgrounds=backgrounds, max_alpha=max_alpha, **options,
+        )  # fmt: skip
 
     def bin_by_boxes(
         *arguments: Any, conics: Tensor, opacities: Tensor, **options: Any

@@ -109,13 +109,15 @@ def intrinsics_gradient_of_rows(
         conics, compensations, gradients: values [rows, ...] of the rows; others as in `intrinsics_gradient`.
     """
     means, covars, quats, scales, viewmats, Ks = inputs
+    v_means2d, v_conics, v_compensations = gradients
     of_rows = lambda values: None if values is None else values.reshape(-1, values.shape[-1])[gaussians]
     single = lambda values: None if values is None else values[:, None, None]
-    flat_Ks = Ks.reshape(-1, 3, 3)
+    flat_Ks, seen = Ks.reshape(-1, 3, 3), conics.new_ones(len(conics), 1, 1, 1)
     each = intrinsics_gradient(
-        of_rows(means)[:, None], world_covariances(of_rows(covars), of_rows(quats), of_rows(scales))[:, None],
-        viewmats.reshape(-1, 1, 4, 4)[images], flat_Ks[images][:, None], torch.ones_like(single(images))[..., None],
-        single(conics), single(compensations), tuple(single(v) for v in gradients), size, camera_model, compensation_floor,
+        means.reshape(-1, 3)[gaussians][:, None],
+        world_covariances(of_rows(covars), of_rows(quats), of_rows(scales))[:, None],
+        viewmats.reshape(-1, 1, 4, 4)[images], flat_Ks[images][:, None], seen, conics[:, None, None], single(compensations),
+        (single(v_means2d), single(v_conics), single(v_compensations)), size, camera_model, compensation_floor,
     )  # fmt: skip
     counts = torch.bincount(images, minlength=len(flat_Ks)).tolist()
     parts = [part.sum(0, dtype=torch.float64) for part in each[:, 0].split(counts)]

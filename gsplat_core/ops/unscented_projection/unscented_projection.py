@@ -114,7 +114,7 @@ def checked_camera(
         "tangential_coeffs": tangential_coeffs,
         "thin_prism_coeffs": thin_prism_coeffs,
     }
-    lens = Lens(camera_model, *coefficients.values(), ftheta_coeffs)
+    lens = Lens(camera_model, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs)
     for name, value in coefficients.items():
         if value is not None:
             require_shape(name, value, (*image_dims, value.shape[-1]), "[..., C, coefficients]")

@@ -126,6 +126,7 @@ def test_harmonics_are_seen_from_the_middle_of_the_read_out():
         ({"radial_coeffs": torch.zeros(1, 6)}, InvalidInput, "need with_ut=True"),
         ({"camera_model": "ftheta", "with_ut": True}, InvalidInput, "needs ftheta_coeffs"),
         ({"with_ut": True, "viewmats_rs": torch.eye(4)[None]}, InvalidInput, "rolling_shutter"),
+        ({"with_ut": True, "sparse_grad": True}, InvalidInput, "leave sparse_grad out"),
         ({"with_ut": True, "covars": torch.eye(3).expand(60, 3, 3)}, InvalidInput, "quats and scales"),
         ({"with_ut": True, "radial_coeffs": torch.zeros(1, 6), "render_mode": "Ed"}, NotImplementedError, "D and ED"),
     ],
