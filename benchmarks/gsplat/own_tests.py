@@ -3,7 +3,7 @@
     python benchmarks/gsplat/own_tests.py --tests FOLDER [--oracle FOLDER] [--device cpu|cuda] [--only test_basic.py ...]
 
 FOLDER holds the files `test_*.py` of gsplat 1.5.3's source distribution. They are copied to a temporary folder, in which
-`torch.device("cuda:0")` is replaced by the chosen device and `torch.cuda.is_available()` by True. gsplat's test scene
+`torch.device("cuda:0")` is replaced by the chosen device, and `torch.cuda.is_available()` by True. gsplat's test scene
 `assets/test_garden.npz` is used if it is next to FOLDER. Otherwise a synthetic scene of the same layout takes its place.
 
 The tests compare functions with gsplat's own functions in plain torch. With `--oracle`, the folder `gsplat` of an unpacked
