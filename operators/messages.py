@@ -3,7 +3,8 @@ operator."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -108,6 +109,8 @@ class RenderedFrame:
     """See `Reconstruction.taken_ns`."""
     published_ns: int | None = None
     """See `Reconstruction.published_ns`."""
+    outputs: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """Further outputs of the renderer by name, float32 [H, W] or [H, W, C]."""
 
     def __post_init__(self) -> None:
         size = self.frame.image.shape

@@ -20,6 +20,10 @@ CLASS_COLOURS = np.array(
     np.uint8,
 )  # fmt: skip
 """Colours of classes (ColorBrewer's Set1); they repeat after the last one."""
+UNDECIDED = (96, 96, 96)
+"""Colour of pixels on which no class was learned."""
+LEAST_LOGIT = 0.05
+"""Smallest lead of the largest logit over the mean of a pixel with a class."""
 FULL = 0.98
 """Quantile of the values that has the last colour, for values without a fixed range."""
 RANGE_FOLLOWS = 0.3
@@ -63,6 +67,7 @@ class OutputPictures:
         if name in kinds:
             image = kinds[name]()
         elif values.ndim == 2:
+            alpha = np.where(values > 0, alpha, 0)  # a pixel without a depth is not observed
             image = self._depths.setdefault(name, DepthColours()).picture(values, alpha, metric=True)[0]
         else:
             image = _bytes(values[..., :3])
@@ -104,7 +109,7 @@ def flow_colours(flow: Values, full_px: float) -> NDArray[np.uint8]:
 
 
 def class_colours(logits: Values) -> NDArray[np.uint8]:
-    """Return the colour of the most probable class of each pixel.
+    """Return the colour of the most probable class of each pixel; grey where all classes are about equally probable.
 
     Raises:
         InvalidSetting: without classes.
@@ -114,7 +119,9 @@ def class_colours(logits: Values) -> NDArray[np.uint8]:
             "the model has no classes, because it was trained without labels; train with --losses semantics, or leave the"
             " output semantics out"
         )
-    return CLASS_COLOURS[logits.argmax(-1) % len(CLASS_COLOURS)]
+    image = CLASS_COLOURS[logits.argmax(-1) % len(CLASS_COLOURS)]
+    image[~(logits.max(-1) - logits.mean(-1) > LEAST_LOGIT)] = UNDECIDED
+    return image
 
 
 def _viridis(values: Values, full: float) -> NDArray[np.uint8]:

@@ -50,9 +50,10 @@ from operators.out_of_body import OutOfBodyGateOp
 from operators.pose import pose_operators
 from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
 from operators.reconstruct import ReconstructOp
-from operators.settings import EngineOptions, JobOptions
+from operators.settings import EngineOptions, JobOptions, OutputSection
 from operators.side_by_side import SideBySideOp
 from operators.sinks.callback import CallbackSinkOp
+from operators.sinks.output_videos import OutputVideosOp
 from operators.sinks.registry import SinkOptions, input_of
 from operators.sinks.session_recorder import (
     RecordFramesOp,
@@ -245,6 +246,7 @@ class Pipeline(Application):
             name="rasterize",
             renderer=settings.renderer,
             renderer_options=settings.renderer_options,
+            outputs=self._shown_outputs,
             predict_every=pace.predict_every,
             rasterizer=self._rasterizer,
         )
@@ -308,6 +310,11 @@ class Pipeline(Application):
         about, outputs = self.frame_source.description, self.outputs
         options = SinkOptions(self.out, about, reserve)
         sinks = [SINKS[name](self, name, options) for name in outputs.sinks]
+        if self._shown_outputs:
+            folder, names = self.out, self._shown_outputs
+            sinks.append(
+                OutputVideosOp(self, name="outputs", folder=folder, outputs=names, fps=about.fps, reserve=reserve)
+            )
         producers: dict[type, tuple[Operator, str]] = {
             RenderedFrame: (rasterize, "rendered"),
             ScoredFrame: (self.metrics, "scored"),
@@ -327,6 +334,11 @@ class Pipeline(Application):
         if outputs.on_scored is not None:
             progress = CallbackSinkOp(self, name="progress", callback=outputs.on_scored)
             self.add_flow(self.metrics, progress, {("scored", "message")}, **self.pace.queue(1))
+
+    @property
+    def _shown_outputs(self) -> tuple[str, ...]:
+        """Outputs that are written as videos."""
+        return self.settings.outputs if isinstance(self.settings, OutputSection) else ()
 
     def room_to_finish(self) -> int:
         """Return the disk space that finishing needs, in bytes: the newest model in float32 and the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any, cast
@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
-from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions
+from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions, standard_outputs
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
 from operators.messages import DeformedScene, Prediction, Reconstruction, RenderedFrame
@@ -64,9 +63,16 @@ class Rasterizer:
     The calling thread blocks until the picture is in page-locked host memory.
     """
 
-    def __init__(self, renderer: str, options: RendererOptions | None = None) -> None:
-        """renderer: name in `gsplat_core.rendering.registry.RENDERERS`. options: options of the renderer."""
+    def __init__(self, renderer: str, options: RendererOptions | None = None, outputs: Sequence[str] = ()) -> None:
+        """Select the renderer.
+
+        Args:
+            renderer: name in `gsplat_core.rendering.registry.RENDERERS`.
+            options: options of the renderer; None for its defaults.
+            outputs: outputs in addition to the standard ones.
+        """
         self.renderer, self._options = renderer, options
+        self._further = tuple(name for name in outputs if name not in STANDARD_OUTPUTS)
         self._made: Renderer | None = None
         self._made_for: tuple[int, int, str, torch.device] | None = None
         self._stream: torch.cuda.Stream | None = None
@@ -74,7 +80,8 @@ class Rasterizer:
     def draw(self, scene: DeformedScene) -> RenderedFrame:
         """Render a scene. Blocks until picture, depth and opacity are on the host."""
         with torch.inference_mode(), self._own_stream(scene.model):
-            picture, output = self._render(scene, STANDARD_OUTPUTS)
+            picture, found = self._render(scene, (*STANDARD_OUTPUTS, *self._further))
+            output = standard_outputs(found)
             # Queue all three copies before waiting for the first.
             image, depth, alpha = _displayed(picture), HostCopy(output.depth), HostCopy(output.alpha)
             made_from = scene.reconstruction
@@ -89,6 +96,7 @@ class Rasterizer:
                 content=None if made_from is None else made_from.content,
                 taken_ns=None if made_from is None else made_from.taken_ns,
                 published_ns=None if made_from is None else made_from.published_ns,
+                outputs={name: HostCopy(found[name].float()).numpy() for name in self._further},
             )
 
     def picture(self, scene: DeformedScene) -> NDArray[np.uint8]:
@@ -96,15 +104,16 @@ class Rasterizer:
         with torch.inference_mode(), self._own_stream(scene.model):
             return _displayed(self._render(scene, ("image",))[0]).numpy()
 
-    def _render(self, scene: DeformedScene, outputs: Iterable[str]) -> tuple[torch.Tensor, RenderOutput]:
-        """Render a scene. Return the image scaled by the frame's exposure, and the raw output."""
+    def _render(self, scene: DeformedScene, outputs: Iterable[str]) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
+        """Render a scene. Return the image scaled by the frame's exposure, and the outputs as rendered."""
         renderer = self._renderer_for(scene)
         reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
         renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
-        output = renderer.render(scene.camera, scene.time_s, outputs).result()
+        found = renderer.render(scene.camera, scene.time_s, outputs).outputs()
+        image = found["image"]
         if scene.frame.exposure == (1.0, 1.0, 1.0):
-            return output.image, output
-        return output.image * output.image.new_tensor(scene.frame.exposure), output
+            return image, found
+        return image * image.new_tensor(scene.frame.exposure), found
 
     def _renderer_for(self, scene: DeformedScene) -> Renderer:
         camera = scene.camera
@@ -143,12 +152,14 @@ class RasterizeOp(Operator):
     Params:
         renderer: name in `gsplat_core.rendering.registry.RENDERERS`.
         renderer_options: `RendererOptions`; None for the renderer's defaults.
+        outputs: outputs of `RenderedFrame.outputs`.
         predict_every: predict one in this many frames; 0 disables prediction.
         rasterizer: warm rasterizer owned by this operator from now on; None creates one.
     """
 
     renderer: str
     renderer_options: RendererOptions | None
+    outputs: tuple[str, ...]
     predict_every: int
 
     def __init__(self, fragment: Any, *args: Any, rasterizer: Rasterizer | None = None, **kwargs: Any) -> None:
@@ -163,6 +174,7 @@ class RasterizeOp(Operator):
         spec.output("predicted", type=Prediction, optional=True)
         spec.param("renderer", "alpha")
         spec.param("renderer_options", None)
+        spec.param("outputs", ())
         spec.param("predict_every", 0)
 
     def start(self) -> None:
@@ -174,7 +186,7 @@ class RasterizeOp(Operator):
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         if self._rasterizer is None:
-            self._rasterizer = Rasterizer(self.renderer, self.renderer_options)
+            self._rasterizer = Rasterizer(self.renderer, self.renderer_options, self.outputs)
         scene: DeformedScene = op_input.receive("scene")
         op_output.emit(self._rasterizer.draw(scene), "rendered")
         if self.predict_every:

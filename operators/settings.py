@@ -238,6 +238,10 @@ class OutputSection(Section):
         "video",
         "keyframes",
     )
+    outputs: Annotated[
+        tuple[Annotated[str, Names(OUTPUTS, more=STANDARD)], ...],
+        Option("Outputs of the renderer to write as one video each, in false colours, or none", TRAINING_RUNS),
+    ] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gsplat_core.choices import OUTPUTS
+from gsplat_core.combinations import STANDARD
 from gsplat_core.io.files import sync_folder
 from services.errors import StoreUnavailable
 from services.jobs.records import JobProgress, JobState
@@ -27,6 +29,7 @@ FILES = {
     "frames.jsonl": "application/x-ndjson",
     "reconstruction.mp4": "video/mp4",
     "model.isplat": "application/octet-stream",
+    **{f"{name}.mp4": "video/mp4" for name in (*STANDARD, *OUTPUTS)},
 }
 """Downloadable result files and their content types."""
 

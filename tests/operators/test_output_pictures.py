@@ -8,7 +8,14 @@ import pytest
 from gsplat_core.choices import OUTPUTS
 from gsplat_core.errors import InvalidSetting
 from operators.layer_pictures import UNOBSERVED
-from operators.output_pictures import CLASS_COLOURS, OutputPictures, class_colours, flow_colours, normal_colours
+from operators.output_pictures import (
+    CLASS_COLOURS,
+    UNDECIDED,
+    OutputPictures,
+    class_colours,
+    flow_colours,
+    normal_colours,
+)  # fmt: skip
 
 SEEN = np.ones((2, 3), np.float32)
 
@@ -46,6 +53,14 @@ def test_a_class_has_one_colour():
     assert class_colours(field(0.0, 3.0, 1.0))[0, 0].tolist() == CLASS_COLOURS[1].tolist()
     with pytest.raises(InvalidSetting, match="train with --losses semantics"):
         class_colours(np.zeros((2, 3, 0), np.float32))
+
+
+def test_a_pixel_without_a_class_or_a_depth_is_not_drawn_as_one():
+    assert class_colours(np.zeros((2, 3, 4), np.float32))[0, 0].tolist() == list(UNDECIDED)
+    depth = np.full((30, 40), 50, np.float32)
+    depth[:, 20:] = 0
+    image = OutputPictures().picture("median_depth", depth, np.full((30, 40), 0.4, np.float32))
+    assert (image[:, 20:] == UNOBSERVED).all(-1).mean() > 0.5 and not (image[:, :20] == UNOBSERVED).all(-1).any()
 
 
 @pytest.mark.parametrize("name", ["depth", *OUTPUTS])

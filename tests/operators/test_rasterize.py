@@ -31,6 +31,16 @@ def test_a_scene_made_from_a_frame_looks_like_it(frame, model, camera, compute):
     assert error < 14
 
 
+def test_further_outputs_are_those_of_the_renderer(frame, model, camera, compute):
+    scene = DeformedScene(frame(), model(4), camera, True)
+    (shown,) = compute(RasterizeOp(None, outputs=("depth", "normals", "ray_depth")), scene=scene)
+    (plain,) = compute(RasterizeOp(None), scene=scene)
+    assert list(shown.outputs) == ["normals", "ray_depth"] and plain.outputs == {}
+    assert shown.outputs["normals"].shape == (*shown.depth.shape, 3)
+    np.testing.assert_array_equal(shown.image, plain.image)
+    np.testing.assert_array_equal(shown.depth, plain.depth)
+
+
 def test_displayed_clips_and_rounds_to_nearest():
     image = torch.tensor([[[-1.0, 0.0, 0.5 / 255 + 1e-4], [1.0, 2.0, 0.4 / 255]]])
     np.testing.assert_array_equal(displayed(image), [[[0, 0, 1], [255, 255, 0]]])
