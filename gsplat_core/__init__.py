@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.io.bundle import load_bundle, save_bundle
+    from gsplat_core.io.exports.export import save_gaussians
     from gsplat_core.io.exports.splats import export_splats
     from gsplat_core.io.ply import load_ply, save_ply
     from gsplat_core.io.png_compression import PngCompression
@@ -107,6 +108,7 @@ __all__ = [
     "rasterize_to_pixels_eval3d",
     "render",
     "save_bundle",
+    "save_gaussians",
     "save_ply",
     "spherical_harmonics",
     "world_to_cam",
@@ -166,6 +168,7 @@ _HOME = {
     "rasterize_to_pixels_eval3d": "ops.world_blending.world_blending",
     "render": "rendering.rasterization",
     "save_bundle": "io.bundle",
+    "save_gaussians": "io.exports.export",
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
     "world_to_cam": "ops.projection.separate_steps",

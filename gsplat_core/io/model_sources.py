@@ -94,7 +94,19 @@ def load_model(path: Path) -> Model:
                 f"{path} is no model; give a model folder, a packed model (.isplat) where it is taken, or a {', '.join(READERS)} file"
             )
         return load_bundle(path)
-    gaussians = READERS[path.suffix.lower()](path)
+    return static_model(READERS[path.suffix.lower()](path), path)
+
+
+def static_model(gaussians: Gaussians, path: Path) -> Model:
+    """Return a model that does not move, with a camera that shows all of it.
+
+    Args:
+        gaussians: Gaussians of the model.
+        path: file of the Gaussians, for error messages.
+
+    Raises:
+        BundleCorrupt: if there are no Gaussians, or they cannot be shown.
+    """
     if gaussians.count == 0:
         raise BundleCorrupt(f"{path} holds no Gaussians; there is nothing to show")
     for name, values, most in (

@@ -31,7 +31,7 @@ class GaussianCollection:
         scene = GaussianCollection(load_ply("scene.ply"))
         scene.delete(~scene.in_sphere((0, 0, 60), 25))
         scene.transform(scale=0.1)
-        save_ply(scene.gaussians, "cut.ply")
+        save_gaussians(scene.gaussians, "cut.splat")
     """
 
     def __init__(self, gaussians: Gaussians) -> None:

@@ -66,6 +66,7 @@ PUBLIC = [
     "rasterize_to_pixels_eval3d",
     "render",
     "save_bundle",
+    "save_gaussians",
     "save_ply",
     "spherical_harmonics",
     "world_to_cam",

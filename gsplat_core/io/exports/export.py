@@ -12,8 +12,9 @@ from typing import BinaryIO
 
 import torch
 
-from gsplat_core.errors import ExportError
+from gsplat_core.errors import BundleError, ExportError, InvalidSetting
 from gsplat_core.geometry.mesh import mesh_of
+from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.compressed_ply import compressed_ply_pieces
 from gsplat_core.io.exports.files import (
     glb_pieces,
@@ -23,8 +24,9 @@ from gsplat_core.io.exports.files import (
     splat_bytes,
     unit_rotations,
 )
-from gsplat_core.io.exports.formats import ExportWish
+from gsplat_core.io.exports.formats import ExportWish, format_of
 from gsplat_core.io.files import PartialFile
+from gsplat_core.io.model_sources import static_model
 from gsplat_core.io.ply import ply_pieces
 from gsplat_core.io.spz import spz_pieces
 from gsplat_core.models.model import Model
@@ -72,6 +74,33 @@ def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool 
             for piece in _pieces(wish.format.name, model.at(times_s[0]), times_s[0]):
                 partial.file.write(piece)
         return partial.file.seek(0, io.SEEK_END)
+
+
+def save_gaussians(gaussians: Gaussians, path: str | Path, *, overwrite: bool = False) -> None:
+    """Save Gaussians that do not move: as a file by the ending of its name, or without an ending as a bundle.
+
+    Args:
+        gaussians: Gaussians to save.
+        path: `.ply`, `.compressed.ply`, `.splat`, `.spz` or `.glb` file, or the folder of the bundle.
+        overwrite: replace an existing file or bundle.
+
+    Raises:
+        InvalidSetting: for an ending without a format of Gaussians.
+        ExportError: if the format cannot represent the Gaussians.
+        BundleError: if the Gaussians cannot be shown, or there is a folder of this name.
+        OSError: if the file cannot be written.
+    """
+    path = Path(path)
+    model = static_model(gaussians.detach().to("cpu", torch.float32), path)
+    if path.suffix:
+        wish = ExportWish(format_of(path))
+        if wish.format.is_sequence or wish.format.is_surface:
+            raise InvalidSetting(f"{path.name!r:.80} is no name for Gaussians; end it in .ply, .splat, .spz or .glb")
+        export_model(model, path, wish, overwrite=overwrite)
+    elif path.exists() and not overwrite:
+        raise BundleError(f"{path} exists; choose another name, or overwrite it")
+    else:
+        save_bundle(model, path)
 
 
 def _pieces(format_name: str, gaussians: Gaussians, time_s: float) -> Iterator[bytes]:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core import Camera, Gaussians, InvalidInput, reference, render
+from gsplat_core import Camera, Gaussians, InvalidInput, reference, render, save_gaussians
+from gsplat_core.errors import BundleError, InvalidSetting
+from gsplat_core.io.model_sources import load_model
 from gsplat_core.scene.collection import GaussianCollection
 from gsplat_core.scene.harmonics import harmonic_bases, rotated_harmonics
 
@@ -134,3 +136,23 @@ def test_wrong_edits_are_refused():
             edit()
     with pytest.raises(InvalidInput, match="label must be from 0 to 3, got 4"):
         GaussianCollection(gaussians(semantics=torch.zeros(40, 4))).labelled(4)
+
+
+@pytest.mark.parametrize("name", ["cut.ply", "cut.splat", "cut.spz", "cut"])
+def test_an_edited_collection_is_saved_and_loaded(tmp_path, name):
+    scene = GaussianCollection(gaussians(degree=1))
+    scene.delete(scene.in_sphere((0, 0, 0), 1.0))
+    save_gaussians(scene.gaussians, tmp_path / name)
+    loaded = load_model(tmp_path / name).gaussians
+    assert loaded.count == len(scene)
+    order = lambda means: means[means[:, 0].argsort()]
+    torch.testing.assert_close(order(loaded.means), order(scene.gaussians.means), rtol=0, atol=1e-3)
+    with pytest.raises((OSError, BundleError)):
+        save_gaussians(scene.gaussians, tmp_path / name)
+    save_gaussians(scene.gaussians, tmp_path / name, overwrite=True)
+
+
+def test_names_without_a_format_of_gaussians_are_refused(tmp_path):
+    for name in ("cut.zip", "cut.txt"):
+        with pytest.raises(InvalidSetting):
+            save_gaussians(gaussians(), tmp_path / name)
