@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import torch
@@ -12,6 +13,10 @@ from gsplat_core.reference.compositing import ALPHA_MAX, ALPHA_MIN, TRANSMITTANC
 
 SCREEN_FACTOR = 2.0
 """Factor of the squared distance in pixels in the screen-space lower bound of a surfel's size."""
+
+
+SURFELS_AT_A_TIME = 2048
+"""Bounds the memory of a tile with very many surfels."""
 
 
 class _TileResult(NamedTuple):
@@ -128,13 +133,20 @@ class _Tiles:
     def blend(self, tile: int, pixels: Tensor) -> _TileResult:
         """Blend the surfels of a tile over pixel centres [P, 2]."""
         ids, values = self.ids[tile], self.values[tile]
-        if torch.is_grad_enabled() and values.requires_grad:
-            return _TileResult(*checkpoint(self._blend, ids, values, pixels, use_reentrant=False))
-        return self._blend(ids, values, pixels)
+        none = pixels.new_zeros(len(pixels), 1)
+        state = _State(none + 1, none, none, none, pixels.new_zeros(len(pixels), values.shape[1] - 12), none)
+        sizes = _parts(len(ids))
+        for some_ids, some in zip(ids.split(sizes), values.split(sizes), strict=True):
+            if not bool((state.product > TRANSMITTANCE_STOP).any()):
+                break
+            if torch.is_grad_enabled() and values.requires_grad:
+                state = _State(*checkpoint(self._blend_part, some_ids, some, pixels, state, use_reentrant=False))
+            else:
+                state = self._blend_part(some_ids, some, pixels, state)
+        return _TileResult(state.sums[:, 3:], state.weight, state.sums[:, :3], state.distortion, state.median)
 
-    def _blend(self, ids: Tensor, values: Tensor, pixels: Tensor) -> _TileResult:
+    def _blend_part(self, ids: Tensor, values: Tensor, pixels: Tensor, state: _State) -> _State:
         means2d, transforms, opacities = values[:, :2], values[:, 2:11].reshape(-1, 3, 3), values[:, 11]
-        normals, colors = values[:, 12:15], values[:, 15:]
         means = means2d[None].expand(len(pixels), -1, -1)
         if self.absolute is not None and means.requires_grad:
             absolute = self.absolute
@@ -143,39 +155,69 @@ class _Tiles:
                 absolute.index_add_(0, ids, gradient.abs().sum(0))
 
             means.register_hook(add)
-        alpha = falloff(means, transforms, pixels) * opacities
-        alpha = alpha.clamp(max=self.max_alpha)
+        alpha = (falloff(means, transforms, pixels) * opacities).clamp(max=self.max_alpha)
         alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
         # Cumulative product of (1 - alpha) through logarithms, which has a cheaper gradient.
-        after = torch.exp(torch.cumsum(torch.log1p(-alpha), 1))
-        before = torch.cat([after.new_ones(len(pixels), 1), after[:, :-1]], 1)[:, : alpha.shape[1]]
+        after = state.product * torch.exp(torch.cumsum(torch.log1p(-alpha), 1))
+        before = torch.cat([state.product, after[:, :-1]], 1)
         # The product decreases monotonically, so the blended surfels are the start of the list.
         weights = torch.where(after > TRANSMITTANCE_STOP, alpha * before, 0)
-        depths = colors[:, -1]
+        depths = values[:, -1]
         weighted = weights * depths
-        in_front, depth_in_front = weights.cumsum(1) - weights, weighted.cumsum(1) - weighted
-        distortions = 2 * (weighted * in_front - weights * depth_in_front).sum(1, keepdim=True)
+        in_front = state.weight + weights.cumsum(1) - weights
+        depth_in_front = state.depth + weighted.cumsum(1) - weighted
+        pairs = 2 * (weighted * in_front - weights * depth_in_front)
         first_half = ((before > 0.5) & (weights > 0)).detach()
-        order = torch.arange(1, len(ids) + 1, device=ids.device)
-        median = (first_half * order).max(1).values if len(ids) else order.new_zeros(len(pixels))
-        medians = torch.cat([depths.new_zeros(1), depths])[median][:, None]
-        return _TileResult(weights @ colors, weights.sum(1, keepdim=True), weights @ normals, distortions, medians)
+        place = (first_half * torch.arange(1, len(ids) + 1, device=ids.device)).max(1, keepdim=True).values
+        median = torch.where(place > 0, depths[(place - 1).clamp(min=0)], state.median)
+        return _State(
+            after[:, -1:], state.weight + weights.sum(1, keepdim=True), state.depth + weighted.sum(1, keepdim=True),
+            state.distortion + pairs.sum(1, keepdim=True), state.sums + weights @ values[:, 12:], median,
+        )  # fmt: skip
+
+
+class _State(NamedTuple):
+    """Sums of the blended surfels over a tile's pixels, [P, 1] unless stated."""
+
+    product: Tensor
+    """Transmittance ignoring early termination."""
+    weight: Tensor
+    depth: Tensor
+    """Sum of weight times depth."""
+    distortion: Tensor
+    sums: Tensor
+    """Sums of weight times normal and colours, [P, 3 + channels]."""
+    median: Tensor
+
+
+def _parts(count: int) -> list[int]:
+    """Return the sizes of the parts of a list: few surfels first, because those behind opaque ones are skipped."""
+    starts = [start for start in (0, 64, 192) if start < count] + list(range(448, count, SURFELS_AT_A_TIME))
+    return [end - start for start, end in itertools.pairwise([*starts, count])]
 
 
 def falloff(means2d: Tensor, transforms: Tensor, pixels: Tensor) -> Tensor:
     """Return exp(-sigma) [P, N] of surfels at pixels; 0 where a ray is parallel to the surfel.
 
     Args:
-        means2d: [P, N, 2] or [N, 2].
+        means2d: [P, N, 2], equal for all pixels.
         transforms: [N, 3, 3].
         pixels: pixel centres [P, 2].
     """
-    pixels = pixels[:, None]
-    x, y, w = transforms.unbind(-2)
-    across, down = pixels[..., :1] * w - x, pixels[..., 1:] * w - y
-    crossing = torch.linalg.cross(across, down)
-    hit = crossing[..., 2] != 0
-    denominator = torch.where(hit, crossing[..., 2], torch.ones_like(crossing[..., 2]))
-    plane = (crossing[..., :2] / denominator[..., None]).square().sum(-1)
-    screen = SCREEN_FACTOR * (means2d - pixels).square().sum(-1)
+    dx, dy = (pixels[:, None] - means2d).unbind(-1)
+    # The cross product of px w - x and py w - y, which is linear in the pixel. Its origin is the projected centre, for
+    # accuracy. The centre is a constant here.
+    center = means2d[0].detach() if len(pixels) else pixels.new_zeros(len(transforms), 2)
+    w = transforms[:, 2]
+    x, y = transforms[:, 0] - center[:, :1] * w, transforms[:, 1] - center[:, 1:] * w
+    cross = torch.linalg.cross
+    across, down = dx.detach(), dy.detach()
+    first, second, third = (
+        a + across * b + down * c
+        for a, b, c in zip(cross(x, y).unbind(-1), cross(y, w).unbind(-1), cross(w, x).unbind(-1), strict=True)
+    )
+    hit = third != 0
+    inverse = 1 / torch.where(hit, third, 1)
+    plane = (first * inverse).square() + (second * inverse).square()
+    screen = SCREEN_FACTOR * (dx.square() + dy.square())
     return torch.where(hit, torch.exp(-0.5 * torch.where(plane <= screen, plane, screen)), 0)

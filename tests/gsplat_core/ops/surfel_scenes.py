@@ -127,6 +127,8 @@ class BlendScene:
         generator = torch.Generator().manual_seed(3)
         loss = sum((value * torch.randn(value.shape, generator=generator).to(device, dtype)).sum() for value in out)
         leaves = list(inputs.values()) + ([] if background is None else [background])
+        # Without surfels the pictures of the reference do not depend on the inputs.
+        loss = loss + sum((leaf * 0).sum() for leaf in leaves)
         # Not torch.autograd.grad, which does not call the hook that stores absolute gradients.
         loss.backward()
         result = {name: value.detach() for name, value in zip(BLENDED, out, strict=True)}
