@@ -25,6 +25,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch.multiprocessing.spawn import spawn
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.projection.arguments import PackedProjection
@@ -199,8 +200,10 @@ def all_to_all_int32(world_size: int, values: Sequence[int | Tensor], device: to
     if world_size == 1:
         return list(values)
     _check_count("values", values, world_size)
-    tensors = [value.device for value in values if isinstance(value, Tensor)]
-    numbers = torch.tensor([int(value) for value in values], dtype=torch.int32, device=(tensors or [device])[0])
+    devices = [value.device for value in values if isinstance(value, Tensor)]
+    if devices:
+        device = devices[0]
+    numbers = torch.tensor([int(value) for value in values], dtype=torch.int32, device=device)
     out = torch.empty_like(numbers)
     dist.all_to_all_single(out, numbers)
     parts = out.tolist()
@@ -303,9 +306,7 @@ def cli(fn: Callable[..., None], args: Any, verbose: bool = False, *, processes:
         fn(0, 0, 1, args)
         return True
     os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"] = "localhost", str(_free_port())
-    context = torch.multiprocessing.spawn(
-        _process, args=(size, fn, args, None, verbose, on_gpus), nprocs=size, join=False
-    )
+    context = spawn(_process, args=(size, fn, args, None, verbose, on_gpus), nprocs=size, join=False)
     assert context is not None
     try:
         while not context.join():

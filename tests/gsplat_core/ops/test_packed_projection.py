@@ -85,6 +85,21 @@ def test_sparse_gradients_hold_the_visible_rows_only(make_scene, assert_near, ca
     assert torch.equal(sparse["viewmats"].grad, leaves["viewmats"].grad)
 
 
+def test_gradients_do_not_depend_on_the_number_of_threads(make_scene):
+    scene = make_scene(5000, cameras=2).to(torch.float32)
+    found = []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            rows, leaves = project(scene, packed=True)
+            backward([getattr(rows, name) for name in OUTPUTS])
+            found.append([leaf.grad for name, leaf in leaves.items() if name != "Ks"])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
 def test_sparse_adam_moves_visible_gaussians_only(make_scene):
     scene = make_scene(200).to(torch.float32)
     rows, leaves = project(scene, packed=True, sparse_grad=True)
