@@ -41,6 +41,11 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "int height, float eps2d, float compensation_floor, float spread, float weight, float center_weight) -> (Tensor v_means, "
       "Tensor v_quats, Tensor v_scales)");
 
+  // Blending by the response of Gaussians [B, N, 12] (mean, whitening matrix) along rays [I, H, W, 6], without gradients.
+  m.def(
+      "blend_world(Tensor gaussians, Tensor colors, Tensor opacities, Tensor rays, Tensor isect_offsets, Tensor flatten_ids, "
+      "Tensor? masks, int tile_size, float max_alpha) -> (Tensor colors, Tensor through)");
+
   // As above for visible pairs of camera and Gaussian only, in ascending order of their ids: (batch * cameras + camera) *
   // gaussians + gaussian (int64 [rows]). The gradients have one row per pair. The host waits for the number of pairs.
   m.def(

@@ -47,7 +47,7 @@ def rasterize_to_pixels_eval3d(
 
     alpha = min(max_alpha, opacity exp(-d²/2)), where d is the distance in standard deviations at which the ray passes the
     centre. Other rules are those of `rasterize_to_pixels`. Differentiable in all floating-point tensors, cameras and
-    coefficients included. A pixel that the lens does not see shows the background.
+    coefficients included; compiled kernels blend float32 values that need no gradient. A pixel that the lens does not see shows the background.
 
     Args:
         means: [..., N, 3].
@@ -125,7 +125,14 @@ def rasterize_to_pixels_eval3d(
     batches, images = math.prod(batch_dims), math.prod(image_dims)
     # Rows are the axes divided by the scales.
     whitening = sigma_offsets(quats, torch.ones_like(scales)) / scales[..., None]
-    image, through = blend_world(
+    inputs = (means, quats, scales, colors, opacities, rays)
+    blend = blend_world
+    if means.dtype == torch.float32 and not (torch.is_grad_enabled() and any(each.requires_grad for each in inputs)):
+        # Loaded when it is first needed, so that float64 works without the compiled library.
+        from gsplat_core.ops.world_blending.compiled import blend_compiled
+
+        blend = blend_compiled
+    image, through = blend(
         means.reshape(batches, n, 3), whitening.reshape(batches, n, 3, 3), colors.reshape(images, n, channels),
         opacities.reshape(images, n), rays.reshape(images, image_height, image_width, 6), tile_size,
         isect_offsets.reshape(images, *isect_offsets.shape[-2:]), flatten_ids,

@@ -78,3 +78,20 @@ def test_pictures_and_gradients_are_those_of_the_cpu(gpu, kind):
         assert torch.equal(found[name], again[name]), name
         largest = float(value.abs().max())
         torch.testing.assert_close(found[name].cpu(), value, rtol=5e-3, atol=5e-3 * largest, msg=name)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 21])
+def test_blending_along_rays_without_gradients(gpu, channels):
+    results = []
+    for device in ("cpu", gpu, gpu):
+        given = moved(pictures.scene(), device)
+        given["colors"] = torch.rand(60, channels, generator=torch.Generator().manual_seed(3)).to(device)
+        options = {
+            "with_ut": True,
+            "with_eval3d": True,
+            "radial_coeffs": torch.tensor([[-0.2, 0.05, 0, 0, 0, 0]], device=device),
+        }
+        results.append(rasterization(**given, **options, width=pictures.W, height=pictures.H)[:2])
+    for expected, found, again in zip(*results, strict=True):
+        assert torch.equal(found, again)
+        assert (found.cpu() - expected).abs().max() < 5e-3 and (found.cpu() - expected).abs().mean() < 2e-5

@@ -144,6 +144,51 @@ def test_pixels_that_the_lens_does_not_see_show_the_background():
     assert (alphas[0, 0, 0] == 0) and alphas[0, 7, 10] > 0 and image.isfinite().all()
 
 
+@pytest.mark.parametrize("channels", [1, 3, 11])
+@pytest.mark.parametrize("masked", [False, True])
+def test_compiled_blending_is_that_of_plain_torch(channels, masked):
+    given, _ = small_scene(60, size=0.15)
+    given["opacities"][:20] = 0.97
+    colors = torch.rand(2, 60, channels, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    move = exp(torch.tensor([[[0.0] * 6], [[0.1, 0.0, 0.0, 0.02, 0.0, 0.1]]], dtype=torch.float64)[:, 0])
+    given |= {"viewmats": move @ given["viewmats"], "Ks": KS.expand(2, 3, 3)}
+    _, offsets, ids = lists(given)
+    radial = RADIAL.expand(2, 6) * 0
+    radial[1, 0] = -1.2  # the corners of the second picture have no ray
+    colors[0, 5, 0], given["means"][7, 1] = math.nan, math.inf
+    given["quats"][9] = math.nan
+    masks = torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1)) > (0.4 if masked else -1.0)
+    results = []
+    for dtype in (torch.float64, torch.float32):
+        cast = {name: value.to(dtype) for name, value in given.items()}
+        image, alphas = blend(cast, colors.to(dtype), offsets, ids, masks=masks, radial_coeffs=radial.to(dtype))
+        results.append((image.double(), alphas.double()))
+    (expected, expected_alphas), (found, alphas) = results
+    assert expected_alphas.max() > 0.99 and (expected_alphas == 0).any()
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-3)
+    torch.testing.assert_close(alphas, expected_alphas, rtol=0, atol=2e-3)
+    assert (found - expected).abs().mean() < 2e-5
+
+
+def test_the_compiled_op_refuses_lists_out_of_range():
+    given, colors = small_scene(3)
+    _, offsets, ids = lists(given)
+    single = {name: value.float() for name, value in given.items()}
+    with pytest.raises(RuntimeError, match="flatten_ids must be in"):
+        blend(single, colors.float(), offsets, ids + 3)
+    with pytest.raises(RuntimeError, match="must rise"):
+        blend(single, colors.float(), offsets + len(ids) + 1, ids)
+
+
+@pytest.mark.slow
+def test_opcheck():
+    given, colors = small_scene(5)
+    _, offsets, ids = lists(given)
+    rays, gaussians = torch.rand(1, H, W, 6), torch.rand(1, 5, 12)
+    arguments = (gaussians, colors.float(), given["opacities"].float()[None], rays, offsets, ids, None, TILE, 0.99)
+    torch.library.opcheck(torch.ops.gsplat_core.blend_world.default, arguments)
+
+
 def test_nothing_to_blend():
     given, colors = small_scene(1)
     none = {name: value[:0] if name not in ("viewmats", "Ks") else value for name, value in given.items()}
