@@ -148,10 +148,42 @@ def processes(logs: Logs) -> str:
     return f"{said}\n\n{table(head, rows)}"
 
 
+def surfels(logs: Logs) -> str:
+    """Return times of surfels next to those of Gaussians, and errors on planes."""
+    times, planes = [], []
+    for device, log in logs.items():
+        for what, words in (("forward", "picture"), ("step", "picture and gradients")):
+            ours, other = log[f"surfels_{what}_ms"], log[f"gaussians_{what}_ms"]
+            times.append([words, device, f"{ours:.1f} ms", f"{other:.1f} ms", f"{log[f'{what}_ratio']:.2f}"])
+        for name, each in log["planes"].items():
+            planes.append(
+                [
+                    name,
+                    device,
+                    f"{each['depth_percent']:.2f} %",
+                    f"{each['median_percent']:.2f} %",
+                    f"{each['normal_deg']:.3f}°",
+                    f"{each['depth_normal_deg']:.2f}°",
+                ]
+            )
+    sizes = ", ".join(
+        f"{log['gaussians']:,} at {log['width_px']}x{log['height_px']} px ({device})" for device, log in logs.items()
+    )
+    head = ("plane at a distance of 40", "device", "depth", "median depth", "normal", "normal of the depth")
+    said = (
+        f"`rasterization_2dgs` next to `rasterization` with the same inputs, both with depth: {sizes}. On the CPU the times are"
+        " processor time, with one thread. gsplat's 2DGS needs CUDA and was not run. Depth is that of the surfels' centres, as in"
+        " gsplat, so its error on a tilted plane is proportional to the standard deviation of the surfels."
+    )
+    both = table(("", "device", "surfels", "Gaussians", "ratio"), times), table(head, planes)
+    return f"{said}\n\n{both[0]}\n\nMean errors on a plane:\n\n{both[1]}"
+
+
 SECTIONS: tuple[tuple[str, str, Callable[[Logs], str]], ...] = (
     ("gsplat's own tests", "own_tests", own_tests),
     ("Typical calls", "calls", calls),
     ("Memory of packed and sparse gradients", "memory", memory),
+    ("Surfels (2D Gaussian Splatting)", "surfels", surfels),
     ("Several processes", "processes", processes),
     ("Static scenes: `intrasplat train`", "static", static),
     ("Cameras", "cameras", cameras),
