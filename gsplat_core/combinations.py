@@ -36,6 +36,10 @@ OF_EVERY_STEP = ("photometric", "depth")
 """Losses that every step computes by the trained renderer's picture."""
 
 
+NEEDED_BY: Mapping[str, tuple[str, str]] = {"semantics": ("labels", "labels/"), "range": ("ranges", "scans/")}
+"""Field of frames that a loss compares with, and the folder of a recording that has it, by loss."""
+
+
 def check_renderer_options(renderer: str, given: Iterable[str]) -> None:
     """Check that a renderer has the options with the names `given`.
 
@@ -63,6 +67,26 @@ def check_outputs(renderer: str, outputs: Iterable[str]) -> None:
             other = f"choose renderer {' or '.join(having)}, or " if having else ""
             raise InvalidSetting(
                 f"renderer {renderer!r} has no output {output!r}; {other}take the outputs {', '.join(known)}"
+            )
+
+
+def check_compared(losses: Iterable[str], fields: Iterable[str], source: str) -> None:
+    """Check that frames have what losses compare with.
+
+    Args:
+        losses: losses, each a name or `name:weight`.
+        fields: optional fields of the frames.
+        source: name of the frames' source for the message.
+
+    Raises:
+        InvalidSetting: if a loss would never compare anything.
+    """
+    known = {*fields}
+    for name in (each.partition(":")[0] for each in losses):
+        field, folder = NEEDED_BY.get(name, ("", ""))
+        if field and field not in known:
+            raise InvalidSetting(
+                f"loss {name!r} compares {field}, and {source} has none; add {folder} to the recording, or leave {name} out"
             )
 
 

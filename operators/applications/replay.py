@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from gsplat_core.combinations import check_compared
 from gsplat_core.depth.registry import check_depth, depth_inputs, of_recording
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.frame_codec import camera_of
@@ -234,6 +235,7 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     description = source.description
     if description.frame_count is None:
         raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
+    check_compared(settings.losses, description.fields, description.name)
     check_picture(description.camera, settings.given_scale)
     check_poses(settings.poses, description.camera)
     if settings.device == "cpu":

@@ -10,6 +10,7 @@ from gsplat_core.combinations import (
     OPTIONS,
     OUTPUTS_OF,
     OWN_OPACITIES,
+    check_compared,
     check_losses,
     check_outputs,
     check_renderer_options,
@@ -52,6 +53,15 @@ def test_an_output_that_a_renderer_lacks_is_refused_with_those_that_it_has(rende
 def test_a_renderer_of_another_package_is_checked_when_it_is_created():
     check_renderer_options("another", ["samples"])
     check_outputs("another", ["heat"])
+
+
+def test_a_loss_without_data_is_refused_with_the_folder_that_gives_it():
+    check_compared(["semantics:0.5", "range"], ["labels", "ranges"], "case")
+    check_compared(["flow"], [], "case")
+    with pytest.raises(InvalidSetting, match="case has none; add labels/ to the recording"):
+        check_compared(["flow", "semantics:0.5"], ["ranges"], "case")
+    with pytest.raises(InvalidSetting, match="add scans/ to the recording, or leave range out"):
+        check_compared(["range"], ["labels"], "case")
 
 
 @pytest.mark.parametrize("loss", LOSSES)
