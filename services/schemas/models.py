@@ -25,7 +25,7 @@ class VersionView(BaseModel):
     uploaded_by: str
     description: dict[str, Any] = Field(
         {},
-        examples=[{"gaussians": 20480, "field": "basis", "renderer": "alpha"}],
+        examples=[{"gaussians": 20480, "field": None, "renderer": "alpha"}],
         description="Results of the check: Gaussians, deformation field (null for a static model), renderer that trained the"
         " model, picture size, time window.",
     )
