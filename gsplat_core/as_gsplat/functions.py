@@ -12,6 +12,7 @@ from gsplat_core.argument_checks import require_trailing
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.exports.splats import export_splats
 from gsplat_core.scene.gaussians import SH_C0
+from gsplat_core.training.strategies.operations import draw
 
 
 def normalized_quat_to_rotmat(quat: Tensor) -> Tensor:
@@ -76,3 +77,8 @@ def save_ply(splats: Mapping[str, Tensor], dir: str, colors: Tensor | None = Non
     export_splats(
         splats["means"], splats["scales"], splats["quats"], splats["opacities"], sh0, shN, format="ply", save_to=dir
     )
+
+
+def _multinomial_sample(weights: Tensor, n: int, replacement: bool = True) -> Tensor:
+    """Draw `n` indices in proportion to `weights` [N], int64 [n]; forks of MCMC import it from `gsplat.strategy.ops`."""
+    return draw(weights, n) if replacement else torch.multinomial(weights, n, replacement=False)

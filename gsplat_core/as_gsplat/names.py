@@ -135,6 +135,9 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.strategy.default": {"DefaultStrategy": _STRATEGIES["DefaultStrategy"]},
     "gsplat.strategy.mcmc": {"MCMCStrategy": _STRATEGIES["MCMCStrategy"]},
     "gsplat.strategy.ops": {
+        "_multinomial_sample": _FUNCTIONS,
+        "_update_param_with_optimizer": f"{_OPERATIONS}:update_rows",
+        "compute_relocation": "gsplat_core.training.strategies.relocation",
         "duplicate": _OPERATIONS,
         "inject_noise_to_position": _OPERATIONS,
         "relocate": _OPERATIONS,
