@@ -21,7 +21,7 @@ from gsplat_core.errors import InvalidInput
 LENS_MODELS = ("pinhole", "ortho", "fisheye", "ftheta")
 WIDEST_PINHOLE_RAD = math.radians(89)
 """Largest angle to the axis that a pinhole lens maps to a pixel."""
-_FOLD_SAMPLES = 512
+_FOLD_SAMPLES, _FOLD_LEVELS = 512, 3
 _BISECTIONS = 14
 _NEWTON_STEPS = 6
 FTHETA_PIXEL_CENTRE = 0.5
@@ -396,15 +396,12 @@ def _fisheye_limit(radial: Tensor | None, like: Tensor) -> Tensor:
 @torch.no_grad()
 def _first_failure(holds: Callable[[Tensor], Tensor], radial: Tensor, most: float) -> Tensor:
     """Return the smallest angle [..., C, 1] in 0 to `most` at which a condition fails; `most` if it never does."""
-    samples = torch.linspace(0, most, _FOLD_SAMPLES, dtype=radial.dtype, device=radial.device)
-    good = holds(samples.expand(*radial.shape[:-1], _FOLD_SAMPLES))
-    count = good.cumprod(-1, dtype=torch.int32).sum(-1, keepdim=True).clamp(min=1)
-    low = samples[count - 1]
-    high = samples[count.clamp(max=_FOLD_SAMPLES - 1)]
-    for _ in range(2 * _BISECTIONS):
-        middle = 0.5 * (low + high)
-        good = holds(middle)
-        low, high = torch.where(good, middle, low), torch.where(good, high, middle)
+    shares = torch.linspace(0, 1, _FOLD_SAMPLES, dtype=radial.dtype, device=radial.device)
+    low, high = radial.new_zeros(*radial.shape[:-1], 1), radial.new_full((*radial.shape[:-1], 1), most)
+    for _ in range(_FOLD_LEVELS):
+        samples = low + (high - low) * shares
+        count = holds(samples).cumprod(-1, dtype=torch.int64).sum(-1, keepdim=True).clamp(min=1)
+        low, high = samples.gather(-1, count - 1), samples.gather(-1, count.clamp(max=_FOLD_SAMPLES - 1))
     return low
 
 
