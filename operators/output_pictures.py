@@ -105,7 +105,7 @@ def flow_colours(flow: Values, full_px: float) -> NDArray[np.uint8]:
     hue = np.rad2deg(np.arctan2(down, right)) % 360
     share = np.clip(np.hypot(right, down) / max(full_px, LEAST_FLOW_PX), 0, 1)
     hsv = np.stack([hue, share, np.ones_like(share)], -1).astype(np.float32)
-    return _bytes(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    return _bytes(np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB), np.float32))
 
 
 def class_colours(logits: Values) -> NDArray[np.uint8]:

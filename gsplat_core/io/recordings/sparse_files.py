@@ -67,13 +67,14 @@ class LabelFiles:
         if path is None:
             return None
         try:
-            labels = decode_plane(path)
+            stored = decode_plane(path)
         except UnreadableFile as error:
             findings.problem(path, str(error), "Export these labels again")
             return None
-        if labels.ndim != 2 or labels.dtype != np.uint8:
-            findings.problem(path, f"the labels are {labels.dtype} {list(labels.shape)}", "Save them as grey 8-bit PNG")
+        if stored.ndim != 2 or stored.dtype != np.uint8:
+            findings.problem(path, f"the labels are {stored.dtype} {list(stored.shape)}", "Save them as grey 8-bit PNG")
             return None
+        labels = np.asarray(stored, np.uint8)
         wrong = (labels >= CLASSES) & (labels != UNKNOWN)
         if wrong.any():
             findings.problem(
