@@ -214,7 +214,8 @@ def _read_png(path: Path) -> NDArray[np.uint8]:
     picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.dtype != np.uint8:
         raise ValueError(f"{path.name} is no PNG picture of 8 bits")
-    return _swapped(picture) if picture.ndim == 3 else picture
+    pixels = np.asarray(picture, np.uint8)
+    return _swapped(pixels) if pixels.ndim == 3 else pixels
 
 
 def _swapped(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -89,7 +89,7 @@ def _spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> T
 
 
 def _rasterization(*arguments: Any, batch_per_iter: int = 100, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    return rasterization(*arguments, packed=False, **options)
+    return rasterization(*arguments, **{"packed": False} | options)
 
 
 def _fully_fused_projection_2dgs(
