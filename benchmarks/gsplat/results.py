@@ -200,7 +200,7 @@ def strategies(logs: Logs) -> str:
         "It is not reached in trainings this short. Copies of MCMC share a place and part slowly, and ADC adds Gaussians where"
         " the error is. Tried: learning rates of positions of 0.0004 and 0.0016, initial scales of 0.1 and 1, weights of the"
         " mean opacity and scale of 0.01 and 0.05, a tenth of the noise, copies displaced by half a standard deviation, random"
-        " instead of true places at the start, a finer texture, and noise in the pictures. Longer trainings were not tried."
+        " instead of true places at the start, a finer texture, and noise in the pictures. More than 1,500 steps were not tried."
     )
     reached = all(figures["gain_db"]["worst"] >= 0 for log in logs.values() for figures in log["scenes"].values())
     return f"{said}{'' if reached else ' ' + tried}\n\n{table(head, rows)}"
