@@ -113,8 +113,8 @@ def binocular_disparity_l1(
     """
     _require_same("binocular_disparity_l1", pred_depth, gt_depth)
     known = (pred_depth.abs() > eps) & (gt_depth.abs() > eps)
-    inverse = [torch.where(known, depth, 1).reciprocal() for depth in (pred_depth, gt_depth)]
-    return masked_l1(*inverse, known if mask is None else known & (mask != 0))
+    own, other = (torch.where(known, depth, 1).reciprocal() for depth in (pred_depth, gt_depth))
+    return masked_l1(own, other, known if mask is None else known & (mask != 0))
 
 
 def pearson_depth_loss(pred_depth: Tensor, gt_depth: Tensor, mask: Tensor | None = None) -> Tensor:
