@@ -191,7 +191,7 @@ class DynamicStrategy(DefaultStrategy):
     `params`; they have optimisers of their own.
     """
 
-    def initialize_state(  # type: ignore[override]
+    def initialize_state(
         self,
         scene_scale: float = 1.0,
         num_gaussians: int = 0,

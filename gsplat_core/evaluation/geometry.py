@@ -199,8 +199,9 @@ def evaluate_geometry(
                 known = _known(frame, true)
                 for each in (depth, normals):
                     each.add(camera, true, picture.depth, known)
-                for each in (ray_depth, ray_normals) if picture.ray_depth is not None else ():
-                    each.add(camera, true, picture.ray_depth, known)
+                if picture.ray_depth is not None:
+                    for each in (ray_depth, ray_normals):
+                        each.add(camera, true, picture.ray_depth, known)
             if followed is not None:
                 followed.add(frame, own(frame), picture.depth)
             if flow is not None:

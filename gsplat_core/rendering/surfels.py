@@ -140,17 +140,17 @@ def rasterization_2dgs(
         *geometry, viewmats, Ks, width, height, eps2d, near_plane, far_plane, radius_clip
     )
     assert isinstance(projected, DenseSurfels)
-    channels = None
-    rows: DenseSurfels | PackedSurfels = projected
+    channels, dense = None, projected
     if settings.has_colors:
         signals = [Signal(colors, sh_degree)]
-        channels, rows = view_colors(step_by_step, geometry[0], signals, viewmats, projected)
-    visible.append(rows.radii)
+        channels, dense = view_colors(step_by_step, geometry[0], signals, viewmats, dense)
+    visible.append(dense.radii)
+    rows: DenseSurfels | PackedSurfels = dense
     shown = opacities[..., None, :].expand(*batch_dims, c, n)
     packing: dict[str, Any] = {}
     camera_ids = gaussian_ids = None
     if packed:
-        rows = pack_surfels(rows)
+        rows = pack_surfels(dense)
         camera_ids, gaussian_ids = rows.camera_ids, rows.gaussian_ids
         image_ids = rows.batch_ids * c + camera_ids
         picked = image_ids * n + gaussian_ids

@@ -141,7 +141,7 @@ async def upload_model(
     expected = stated_sha256(", ".join(request.headers.getlist("content-digest")) or None)
     async with recorded(request, caller, "model.upload", name, {"sha256": expected.hex()}) as said:
         async with incoming_file(request, control, expected) as file:
-            kind = format or await asyncio.to_thread(recognised, file.path)
+            kind = await asyncio.to_thread(recognised, file.path) if format is None else format
             if kind == "isplat":
                 record = await asyncio.to_thread(registry.upload, name, file.path, file.sha256, str(caller))
             else:

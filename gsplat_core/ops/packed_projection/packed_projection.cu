@@ -108,8 +108,7 @@ __global__ void __launch_bounds__(kThreads)
       for (int k = 0; k < 3; ++k) to.scales[3 * row + k] = g.scales[k];
     }
   }
-  if (to.viewmat != nullptr)
-    sum_over_block<kMatrixSums, kThreads>(g.viewmat, to.viewmat + int64_t(blockIdx.x) * kMatrixSums);
+  if (to.viewmat != nullptr) sum_over_block<kMatrixSums, kThreads>(g.viewmat, to.viewmat + int64_t(blockIdx.x) * kMatrixSums);
 }
 
 // Rows of one camera and batch have different Gaussians, so that no two threads add to one value.

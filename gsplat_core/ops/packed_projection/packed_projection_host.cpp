@@ -23,8 +23,12 @@ struct Packed {
         depths(call.empty({rows})),
         conics(call.empty({rows, 3})),
         compensations(compensate ? call.empty({rows}) : call.empty({0})),
-        out{ids.mutable_data_ptr<int64_t>(), radii.mutable_data_ptr<int32_t>(), mutable_data(means2d),
-            mutable_data(depths),            mutable_data(conics),              compensate ? mutable_data(compensations) : nullptr} {}
+        out{ids.mutable_data_ptr<int64_t>(),
+            radii.mutable_data_ptr<int32_t>(),
+            mutable_data(means2d),
+            mutable_data(depths),
+            mutable_data(conics),
+            compensate ? mutable_data(compensations) : nullptr} {}
 
   RowOutput out;
 };
@@ -155,10 +159,10 @@ void backward(Call& call, const Scene& scene, const Rows& rows, const RowOutputG
     for (int64_t i = 0; i < 2 * count; ++i) radii[i] = 1;
     const projection::ProjectionOutputGradient v = {radii, at(from.means2d, 2 * first), at(from.depths, first),
                                                     at(from.conics, 3 * first), at(from.compensations, first)};
-    projection::kernels().backward(gathered.input, v,
-                                   {to.means + 3 * first, at(to.covars, 6 * first), at(to.quats, 4 * first),
-                                    at(to.scales, 3 * first), sum, false},
-                                   0, count);
+    projection::kernels().backward(
+        gathered.input, v,
+        {to.means + 3 * first, at(to.covars, 6 * first), at(to.quats, 4 * first), at(to.scales, 3 * first), sum, false}, 0,
+        count);
   });
   for (int64_t image = 0; v_viewmats != nullptr && image < images; ++image)
     for (int i = 0; i < 12; ++i) {
@@ -221,7 +225,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_visible_backward(
   const OptionalTensor v_means2d = call.floats(v_means2d_, "v_means2d"), v_depths = call.floats(v_depths_, "v_depths"),
                        v_conics = call.floats(v_conics_, "v_conics"),
                        v_compensations = call.floats(v_compensations_, "v_compensations");
-  const auto fits = [&](const OptionalTensor& t, int64_t columns) { return !t.has_value() || t->numel() == rows.count * columns; };
+  const auto fits = [&](const OptionalTensor& t, int64_t columns) {
+    return !t.has_value() || t->numel() == rows.count * columns;
+  };
   check(fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_conics, 3) && fits(v_compensations, 1),
         "packed projection backward: the sizes of the gradients do not fit ", rows.count, " rows");
   const bool from_covars = scene.covars.has_value();

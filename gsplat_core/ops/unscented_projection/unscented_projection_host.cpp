@@ -60,11 +60,13 @@ void backward(const Call&, const Inputs& in, const Gradients& gradients) {
 
 #endif
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_unscented(
-    Tensor means, Tensor quats, Tensor scales, OptionalTensor opacities, Tensor cameras, int64_t model, int64_t shutter,
-    bool distorted, int64_t width, int64_t height, double eps2d, double near_plane, double far_plane, double radius_clip,
-    bool compensate, double compensation_floor, double spread, double weight, double center_weight, double margin,
-    bool all_inside) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_unscented(Tensor means, Tensor quats, Tensor scales,
+                                                                     OptionalTensor opacities, Tensor cameras, int64_t model,
+                                                                     int64_t shutter, bool distorted, int64_t width,
+                                                                     int64_t height, double eps2d, double near_plane,
+                                                                     double far_plane, double radius_clip, bool compensate,
+                                                                     double compensation_floor, double spread, double weight,
+                                                                     double center_weight, double margin, bool all_inside) {
   const Call call(means);
   Arguments arguments(call, means, quats, scales, opacities, cameras, model, shutter);
   Inputs& in = arguments.in;
@@ -82,10 +84,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_unscented(
   return {means2d, depths, conics, compensations, radii};
 }
 
-std::tuple<Tensor, Tensor, Tensor> project_unscented_backward(
-    Tensor means, Tensor quats, Tensor scales, Tensor cameras, Tensor radii_, OptionalTensor v_means2d_, OptionalTensor v_depths_,
-    OptionalTensor v_conics_, OptionalTensor v_compensations_, int64_t model, int64_t shutter, bool distorted, int64_t width,
-    int64_t height, double eps2d, double compensation_floor, double spread, double weight, double center_weight) {
+std::tuple<Tensor, Tensor, Tensor> project_unscented_backward(Tensor means, Tensor quats, Tensor scales, Tensor cameras,
+                                                              Tensor radii_, OptionalTensor v_means2d_, OptionalTensor v_depths_,
+                                                              OptionalTensor v_conics_, OptionalTensor v_compensations_,
+                                                              int64_t model, int64_t shutter, bool distorted, int64_t width,
+                                                              int64_t height, double eps2d, double compensation_floor,
+                                                              double spread, double weight, double center_weight) {
   const Call call(means);
   Arguments arguments(call, means, quats, scales, std::nullopt, cameras, model, shutter);
   Inputs& in = arguments.in;

@@ -43,11 +43,11 @@ GSPLAT_INLINE Gaussian gaussian_of(const vfloat mean[3], const vfloat quat[4], c
 // Moments of the sigma points' pixels. Positions are relative to the pixel of the mean: the weights are large and of both
 // signs, so absolute positions would cancel.
 struct Moments {
-  vfloat u, v;                                                // pixel of the mean
-  vfloat apart[kSigmaPoints - 1][2], moved[2];                // offsets of the outer points, and of the transformed mean
-  projection::Ellipse covariance;                             // members a0, b and c0 only
-  vint seen;                                                  // by the lens
-  vint inside;                                                // the picture and its margin
+  vfloat u, v;                                  // pixel of the mean
+  vfloat apart[kSigmaPoints - 1][2], moved[2];  // offsets of the outer points, and of the transformed mean
+  projection::Ellipse covariance;               // members a0, b and c0 only
+  vint seen;                                    // by the lens
+  vint inside;                                  // the picture and its margin
 };
 
 GSPLAT_INLINE Moments moments_of(const Inputs& in, const Lens& lens, const Gaussian& g) {
@@ -56,8 +56,7 @@ GSPLAT_INLINE Moments moments_of(const Inputs& in, const Lens& lens, const Gauss
   for (int i = 0; i < kSigmaPoints; ++i) {
     vfloat time;
     const Pixel pixel = lens.pixel_of_world(g.sigma_point(i), time);
-    const vint here =
-        (pixel.u >= -across) & (pixel.u < in.width + across) & (pixel.v >= -down) & (pixel.v < in.height + down);
+    const vint here = (pixel.u >= -across) & (pixel.u < in.width + across) & (pixel.v >= -down) & (pixel.v < in.height + down);
     if (i == 0) {
       m.u = pixel.u, m.v = pixel.v, m.seen = pixel.seen, m.inside = here;
       continue;

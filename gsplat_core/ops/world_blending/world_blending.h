@@ -9,8 +9,8 @@
 
 namespace gsplat::world_blending {
 
-constexpr int kMostLanes = 16;      // of a CPU vector
-constexpr int kRayNumbers = 6;      // origin and unit direction
+constexpr int kMostLanes = 16;        // of a CPU vector
+constexpr int kRayNumbers = 6;        // origin and unit direction
 constexpr int kGaussianNumbers = 12;  // mean, and rows of the matrix that maps offsets to standard deviations
 
 struct Inputs {

@@ -38,10 +38,10 @@ class CompiledAdam(torch.optim.Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None and parameter.numel():
-                    self._update(parameter, group)
+                    self._update(parameter, parameter.grad.contiguous(), group)
         return loss
 
-    def _update(self, parameter: Tensor, group: dict[str, Any]) -> None:
+    def _update(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
         state = self.state[parameter]
         if not state:
             state["step"] = torch.tensor(0.0)  # on the host, as `torch.optim.Adam` keeps it without `capturable`
@@ -49,6 +49,6 @@ class CompiledAdam(torch.optim.Optimizer):
             state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
         state["step"] += 1
         adam_step_queued(
-            parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"], int(state["step"]), group["lr"],
+            parameter, gradient, state["exp_avg"], state["exp_avg_sq"], int(state["step"]), group["lr"],
             group["betas"], group["eps"], row_size=max(1, parameter.numel() // max(1, parameter.shape[0])),
         )  # fmt: skip

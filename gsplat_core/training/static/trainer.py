@@ -106,14 +106,15 @@ class StaticConfig:
         training.
         """
         every = max(min(REFINE_EVERY, pictures), self.shortened(REFINE_EVERY))
-        schedule = {"refine_start_iter": self.shortened(500), "refine_every": every}
+        schedule: dict[str, Any] = {"refine_start_iter": self.shortened(500), "refine_every": every}
         if self.strategy == "adc":
             stop, reset = self.shortened(15_000), max(self.shortened(3000), RESETS_AT_LEAST * every)
             if 2 * reset > stop:
                 reset = self.steps  # too short a training to recover from a reset
-            threshold = {"grow_grad2d": ABSGRAD_THRESHOLD} if self.absgrad else {}
+            if self.absgrad:
+                schedule["grow_grad2d"] = ABSGRAD_THRESHOLD
             return DefaultStrategy(
-                **schedule, **threshold, refine_stop_iter=stop, reset_every=reset, absgrad=self.absgrad, generator=generator,
+                **schedule, refine_stop_iter=stop, reset_every=reset, absgrad=self.absgrad, generator=generator,
             )  # fmt: skip
         if self.strategy == "mcmc":
             return MCMCStrategy(
