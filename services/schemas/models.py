@@ -52,6 +52,7 @@ class RenderRequest(BaseModel):
     )
     time_s: FiniteFloat | None = Field(
         None,
+        strict=True,
         ge=-1e9,
         le=1e9,
         description="Time of a picture within the model's time window, in seconds. Default: the end of the window.",
