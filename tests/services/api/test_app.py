@@ -98,7 +98,7 @@ def test_every_operation_is_described(plane):
         assert bool(operation["security"]) == (operation["x-role"] != "public")
     upload = document["paths"]["/v1/models/{name}/versions"]["put"]
     assert list(upload["requestBody"]["content"]) == ["application/octet-stream"]
-    assert [each["name"] for each in upload["parameters"]] == ["name", "Content-Digest"]
+    assert [each["name"] for each in upload["parameters"]] == ["name", "format", "Content-Digest"]
     assert document["components"]["schemas"]["Activation"]["properties"]["version"]["examples"] == [3]
 
 

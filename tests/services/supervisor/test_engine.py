@@ -66,7 +66,7 @@ def shown(monkeypatch):
     worker = Recorder(stop_requested=lambda: world.stopped)
     monkeypatch.setattr(engines, "ModelShow", lambda *parts: models)
     monkeypatch.setattr(engines, "check_device", lambda device: world.opened.append(device))
-    monkeypatch.setattr(engines, "check_renderer", lambda renderer, device: world.opened.append(renderer))
+    monkeypatch.setattr(engines, "check_renderer", lambda renderer, device, options: world.opened.append(renderer))
 
     def reconstruct(worker, spec, screen, layers, snapshots, *, again):
         world.reconstructed.append(again)
