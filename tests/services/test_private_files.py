@@ -145,6 +145,7 @@ def test_what_is_no_folder_is_refused(tmp_path, kind):
         make_state_private(tmp_path / "file" if kind == "a file" else tmp_path / "file" / "data")
 
 
+@pytest.mark.slow
 def test_every_folder_of_the_service_is_known():
     """A name that the service gives below its data folder and that is not listed would keep its rights."""
     named = set()

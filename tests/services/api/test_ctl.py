@@ -137,6 +137,7 @@ class Terminal(io.StringIO):
         return True
 
 
+@pytest.mark.slow
 def test_yes_asks_nobody(ctl, service):
     assert ctl("delete", "stream", "theatre-1", "--yes")[0] == OK
     assert service.streams() == []
@@ -144,6 +145,7 @@ def test_yes_asks_nobody(ctl, service):
         assert ctl("delete", *missing, "--yes")[0] == BAD_INPUT
 
 
+@pytest.mark.slow
 def test_keys_from_a_shell(ctl, service):
     code, token, _ = ctl("keys", "add", "wall", "--expires-days", "3", "--stream", "theatre-1")
     assert code == OK

@@ -79,6 +79,7 @@ def test_a_snapshot_is_kept_as_a_file(plane):
     assert plane.ask("GET", f"{STREAM}/snapshots/{ID}", "viewer").json()["gaussians"] == 12
 
 
+@pytest.mark.slow
 def test_a_snapshot_becomes_a_version(plane):
     answer = plane.ask("POST", f"{STREAM}/snapshots", "operator", json={"model": "liver"})
     assert answer.status_code == 201 and answer.headers["Location"] == "/v1/models/liver/versions/4"

@@ -6,6 +6,8 @@ import base64
 import hashlib
 import time
 
+import pytest
+
 from services.api.problems import PROBLEM_JSON
 
 CASE = "/v1/recordings/case-7"
@@ -52,6 +54,7 @@ def test_what_cannot_be_used_is_rejected_afterwards(plane):
     assert settled(plane)["state"] == "rejected"
 
 
+@pytest.mark.slow
 def test_uploads_are_bounded_and_whole(new_plane):
     plane = new_plane(limits={"recording_bytes": 2**20})
     long = put(plane, bytes(2**20 + 1))

@@ -116,6 +116,7 @@ def test_an_error_at_any_step_is_refused_and_leaves_a_log_that_fits(tmp_path, wi
     assert step > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keeping", [ONE_FILE, MANY_FILES], ids=["one file", "many files"])
 @pytest.mark.parametrize("after", [False, True], ids=["before the call", "after the call"])
 def test_a_kill_at_any_step_loses_no_entry_that_was_confirmed(tmp_path, wire, keeping, after):

@@ -72,6 +72,7 @@ def test_a_segment_that_was_cut_or_swapped_is_found(path):
     assert not verify(path).intact
 
 
+@pytest.mark.slow
 def test_old_segments_go_and_an_anchor_is_kept(tmp_path):
     log = written(tmp_path / "audit.jsonl", replace(SMALL, segments=2), 60)
     closed, anchor = closed_segments(log.path), read_anchor(log.path)

@@ -101,6 +101,7 @@ def test_options_with_numbers_are_recognised():
     assert wanted <= numeric and not {("replay", "--device"), ("replay", "--heldout")} & numeric
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", EVERY_COMMAND, ids=" ".join)
 def test_numbers_with_underscores_or_digits_of_other_scripts_are_refused(words, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)

@@ -39,6 +39,7 @@ def bundle(gaussians, tmp_path):
     return str(tmp_path / "bundle")
 
 
+@pytest.mark.slow
 def test_a_box_is_cut_out_of_a_scene_file(ply, gaussians, tmp_path, capsys):
     out = tmp_path / "cut.ply"
     words = ["edit", ply, "--select", "box:-1,-1,8,1,1,10", "--outside", "--delete", "--out", str(out), "--json"]

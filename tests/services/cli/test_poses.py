@@ -92,6 +92,7 @@ def test_a_camera_that_is_not_known_is_said(clip, capsys):
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (144, "assumed", [96, 256])
 
 
+@pytest.mark.slow
 def test_a_focal_length_that_pictures_tell_is_used_and_said(clip, capsys, monkeypatch):
     focal_length_found = FocalLength(144.0, FOCAL, (130.0, 150.0), True)
     monkeypatch.setattr(focal_length, "focal_length_of", lambda frames, camera, found: focal_length_found)
@@ -111,12 +112,14 @@ def test_a_calibrated_camera_is_taken_as_it_is(clip, capsys):
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "calibration", [])
 
 
+@pytest.mark.slow
 def test_a_scope_that_may_stand_still_is_said(clip, capsys):
     said = said_of(capsys, clip(STILL))
     assert said["explained"] < 0.75
     assert any("it may stand still before tissue that moves" in note for note in said["notes"])
 
 
+@pytest.mark.slow
 def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch):
     plain = recordings.trajectory_of
 

@@ -115,6 +115,7 @@ HOSTILE = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", HOSTILE)
 @pytest.mark.parametrize("command", ["render", "export", "view", "measure"])
 def test_a_hostile_ply_is_one_sentence(tmp_path, capsys, command, what):
@@ -137,6 +138,7 @@ def test_a_hostile_splat_is_refused(tmp_path, data):
         load_model(tmp_path / "scene.splat")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["render", "export", "pack", "measure", "evaluate", "view"])
 @pytest.mark.parametrize("name", ["model.pt", "scene.obj", "video.mp4", "nosuffix"])
 def test_what_is_no_model_is_one_sentence(tmp_path, capsys, command, name):

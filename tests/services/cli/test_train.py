@@ -47,6 +47,7 @@ def scene(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_scene_is_trained_saved_and_evaluated(scene, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["train", str(scene), "--out", str(out), "--steps", "40", "--sh-degree", "1", "--strategy", "mcmc"]

@@ -63,6 +63,7 @@ def test_two_checks_of_one_version_agree(registry, files):
     assert first == second and first.state == "ready"
 
 
+@pytest.mark.slow
 def test_checks_wait_for_each_other(tmp_path, files):
     """Each check takes a file for itself, and fails where it is taken."""
     taken = str(tmp_path / "taken")
