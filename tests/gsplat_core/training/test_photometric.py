@@ -65,7 +65,7 @@ def by_autograd(gaussians, seen, weights):
 @pytest.mark.parametrize(("model", "pose"), [("pinhole", None), ("pinhole", MOVED), ("fisheye", MOVED)])
 def test_equals_render_loss_and_backward(make_gaussians, assert_near, sh_degree, weights, model, pose):
     gaussians, seen = make_gaussians(150, sh_degree), observation(model, pose)
-    loss, gradients, _ = loss_and_gradients(gaussians, seen, weights)
+    loss, gradients, *_ = loss_and_gradients(gaussians, seen, weights)
     expected_loss, expected = by_autograd(gaussians, seen, weights)
     assert loss == pytest.approx(expected_loss, rel=1e-6)
     assert gradients.keys() == expected.keys()
@@ -79,7 +79,7 @@ def test_equals_render_loss_and_backward(make_gaussians, assert_near, sh_degree,
 def test_equals_the_float64_reference(make_gaussians, assert_near, sh_degree):
     seen, weights = observation(pose=MOVED, width=21, height=18), LossWeights(0.2, 5.0)
     gaussians = make_gaussians(25, sh_degree)
-    loss, gradients, _ = loss_and_gradients(gaussians, seen, weights)
+    loss, gradients, *_ = loss_and_gradients(gaussians, seen, weights)
     exact = gaussians.to(dtype=torch.float64).requires_grad_()
     colors, _, _ = reference.rasterization(
         exact.means,
@@ -106,8 +106,8 @@ def test_equals_the_float64_reference(make_gaussians, assert_near, sh_degree):
 
 def test_without_depth_the_depth_weight_has_no_effect(make_gaussians):
     gaussians, seen = make_gaussians(80), observation(depth=False)
-    loss, gradients, _ = loss_and_gradients(gaussians, seen, LossWeights(depth=3.0))
-    plain_loss, plain, _ = loss_and_gradients(gaussians, seen, LossWeights())
+    loss, gradients, *_ = loss_and_gradients(gaussians, seen, LossWeights(depth=3.0))
+    plain_loss, plain, *_ = loss_and_gradients(gaussians, seen, LossWeights())
     assert loss == plain_loss
     assert all(torch.equal(gradients[name], plain[name]) for name in plain)
 
@@ -116,9 +116,9 @@ def test_what_lies_under_the_tool_is_not_seen(make_gaussians):
     gaussians, seen = make_gaussians(80), observation()
     other = seen.image.clone()
     other[seen.mask == 0] = 255 - other[seen.mask == 0]
-    loss, gradients, _ = loss_and_gradients(gaussians, seen, LossWeights(0.2))
+    loss, gradients, *_ = loss_and_gradients(gaussians, seen, LossWeights(0.2))
     changed = Observation(seen.seq, seen.time_s, seen.camera, other, seen.mask, seen.depth)
-    other_loss, other_gradients, _ = loss_and_gradients(gaussians, changed, LossWeights(0.2))
+    other_loss, other_gradients, *_ = loss_and_gradients(gaussians, changed, LossWeights(0.2))
     assert loss == other_loss
     assert all(torch.equal(gradients[name], other_gradients[name]) for name in gradients)
 
@@ -126,7 +126,7 @@ def test_what_lies_under_the_tool_is_not_seen(make_gaussians):
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(0.2, 0.1)])
 def test_no_gaussians_give_the_loss_of_a_black_picture(make_gaussians, weights):
     seen = observation(tool=False)
-    loss, gradients, _ = loss_and_gradients(make_gaussians(0), seen, weights)
+    loss, gradients, *_ = loss_and_gradients(make_gaussians(0), seen, weights)
     black = torch.zeros(HEIGHT_PX, WIDTH_PX, 3)
     assert loss == pytest.approx(float(image_loss(black, seen.image, ssim_weight=weights.ssim).loss))
     assert all(gradient.shape[0] == 0 for gradient in gradients.values())
@@ -144,8 +144,8 @@ def test_a_gaussian_that_is_not_finite_does_not_touch_the_others(make_gaussians,
     others = torch.arange(40) != 7
     broken = gaussians.clone()
     broken.tensors()[name][7, ...] = bad
-    loss, gradients, _ = loss_and_gradients(broken, seen, LossWeights(0.2, 0.1))
-    expected_loss, expected, _ = loss_and_gradients(gaussians.select(others), seen, LossWeights(0.2, 0.1))
+    loss, gradients, *_ = loss_and_gradients(broken, seen, LossWeights(0.2, 0.1))
+    expected_loss, expected, *_ = loss_and_gradients(gaussians.select(others), seen, LossWeights(0.2, 0.1))
     assert loss == expected_loss
     for key, gradient in gradients.items():
         torch.testing.assert_close(gradient[others], expected[key], rtol=1e-5, atol=1e-9)
@@ -154,7 +154,7 @@ def test_a_gaussian_that_is_not_finite_does_not_touch_the_others(make_gaussians,
 @pytest.mark.parametrize("size", [(1, 1), (17, 3), (16, 16)])
 def test_odd_sizes(make_gaussians, assert_near, size):
     gaussians, seen = make_gaussians(30), observation(tool=False, width=size[0], height=size[1])
-    loss, gradients, _ = loss_and_gradients(gaussians, seen, LossWeights(0.2, 1.0))
+    loss, gradients, *_ = loss_and_gradients(gaussians, seen, LossWeights(0.2, 1.0))
     expected_loss, expected = by_autograd(gaussians, seen, LossWeights(0.2, 1.0))
     assert loss == pytest.approx(expected_loss, rel=1e-5)
     for name, gradient in gradients.items():
@@ -170,7 +170,7 @@ def test_the_number_of_threads_does_not_change_a_bit(make_gaussians):
         results = []
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            loss, gradients, _ = loss_and_gradients(gaussians, seen, LossWeights(0.2, 0.1))
+            loss, gradients, *_ = loss_and_gradients(gaussians, seen, LossWeights(0.2, 0.1))
             results.append((loss, gradients | {"opacities": gaussians.opacities}))
     finally:
         torch.set_num_threads(before)
