@@ -102,14 +102,17 @@ class Reconstructor:
     @property
     def gaussians(self) -> int:
         """Current number of Gaussians."""
-        return 0 if self._step is None else self._step.gaussians.count
+        # Read once: another thread than the training one may ask, between two models too.
+        step = self._step
+        return 0 if step is None else step.gaussians.count
 
     @property
     def parameter_count(self) -> int:
         """Number of parameters of the whole model; 0 before there is one."""
-        if self._step is None:
+        step = self._step
+        if step is None:
             return 0
-        return sum(t.numel() for t in self._step.gaussians.tensors().values()) + self._step.field.parameter_count
+        return sum(t.numel() for t in step.gaussians.tensors().values()) + step.field.parameter_count
 
     @property
     def step_ns(self) -> float:
@@ -118,8 +121,9 @@ class Reconstructor:
 
     def kept(self) -> dict[str, int]:
         """Return the current sizes of all stores that grow with the stream; each is bounded."""
-        parameters = 0 if self._step is None else self._step.field.parameter_count
-        archived = 0 if self._growth is None else self._growth.archived
+        step, growth = self._step, self._growth
+        parameters = 0 if step is None else step.field.parameter_count
+        archived = 0 if growth is None else growth.archived
         held = {"window_frames": len(self._window), "field_parameters": parameters, "places": len(self._left.places)}
         return {**held, "archived": archived}
 

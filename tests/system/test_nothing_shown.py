@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -31,12 +33,16 @@ def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
         == NOTHING_SHOWN
     )
     said = capsys.readouterr().err
-    assert "nothing was shown: 6 frames came, 6 withheld (out of body" in said and "--out-of-body off" in said
+    # A busy machine may miss a frame of a live source.
+    counts = re.search(r"nothing was shown: (\d+) frames came, (\d+) withheld \(out of body", said)
+    assert counts is not None and "--out-of-body off" in said
+    came, withheld = map(int, counts.groups())
+    assert came == withheld and 1 <= came <= 6
     (session,) = (tmp_path / "out" / "recordings").iterdir()
     for more in ([], ["--ignore-schedule"]):
         assert run(["replay", str(session), "--out", str(tmp_path / "again"), *more]) == NOTHING_SHOWN
         said = capsys.readouterr().err
-        assert "6 withheld when they were recorded (out of body: 6)" in said and "interrupted" not in said
+        assert f"{came} withheld when they were recorded (out of body: {came})" in said and "interrupted" not in said
     assert run(["reconstruct", str(session), "--out", str(tmp_path / "fit"), "--steps", "2"]) == NOTHING_SHOWN
     assert "can be trained on" in capsys.readouterr().err
     assert run(["batch", str(session.parent), "--out", str(tmp_path / "batch"), "--workers", "1"]) == NOTHING_SHOWN
