@@ -30,9 +30,17 @@ def main() -> int:
         images = Path(recording) / "images"
         single = images.is_dir() and len(list(images.iterdir())) == 1
         source = still(Path(recording), Path(folder)) if single else Path(recording)
-        words = [sys.executable, "-m", "services.cli", command, str(source), "--json", *options]
-        if command != "live":
-            words += ["--out", f"{folder}/out"]
+        words = [
+            sys.executable,
+            "-m",
+            "services.cli",
+            command,
+            str(source),
+            "--json",
+            "--out",
+            f"{folder}/out",
+            *options,
+        ]
         start = time.perf_counter()
         done = subprocess.run(words, capture_output=True, text=True, check=False)
         wall_s = time.perf_counter() - start
@@ -50,7 +58,37 @@ def figures(report: dict[str, Any]) -> dict[str, Any]:
     """
     kept = {name: report[name] for name in KEPT if report.get(name) is not None}
     kept["run"] = {name: value for name, value in kept["run"].items() if name not in ("machine", "started_at")}
-    return kept
+    return kept | {"margins": margins(report)}
+
+
+def margins(report: dict[str, Any]) -> dict[str, float | int] | None:
+    """Compare each displayed frame with the previous frame as a prediction of it, after the first second.
+
+    Args:
+        report: the command's report, with an entry per frame.
+
+    Returns:
+        frames: number of compared frames. worst_db: lowest difference of the tissue PSNR of the displayed picture and
+        of the previous frame. below: frames for which it is negative; far_below: for which it is below -1 dB. None for a
+        report without such entries.
+    """
+    entries = report.get("series") or []
+    if not entries or report.get("series_frames_per_entry", 1) != 1:
+        return None
+    settled_s = entries[0]["time_s"] + 1.0
+    differences = [
+        entry["psnr_tissue_db"] - entry["previous_frame_db"]
+        for entry in entries
+        if entry["time_s"] >= settled_s and None not in (entry["psnr_tissue_db"], entry["previous_frame_db"])
+    ]
+    if not differences:
+        return None
+    return {
+        "frames": len(differences),
+        "worst_db": round(min(differences), 3),
+        "below": sum(each < 0 for each in differences),
+        "far_below": sum(each < -1 for each in differences),
+    }
 
 
 def still(stills: Path, folder: Path) -> Path:

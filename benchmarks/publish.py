@@ -1,4 +1,4 @@
-"""Generate RESULTS.md, results/methods.md, results/gsplat.md and the figures in README.md from the logs in `benchmarks/logs`.
+"""Generate RESULTS.md, the generated pages of `results` and the figures in README.md from the logs in `benchmarks/logs`.
 
     python benchmarks/publish.py            # writes
     python benchmarks/publish.py --check    # exit code 1 where a written figure and its log differ
@@ -20,10 +20,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent / "methods"))
 sys.path.insert(0, str(Path(__file__).resolve().parent / "gsplat"))
 
 from accepted import methods_text
+from generality import generality_text
 from results import gsplat_text
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,6 +33,7 @@ LOGS = ROOT / "benchmarks" / "logs"
 RESULTS = ROOT / "benchmarks" / "RESULTS.md"
 METHODS = ROOT / "benchmarks" / "results" / "methods.md"
 GSPLAT = ROOT / "benchmarks" / "results" / "gsplat.md"
+GENERALITY = ROOT / "benchmarks" / "results" / "generality.md"
 README = ROOT / "README.md"
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 ENVELOPE = ("benchmark", "run", "commit", "date", "machine", "command", "seconds")
@@ -398,16 +401,22 @@ def with_figures(text: str, logs: Path = LOGS) -> str:
     return BLOCK.sub(lambda found: found.group(1) + readme_block(found.group(2), logs) + found.group(3), text)
 
 
+def documents() -> dict[Path, str]:
+    """Return the text of each generated document."""
+    return {
+        RESULTS: results_text(),
+        METHODS: methods_text(),
+        GSPLAT: gsplat_text(),
+        GENERALITY: generality_text(),
+        README: with_figures(README.read_text(encoding="utf-8")),
+    }
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 where a file would change")
     options = parser.parse_args()
-    wanted = {
-        RESULTS: results_text(),
-        METHODS: methods_text(),
-        GSPLAT: gsplat_text(),
-        README: with_figures(README.read_text(encoding="utf-8")),
-    }
+    wanted = documents()
     stale = [path for path, text in wanted.items() if not path.exists() or path.read_text(encoding="utf-8") != text]
     if options.check:
         for path in stale:

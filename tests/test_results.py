@@ -25,7 +25,7 @@ def script(name: str) -> ModuleType:
     return module
 
 
-publish, suite = script("publish"), script("suite")
+publish, suite, generality = script("publish"), script("suite"), script("generality")
 
 LINE = {
     "benchmark": "x", "run": 1, "commit": "abc", "date": "2026-01-01", "command": "python x.py", "seconds": 1.0,
@@ -44,10 +44,9 @@ def written(folder: Path, *results: dict) -> Path:
 
 
 def test_the_committed_documents_are_what_the_logs_say():
-    assert publish.RESULTS.read_text(encoding="utf-8") == publish.results_text()
-    readme = publish.README.read_text(encoding="utf-8")
-    assert publish.BLOCK.search(readme)
-    assert readme == publish.with_figures(readme)
+    assert publish.BLOCK.search(publish.README.read_text(encoding="utf-8"))
+    for path, text in publish.documents().items():
+        assert path.read_text(encoding="utf-8") == text, f"{path.name} differs from the logs; run benchmarks/publish.py"
 
 
 def test_the_readme_states_no_quality_or_speed_outside_of_its_generated_block():
@@ -99,6 +98,11 @@ def test_logs_state_commits_of_this_history_and_no_place_of_a_machine():
     lines += [
         (path, json.loads(path.read_text())) for path in (ROOT / "benchmarks" / "logs" / "methods").glob("*.json")
     ]
+    lines += [
+        (path, line)
+        for path in (ROOT / "benchmarks" / "logs" / "generality").glob("*.jsonl")
+        for line in publish.log_lines(f"generality/{path.stem}")
+    ]
     for path, line in lines:
         # results/methods.md states the `+` of a log that was measured on files that were not committed.
         assert path.parent.name == "methods" or not line["commit"].endswith("+"), f"{path.name}: {line['commit']}"
@@ -118,3 +122,42 @@ def test_logs_state_commits_of_this_history_and_no_place_of_a_machine():
 )
 def test_results_are_read_from_lines_and_from_a_whole_output(text, found):
     assert suite.results(text) == found
+
+
+def test_recordings_are_found_by_their_files(tmp_path):
+    for made in (
+        "a/images/000000.png",
+        "b/video.mp4",
+        "c/poses_bounds.npy",
+        "d/e/left.mp4",
+        "d/e/right.mp4",
+        "loose/000.jpg",
+    ):
+        path = tmp_path / made
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    found = {name: path.name for name, path in generality.recordings(tmp_path).items()}
+    assert found == {"a": "a", "b": "video.mp4", "c": "c", "d/e": "left.mp4"}
+
+
+def test_a_live_row_is_met_only_if_every_run_is_above_the_previous_frame(tmp_path):
+    def lines(*runs: tuple[float, int]) -> str:
+        results = [
+            {
+                "live": {"settled_psnr_tissue_db": db, "previous_frame_db": 20.0, "withheld": {"blur": 2}},
+                "margins": {"far_below": far},
+            }
+            for db, far in runs
+        ]
+        return "".join(
+            json.dumps(LINE | {"run": run, "result": result, "part": "live", "recording": "r"}) + "\n"
+            for run, result in enumerate(results, 1)
+        )
+
+    for runs, row in (
+        (((24.0, 0), (23.5, 0)), "| `r` | 23.8 (23.5) | 20.0 (20.0) | – | – | 0 (0) | – | – of – | blur 2 | met |"),
+        (((24.0, 0), (22.5, 0)), "missed"),
+        (((24.0, 0), (23.5, 1)), "missed"),
+    ):
+        (tmp_path / "cpu.jsonl").write_text(lines(*runs), encoding="utf-8")
+        assert row in generality.generality_text(tmp_path)

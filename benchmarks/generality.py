@@ -1,0 +1,265 @@
+"""Run live and offline reconstruction with default settings on every recording of a folder.
+
+    python benchmarks/generality.py ../shared/recordings --device cuda
+    python benchmarks/generality.py MY_RECORDINGS --parts live --runs 1 --out /tmp/mine.jsonl
+
+Recordings are found by their files, so that the script runs on recordings that nobody chose. It then runs the benchmarks
+of gates, tool masks and random geometry. Each run is a line of the log. `publish.py` generates results/generality.md from
+the logs in `logs/generality`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import statistics
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import suite
+
+FOLDER = suite.LOGS / "generality"
+VIDEOS = ("left.mp4", "video.mp4")
+PARTS = ("live", "live_own_rate", "offline")
+LEAST_FRAMES = 31
+"""Frames of a recording for a live run: a second and one more frame, since scores start after a second."""
+OFFLINE_CPU_SCALE = "0.25"
+
+
+def recordings(root: Path) -> dict[str, Path]:
+    """Return the recordings below a folder by their path in it. Loose pictures are no recording."""
+    found: dict[str, Path] = {}
+    for folder in sorted(each for each in [root, *root.rglob("*")] if each.is_dir()):
+        name = folder.relative_to(root).as_posix()
+        videos = [folder / video for video in VIDEOS if (folder / video).is_file()]
+        if (folder / "poses_bounds.npy").is_file() or (folder / "images").is_dir():
+            found[name] = folder
+        elif videos:
+            found[name] = videos[0]
+    return found
+
+
+def frames_and_rate(recording: Path) -> tuple[int, float]:
+    """Return the number of frames and the rate in frames/s; 30 for pictures without a rate."""
+    import cv2
+
+    videos = (
+        [recording] if recording.is_file() else [recording / name for name in VIDEOS if (recording / name).is_file()]
+    )
+    if not videos:
+        return len(list((recording / "images").iterdir())), 30.0
+    video = cv2.VideoCapture(str(videos[0]))
+    try:
+        return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), float(video.get(cv2.CAP_PROP_FPS)) or 30.0
+    finally:
+        video.release()
+
+
+def commands(root: Path, parts: Iterable[str], device: str) -> Iterator[tuple[str, str, suite.Benchmark]]:
+    """Yield part, name of the recording, and the command that measures it."""
+    scale = () if device == "cuda" else ("--scale", OFFLINE_CPU_SCALE)
+    for name, recording in recordings(root).items():
+        frames, rate = frames_and_rate(recording)
+        for part in parts:
+            own_rate = part == "live_own_rate"
+            if part != "offline" and (frames < LEAST_FRAMES or (own_rate and abs(rate - 30.0) < 0.5)):
+                continue
+            options = {"live": ("live", "--fps", "30"), "live_own_rate": ("live",), "offline": ("reconstruct", *scale)}[
+                part
+            ]
+            command, *more = options
+            words = ["benchmarks/plain.py", command, str(recording), "--device", device, *more]
+            yield part, name, suite.Benchmark(f"generality_{part}", shlex.join(words), device)
+
+
+def run(root: Path, parts: Iterable[str], device: str, runs: int, out: Path) -> None:
+    """Append a line to the log for each run of each command. The log is started anew."""
+    date = datetime.now(UTC).strftime("%Y-%m-%d")
+    about = {"commit": suite.commit(), "date": date, "machine": suite.machine(device)}
+    chosen = list(commands(root, parts, device))
+    if not chosen:
+        sys.exit(
+            f"no recording is in {root}; a recording is a folder with images/, video.mp4, left.mp4 or poses_bounds.npy"
+        )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.open("w", encoding="utf-8") as log:
+        for number in range(1, runs + 1):
+            for part, name, benchmark in chosen:
+                for line in suite.measured(benchmark, number, about):
+                    stated = {
+                        "part": part,
+                        "recording": name,
+                        "command": line["command"].replace(str(root), "RECORDINGS"),
+                    }
+                    log.write(json.dumps(line | stated) + "\n")
+                    log.flush()
+                    print(
+                        f"{part} {name} run {number}: {line.get('error', 'done').strip().splitlines()[-1]}", flush=True
+                    )
+
+
+def lines_of(folder: Path = FOLDER) -> dict[str, list[dict[str, Any]]]:
+    """Return the log lines by device."""
+    logs = {path.stem: path.read_text(encoding="utf-8").splitlines() for path in sorted(folder.glob("*.jsonl"))}
+    return {device: [json.loads(line) for line in text if line] for device, text in logs.items()}
+
+
+def value(result: Mapping[str, Any], path: str) -> float | None:
+    """Return a number in a result by its dotted path; None if it is missing."""
+    found: Any = result
+    for key in path.split("."):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return float(found) if isinstance(found, int | float) else None
+
+
+def cell(results: Iterable[Mapping[str, Any]], path: str, *, digits: int = 1, worst: str = "min") -> str:
+    """Return the median over the runs, with the worst run in brackets."""
+    values = [number for each in results if (number := value(each, path)) is not None]
+    if not values:
+        return "–"
+    beyond = min(values) if worst == "min" else max(values)
+    return f"{statistics.median(values):.{digits}f}" + (f" ({beyond:.{digits}f})" if len(values) > 1 else "")
+
+
+def withheld(results: Iterable[Mapping[str, Any]]) -> str:
+    """Return the withheld frames of the first run by reason."""
+    first = next(iter(results))
+    counts = (first.get("live") or {}).get("withheld") or {}
+    return ", ".join(f"{reason} {count}" for reason, count in counts.items()) or "0"
+
+
+def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
+    """Return the table of live runs."""
+    head = (
+        "recording", "displayed frame (training error), dB", "previous frame, dB", "worst frame, dB", "worst difference to the previous frame, dB",
+        "frames more than 1 dB below it", "age p99, ms", "shown of", "withheld", "required: 3 dB above, never 1 dB below",
+    )  # fmt: skip
+    rows = []
+    for name, results in groups.items():
+        gains = [
+            shown - before
+            for each in results
+            if (shown := value(each, "live.settled_psnr_tissue_db")) is not None
+            and (before := value(each, "live.previous_frame_db")) is not None
+        ]
+        far = [value(each, "margins.far_below") or 0 for each in results]
+        met = "met" if gains and min(gains) >= 3 and max(far) == 0 else "missed"
+        rows.append(
+            (
+                f"`{name}`",
+                cell(results, "live.settled_psnr_tissue_db"),
+                cell(results, "live.previous_frame_db"),
+                cell(results, "live.worst_psnr_tissue_db"),
+                cell(results, "margins.worst_db"),
+                cell(results, "margins.far_below", digits=0, worst="max"),
+                cell(results, "live.age_p99_ms", worst="max"),
+                f"{cell(results, 'live.pictures', digits=0)} of {cell(results[:1], 'frames.ingested', digits=0)}",
+                withheld(results),
+                met,
+            )
+        )
+    return table(head, rows)
+
+
+def offline_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
+    """Return the table of offline runs."""
+    head = (
+        "recording", "width, px", "held-out frames, dB", "neighbours' mean, dB", "previous frame, dB", "training frames (training error), dB",
+        "whole command, s", "required: neighbours' mean",
+    )  # fmt: skip
+    rows = []
+    for name, results in groups.items():
+        gains = [
+            held_out - mean
+            for each in results
+            if (held_out := value(each, "quality.heldout.psnr_tissue_db")) is not None
+            and (mean := value(each, "quality.baselines.heldout_neighbour_mean_db")) is not None
+        ]
+        met = ("met" if min(gains) >= 0 else "missed") if gains else "–"
+        rows.append(
+            (
+                f"`{name}`",
+                cell(results[:1], "recording.width_px", digits=0),
+                cell(results, "quality.heldout.psnr_tissue_db"),
+                cell(results[:1], "quality.baselines.heldout_neighbour_mean_db"),
+                cell(results[:1], "quality.baselines.heldout_previous_frame_db"),
+                cell(results, "quality.training.psnr_tissue_db"),
+                cell(results, "wall_s", worst="max"),
+                met,
+            )
+        )
+    return table(head, rows)
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a Markdown table."""
+    titles = list(head)
+    lines = [titles, ["---"] * len(titles), *(list(row) for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+TITLES = {
+    "live": "Live at 30 frames/s",
+    "live_own_rate": "Live at the recording's own rate",
+    "offline": "Offline, default settings",
+}
+
+
+def generality_text(folder: Path = FOLDER) -> str:
+    """Return the text of results/generality.md."""
+    parts = [
+        "# Recordings that nobody tuned for",
+        "Generated by `python benchmarks/publish.py` from the logs in [logs/generality](../logs/generality); do not edit. `python benchmarks/generality.py "
+        "RECORDINGS` runs the default commands on every recording of a folder. A figure is the median over the runs, with the worst run in brackets. PSNR is over "
+        "tissue. The displayed frame was trained on before it is shown, so its PSNR is a training error. Differences to the previous frame are of single frames after "
+        "the first second.",
+    ]
+    for device, lines in lines_of(folder).items():
+        name = "one GPU" if device == "cuda" else "two CPU cores"
+        for part, title in TITLES.items():
+            own = [line for line in lines if line["part"] == part]
+            groups: dict[str, list[dict[str, Any]]] = {}
+            for line in own:
+                if "result" in line:
+                    groups.setdefault(line["recording"], []).append(line["result"])
+            failed = [
+                f"- `{line['recording']}`, run {line['run']}: {line['error'].strip().splitlines()[-1]}"
+                for line in own
+                if "error" in line
+            ]
+            if not own:
+                continue
+            parts += [f"## {title}, {name}", live_table(groups) if part.startswith("live") else offline_table(groups)]
+            if failed:
+                parts.append("Ended with an error:\n\n" + "\n".join(failed))
+            about = own[0]["machine"]
+            gpu = f"{about['gpu']}, " if "gpu" in about else ""
+            parts.append(
+                f"Measured at commit {own[0]['commit']}, {own[0]['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}; "
+                f"{max(line['run'] for line in own)} runs of `{own[0]['command']}` and the same for the other recordings."
+            )
+    if len(parts) == 2:
+        parts.append("Not measured yet.")
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", type=Path, nargs="?", default=suite.RECORDINGS, help="folder of recordings")
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--out", type=Path, help="log (default: benchmarks/logs/generality/DEVICE.jsonl)")
+    options = parser.parse_args()
+    out = options.out or FOLDER / f"{options.device}.jsonl"
+    run(options.recordings.resolve(), options.parts, options.device, options.runs, out)
+
+
+if __name__ == "__main__":
+    main()
