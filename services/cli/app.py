@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -276,9 +277,7 @@ def run(arguments: list[str]) -> int:
         typer.echo(f"error: {sentence(empty[0])} is empty; a variable of the shell may be unset", err=True)
         return BAD_INPUT
     try:
-        command = typer.main.get_command(app)
-        require_plain_numbers(command)
-        code = command.main(arguments, prog_name="intrasplat", standalone_mode=False)
+        code = _whole_command().main(arguments, prog_name="intrasplat", standalone_mode=False)
     except typer.Abort:
         return INTERRUPTED
     except _USAGE_ERRORS as error:
@@ -286,6 +285,14 @@ def run(arguments: list[str]) -> int:
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the single place where errors become exit codes
         return exit_code_of(error, arguments)
     return code if isinstance(code, int) else OK
+
+
+@cache
+def _whole_command() -> Any:
+    """Build the tree of all commands, once per process."""
+    command = typer.main.get_command(app)
+    require_plain_numbers(command)
+    return command
 
 
 def _is_empty(word: str) -> bool:
