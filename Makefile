@@ -21,20 +21,28 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
-# Run the fast tests (`test`), or also those marked as slow (`test-all`), in six groups of which two run at a time, the longest first. The output
-# of a group is printed when it has ended.
-PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/recipes tests/deploy
+# Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time, the longest first. There are
+# more of them than cores, because many tests wait for processes. The output of a group is printed when it has ended.
+JOBS ?= $(shell expr $$(nproc) + 2)
+SYSTEM_TESTS := tests/system
+PROGRAM_TESTS := tests/attacks tests/test_examples.py tests/recipes tests/deploy
+REGISTRY_TESTS := $(addprefix tests/services/,registry jobs exports audit supervisor recordings)
 TRAINING_TESTS := tests/gsplat_core/training tests/gsplat_core/experimental tests/gsplat_core/evaluation
 OP_TESTS := tests/gsplat_core/ops tests/gsplat_core/rendering tests/gsplat_core/deformation
-GROUPS := services programs operators rest training ops
+GEOMETRY_TESTS := tests/gsplat_core/geometry
+GROUPS := system registry operators training services programs rest ops geometry
+ignoring = $(patsubst %,--ignore=%,$1)
+test-of-system: TESTS = $(SYSTEM_TESTS)
 test-of-programs: TESTS = $(PROGRAM_TESTS)
-test-of-services: TESTS = tests/services
-test-of-operators: TESTS = tests/operators tests/gsplat_core/geometry
+test-of-registry: TESTS = $(REGISTRY_TESTS)
+test-of-services: TESTS = tests/services $(call ignoring,$(REGISTRY_TESTS))
+test-of-operators: TESTS = tests/operators
 test-of-training: TESTS = $(TRAINING_TESTS)
 test-of-ops: TESTS = $(OP_TESTS)
-test-of-rest: TESTS = $(patsubst %,--ignore=%,$(PROGRAM_TESTS) tests/services tests/operators tests/gsplat_core/geometry $(TRAINING_TESTS) $(OP_TESTS))
+test-of-geometry: TESTS = $(GEOMETRY_TESTS)
+test-of-rest: TESTS = $(call ignoring,$(SYSTEM_TESTS) $(PROGRAM_TESTS) tests/services tests/operators $(TRAINING_TESTS) $(OP_TESTS) $(GEOMETRY_TESTS))
 .PHONY: $(GROUPS:%=test-of-%)
-BESIDE := --no-print-directory --jobs=2 --output-sync=target --keep-going
+BESIDE = --no-print-directory --jobs=$(JOBS) --output-sync=target --keep-going
 test: native .venv/.development
 	@$(MAKE) $(BESIDE) MARKED='not slow' $(GROUPS:%=test-of-%)
 
@@ -49,6 +57,8 @@ test-isa: native .venv/.development
 $(GROUPS:%=test-of-%): export OMP_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENBLAS_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
+# Child processes load compiled modules instead of compiling them again.
+$(GROUPS:%=test-of-%): export PYTHONDONTWRITEBYTECODE :=
 $(GROUPS:%=test-of-%):
 	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(TESTS)
 
