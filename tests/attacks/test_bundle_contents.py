@@ -1,5 +1,7 @@
 """A well-formed upload of a hostile model: its check rejects it with one sentence, and nothing in it is executed."""
 
+import contextlib
+import io
 import json
 import pickle
 import struct
@@ -10,6 +12,7 @@ from safetensors.torch import save
 
 from gsplat_core.io.bundle import load_bundle
 from services.errors import Conflict
+from services.registry import check, checking
 from services.registry.bundle_file import pack
 from services.registry.models import ModelRegistry
 
@@ -18,6 +21,23 @@ from services.registry.models import ModelRegistry
 def registry(tmp_path):
     with ModelRegistry(tmp_path / "registry", most_upload_bytes=4 << 20) as opened:
         yield opened
+
+
+@pytest.fixture
+def check_here(monkeypatch):
+    """Run the check program in this process, without its resource limits. A process of its own starts in seconds."""
+
+    def run(command, passed_s, take, **_):
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said):
+            assert check.main([command[len(checking.PROGRAM)], "--json"]) == 0
+        for line in said.getvalue().splitlines():
+            take(json.loads(line))
+        return ""
+
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "keep_files_private", lambda: None)
+    monkeypatch.setattr(checking, "run_program", run)
 
 
 @pytest.fixture
@@ -67,54 +87,47 @@ def test_a_pickle_as_tensors_is_rejected_by_the_check(rejected, bundle, tmp_path
     assert not (tmp_path / "executed").exists()
 
 
-@pytest.mark.slow
-def test_weights_that_are_not_finite_are_rejected(rejected, bundle):
+def test_weights_that_are_not_finite_are_rejected(check_here, rejected, bundle):
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], float("nan"))
     bundle.replace_tensors(save(tensors))
     assert "field.weights holds 390 of 390 values that are NaN" in rejected()
 
 
-@pytest.mark.slow
-def test_overlapping_tensors_are_rejected(rejected, bundle):
+def test_overlapping_tensors_are_rejected(check_here, rejected, bundle):
     header = json.loads(bundle.header_and_data()[0])
     header["gaussians.means"]["data_offsets"] = header["gaussians.log_scales"]["data_offsets"]
     bundle.replace_header(json.dumps(header).encode())
     assert "not a safetensors file" in rejected()
 
 
-@pytest.mark.slow
-def test_a_giant_header_is_rejected(rejected, bundle):
+def test_a_giant_header_is_rejected(check_here, rejected, bundle):
     bundle.replace_tensors(struct.pack("<Q", 2**40) + bundle.tensors.read_bytes()[8:])
     assert "states a header of 1099511627776 bytes" in rejected()
 
 
-@pytest.mark.slow
-def test_tensors_that_the_manifest_does_not_name_are_rejected(rejected, bundle):
+def test_tensors_that_the_manifest_does_not_name_are_rejected(check_here, rejected, bundle):
     bundle.replace_tensors(save(dict(load_bundle(bundle.folder).tensors()) | {"__reduce__": torch.zeros(0)}))
     assert "unknown __reduce__" in rejected()
 
 
-@pytest.mark.slow
-def test_a_nested_manifest_is_rejected(rejected, bundle):
+def test_a_nested_manifest_is_rejected(check_here, rejected, bundle):
     bundle.manifest.write_bytes(b"[" * 100_000 + b"]" * 100_000)
     assert "not valid JSON" in rejected()
 
 
-@pytest.mark.slow
-def test_a_picture_beyond_the_budget_is_rejected_unrendered(rejected, bundle):
+def test_a_picture_beyond_the_budget_is_rejected_unrendered(check_here, rejected, bundle):
     bundle.edit(lambda manifest: manifest["camera"].update(width_px=16384, height_px=4096))
     assert "16384x4096" in rejected()
 
 
-@pytest.mark.slow
-def test_more_gaussians_than_the_file_has_are_rejected(rejected, bundle):
+def test_more_gaussians_than_the_file_has_are_rejected(check_here, rejected, bundle):
     bundle.edit(lambda manifest: manifest["gaussians"].update(count=1_900_000))
     assert "describes" in rejected()
 
 
 @pytest.mark.slow
-def test_a_model_that_shows_nothing_is_rejected(rejected, bundle):
+def test_a_model_that_shows_nothing_is_rejected(check_here, rejected, bundle):
     """Every value is finite, and so is the picture: the Gaussians are moved out of it."""
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], 3e38)

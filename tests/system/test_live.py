@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -39,12 +38,11 @@ def showing(start, source, out):
     process = start("live", source, "--loop", "--out", out)
     for line in process.stderr:
         if line.startswith("live"):
-            time.sleep(0.5)
             return process
     pytest.fail("the process ended before its first picture")
 
 
-def reached(out, frames=5):
+def reached(out, frames=1):
     """The report of a run that has left everything, whole."""
     report = RunReport.read(out / "report.json")
     assert report.run.command == "live" and report.frames.displayed >= frames
@@ -76,7 +74,7 @@ def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start, number):
 
 
 def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
-    done = intrasplat("live", scope, "--loop", "--seconds", "1.5", "--out", tmp_path / "out", "--json")
+    done = intrasplat("live", scope, "--loop", "--seconds", "3", "--out", tmp_path / "out", "--json")
     assert done.code == 0, done.err
     report = reached(tmp_path / "out")
     assert report.run.stop_reason == "end of the time asked for" and not report.run.interrupted
@@ -86,12 +84,12 @@ def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
 
 
 class Dying(RealtimeSource):
-    """A recording whose 90th frame does not come: by then even a busy machine has shown several."""
+    """A recording whose 40th frame does not come. A busy machine has shown at least one by then."""
 
     def frames(self) -> Iterator[Frame]:
         """See `RealtimeSource`."""
         for frame in super().frames():
-            if frame.seq == 90:
+            if frame.seq == 40:
                 raise SourceLost("the scope was pulled out; plug it in again")
             yield frame
 
@@ -114,7 +112,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     observe = Reconstructor.observe
 
     def observing(self, frame, **more):
-        if frame.seq >= 90:
+        if frame.seq >= 40:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
         return observe(self, frame, **more)
 
@@ -127,7 +125,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     sentence = user_sentence(failed.value)
     assert sentence is not None and "there is not enough memory (CUDA out of memory." in sentence
     assert load_bundle(tmp_path / "out" / "model").gaussians.count > 0
-    assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 5
+    assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 1
 
 
 @pytest.mark.slow

@@ -90,15 +90,17 @@ def test_the_cameras_picture_goes_on_while_a_killed_engine_comes_back(served):
     raw = client.pictures("theatre", "raw")
     next(raw)
     os.kill(before["pid"], signal.SIGKILL)
-    longest_s, last_s, began_s = 0.0, time.monotonic(), time.monotonic()
-    while time.monotonic() < began_s + 2:
-        next(raw)
-        now_s = time.monotonic()
-        longest_s, last_s = max(longest_s, now_s - last_s), now_s
+    numbers = set()
+
+    def back():
+        numbers.add(next(raw).header["seq"])
+        found = client.stream("theatre")
+        return found.state == "live" and found.processes["engine"]["pid"] != before["pid"] and found
+
+    after = until(back, log).processes["engine"]
     raw.close()
-    assert longest_s < 1.0  # a picture every 67 ms, on a machine that may be busy
-    after = until(lambda: (found := client.stream("theatre")).state == "live" and found, log).processes["engine"]
-    assert after["pid"] != before["pid"] and after["restarts"] == before["restarts"] + 1
+    assert len(numbers) >= 5, "an engine takes seconds to start, and the camera gives fifteen pictures a second"
+    assert after["restarts"] == before["restarts"] + 1
 
 
 @pytest.fixture(scope="module")

@@ -83,7 +83,7 @@ def shown(port: int, name: str | None) -> bytes:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     with (
-        socket.create_connection(("127.0.0.1", port), timeout=10) as plain,
+        socket.create_connection(("127.0.0.1", port), timeout=300) as plain,
         context.wrap_socket(plain, server_hostname=name) as client,
     ):
         return client.getpeercert(binary_form=True) or b""
@@ -234,7 +234,7 @@ def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatc
     certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)), events)
 
     async def until(count: int) -> None:
-        end_s = time.monotonic() + 20
+        end_s = time.monotonic() + 300
         while audit.head.seq + 1 < count:
             assert time.monotonic() < end_s
             await asyncio.sleep(0.01)
@@ -245,7 +245,7 @@ def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatc
             (tmp_path / "cert.pem").write_bytes(b"")
             await until(1)
             put(tmp_path, pem(new), key_pem(new_key))
-            end_s = time.monotonic() + 20
+            end_s = time.monotonic() + 300
             while certificate.expires_at != new.not_valid_after_utc:
                 assert time.monotonic() < end_s
                 await asyncio.sleep(0.01)

@@ -40,7 +40,7 @@ def ticket(plane, path, role="viewer"):
 
 
 def until(condition):
-    for _ in range(300):
+    for _ in range(30_000):
         if condition():
             return
         time.sleep(0.01)

@@ -45,7 +45,7 @@ def test_a_format_that_there_is_not_is_refused(plane):
 
 
 def settled(plane, number: int) -> dict:
-    for _ in range(200):
+    for _ in range(30_000):
         version = plane.ask("GET", f"{VERSIONS}/{number}").json()
         if version["state"] != "uploaded":
             return version

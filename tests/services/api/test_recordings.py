@@ -20,7 +20,7 @@ def put(plane, body: bytes, role: str = "operator", path: str = CASE, **headers:
 
 
 def settled(plane) -> dict:
-    for _ in range(200):
+    for _ in range(30_000):
         found = plane.ask("GET", CASE).json()
         if found["state"] != "uploaded":
             return found

@@ -179,7 +179,7 @@ def test_logs_are_json_with_the_request_and_without_the_query(served):
     process, port, key = served
     answer, _ = ask(port, "/v1/streams/a/mjpeg?ticket=s3cret", key)
     number = answer.headers["x-request-id"]
-    for _ in range(100):
+    for _ in range(15_000):
         lines = [json.loads(line) for line in process.lines if line.startswith("{") and number in line]
         if lines:
             break
@@ -194,7 +194,7 @@ def test_logs_do_not_have_the_ticket_of_a_websocket(tmp_path, form):
     with serving(tmp_path, "--set", f"log.format={form}") as (process, port, _):
         with pytest.raises(InvalidStatus):
             connect(f"ws://127.0.0.1:{port}/v1/streams/a/display?ticket=s3cret")
-        for _ in range(100):
+        for _ in range(15_000):
             said = [line for line in process.lines if "ticket=" in line]
             if said:
                 break
@@ -302,10 +302,10 @@ def test_a_renewed_certificate_is_taken_without_a_restart(tmp_path):
         with Client(url, key, verify=False) as client:
             before = re.search(r"expiry_timestamp_seconds ([0-9.e+]+)", client.metrics())[1]
             renew(40)
-            end_s = time.monotonic() + 30
+            end_s = time.monotonic() + 300
             while (now := re.search(r"expiry_timestamp_seconds ([0-9.e+]+)", client.metrics())[1]) == before:
                 assert time.monotonic() < end_s
-                time.sleep(0.2)
+                time.sleep(0.02)
             assert float(now) - float(before) == pytest.approx(38 * 86400, abs=3600)
         pem = ssl.get_server_certificate(("127.0.0.1", port))
         assert pem.strip() == (tmp_path / "cert.pem").read_text().strip()

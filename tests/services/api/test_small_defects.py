@@ -64,7 +64,7 @@ def test_slow_uploads_of_one_key_leave_room_for_others(new_plane):
         def upload(self, name, file, digest, by):
             if name == "slow":
                 self.inside.release()
-                assert self.go_on.wait(20)
+                assert self.go_on.wait(300)
             return super().upload(name, file, digest, by)
 
     models = SlowModels()
@@ -77,7 +77,7 @@ def test_slow_uploads_of_one_key_leave_room_for_others(new_plane):
     slow = [threading.Thread(target=put, args=("slow", "operator")) for _ in range(2)]
     for each in slow:
         each.start()
-        assert models.inside.acquire(timeout=20)
+        assert models.inside.acquire(timeout=300)
     assert put("quick", "operator") == 429
     assert put("quick", "admin") == 201
     models.go_on.set()
@@ -105,7 +105,7 @@ def test_what_is_deleted_during_its_check_is_no_error(new_plane, caplog, what, d
     path = "/v1/models/liver/versions" if what == "models" else "/v1/recordings/case"
     headers = {"Content-Type": OCTETS, "Content-Digest": digest(b"GOOD")}
     assert plane.ask("PUT", path, content=b"GOOD", headers=headers).status_code == 201
-    assert checked.wait(20)
+    assert checked.wait(300)
     while plane.control.tasks:
         plane.client.get("/livez")
     errors = [record for record in caplog.records if record.levelno >= logging.ERROR]

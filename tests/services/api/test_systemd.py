@@ -26,7 +26,7 @@ def manager() -> Iterator[tuple[socket.socket, str]]:
     """A socket as systemd has one, and its address."""
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
         heard.bind(f"{folder}/notify")
-        heard.settimeout(20)
+        heard.settimeout(300)
         yield heard, f"{folder}/notify"
 
 
@@ -53,7 +53,7 @@ def test_a_socket_in_the_abstract_name_space_is_found():
     name = f"intrasplat-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
         heard.bind(f"\0{name}")
-        heard.settimeout(5)
+        heard.settimeout(300)
         ServiceManager({"NOTIFY_SOCKET": f"@{name}"}).tell("READY=1", "STATUS=serving")
         assert heard.recv(100) == b"READY=1\nSTATUS=serving"
 

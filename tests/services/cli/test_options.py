@@ -81,7 +81,6 @@ values = st.one_of(
 )  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "option"), [(c, o) for c, options in COMMANDS.items() for o in options if o != "--out"]
 )

@@ -41,7 +41,7 @@ async def published(runtime, every_s: float = 0.01):
 
 def run(scenario) -> None:
     async def within() -> None:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(300):
             await scenario()
 
     asyncio.run(within())

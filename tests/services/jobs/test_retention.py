@@ -51,7 +51,7 @@ def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
             while not (events.entries and store.checked):
                 await asyncio.sleep(0.01)
 
-    asyncio.run(asyncio.wait_for(serve(), 20))
+    asyncio.run(asyncio.wait_for(serve(), 300))
     assert store.asked == [(2 * DAY_S, 10**9)] and store.checked == ["waits"] and store.closed
     assert events.entries == [("recording.expire", "case-1", "done", {"why": "it is older than 2 days"})]
 
@@ -76,7 +76,7 @@ def test_replays_that_ended_go_with_their_results(tmp_path):
             while not events.entries:
                 await asyncio.sleep(0.01)
 
-    asyncio.run(asyncio.wait_for(serve(), 20))
+    asyncio.run(asyncio.wait_for(serve(), 300))
     assert [(event, subject) for event, subject, _, _ in events.entries] == [("replay.expire", ids[0])]
     assert [job.id for job in store.newest()] == [ids[2], ids[1]]
     assert not (results.folder / ids[0]).exists() and (results.folder / ids[1]).exists()

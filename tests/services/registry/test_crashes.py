@@ -1,5 +1,6 @@
 """A process that changes the registry is killed at every step: afterwards the old version is served or the new one, whole, and nothing lies about."""
 
+import multiprocessing
 import os
 import random
 import shutil
@@ -55,11 +56,19 @@ def prepare(folder, files, action, database_url=None):
                 shutil.rmtree(made)
 
 
-def run_dying(*arguments):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [sys.executable, dying.__file__, *map(str, arguments)], env=environment, capture_output=True, text=True
-    )
+@pytest.fixture(scope="module")
+def run_dying():
+    """Run `dying` in forks of a process that has imported it, and return their exit codes."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([dying.__name__])
+
+    def run(*arguments):
+        process = context.Process(target=dying.main, args=[str(argument) for argument in arguments])
+        process.start()
+        process.join(300)
+        return process.exitcode
+
+    return run
 
 
 @pytest.mark.parametrize("action", STEPS)
@@ -72,10 +81,9 @@ def test_every_step_is_known(action, tmp_path, files):
 
 
 @pytest.mark.parametrize(("action", "step"), [(action, step) for action, steps in STEPS.items() for step in steps])
-def test_a_kill_at_a_step_leaves_the_old_or_the_new(action, step, tmp_path, files, database_url):
+def test_a_kill_at_a_step_leaves_the_old_or_the_new(run_dying, action, step, tmp_path, files, database_url):
     prepare(tmp_path, files, action, database_url)
-    died = run_dying(tmp_path, database_url or "", packed_model(files, 2), action, step)
-    assert died.returncode == -9, died.stderr
+    assert run_dying(tmp_path, database_url or "", packed_model(files, 2), action, step) == -9
     happened = action in COMMITTED and STEPS[action].index(step) >= STEPS[action].index(COMMITTED[action])
 
     with ModelRegistry(tmp_path, database_url=database_url, check_program=ALWAYS_READY) as registry:
