@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -28,15 +29,22 @@ def test_no_modules_import_each_other_not_even_in_functions_or_for_type_checkers
 REFERENCE = "gsplat_core.reference"
 
 
-def imported_modules(path: Path) -> set[str]:
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    """Every node of a file's syntax tree."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
+def imported_modules(path: Path) -> frozenset[str]:
     """Every module that a file may import, also inside of functions: `from a import b` counts as a and as a.b."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
+    return frozenset(found)
 
 
 def imported_packages(path: Path) -> set[str]:
@@ -102,7 +110,7 @@ FIELD_NAMES, FIELD_CLASSES = {"basis", "hexplane"}, {"BasisField", "HexPlaneFiel
 
 def named_fields(path: Path) -> set[str]:
     """Return the names of fields in the strings of a file, and their classes in its code."""
-    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    nodes = nodes_of(path)
     strings = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     identifiers = {getattr(node, kind, None) for node in nodes for kind in ("id", "attr", "name")}
     return strings & FIELD_NAMES | {each for each in identifiers if isinstance(each, str)} & FIELD_CLASSES
@@ -161,7 +169,6 @@ def test_import_opens_no_socket_starts_no_process_and_compiles_nothing():
 
 WITHOUT_TORCH = [
     "services.bus.messages",
-    "services.bus.messages",
     "services.bus.pictures",
     "services.bus.runtime",
     "services.supervisor.launcher",
@@ -172,16 +179,11 @@ WITHOUT_TORCH = [
     "services.registry.models",
     "services.recordings.store",
     "services.jobs.pool",
-    "services.jobs.pool",
     "services.jobs.store",
     "services.api.assembly",
-    "services.supervisor.stream",
     "services.api.pages",
-    "services.api.assembly",
     "services.exports.snapshots",
-    "services.supervisor.stream",
     "services.exports.cache",
-    "services.exports.snapshots",
     "services.client",
     "services.audit",
     "services.api",

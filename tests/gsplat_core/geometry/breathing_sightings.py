@@ -12,19 +12,24 @@ from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swayin
 
 
 def seen_for(
-    length_s: float, breathes: float = 1.0, rate_hz: float = 10.0, noise_px: float = 0.2, pulled: int = 0
+    length_s: float,
+    breathes: float = 1.0,
+    rate_hz: float = 10.0,
+    noise_px: float = 0.2,
+    pulled: int = 0,
+    points: int = 300,
 ) -> tuple[Sightings, NDArray[np.float64]]:
-    """Return the observations and the true poses. `pulled` is the number of points with irregular motion of their own."""
+    """Return the observations of a number of points and the true poses. `pulled` points have irregular motion of their own."""
     times_s = np.arange(0, length_s, 1 / rate_hz)
-    poses, points = swaying(times_s), places(times_s, breathes)
-    points[:, :pulled] += 6 * np.clip(np.sin(times_s**1.7), 0, 1)[:, None, None] * np.array([0.5, 0.3, -0.8])
-    tracks = tracks_of(points, poses, times_s, noise_px)
+    poses, at = swaying(times_s), places(times_s, breathes, points)
+    at[:, :pulled] += 6 * np.clip(np.sin(times_s**1.7), 0, 1)[:, None, None] * np.array([0.5, 0.3, -0.8])
+    tracks = tracks_of(at, poses, times_s, noise_px)
     frame, point = np.nonzero(tracks.seen)
-    taken = np.stack([pose @ rigid(points[0], each) for pose, each in zip(poses, points, strict=True)])
+    taken = np.stack([pose @ rigid(at[0], each) for pose, each in zip(poses, at, strict=True)])
     taken[:, :3, 3] /= DISTANCE
     sightings = Sightings(
         torch.from_numpy(frame), torch.from_numpy(point), torch.from_numpy(tracks.rays[frame, point]),
-        torch.from_numpy(times_s), torch.from_numpy(taken), torch.from_numpy(points[0] / DISTANCE),
+        torch.from_numpy(times_s), torch.from_numpy(taken), torch.from_numpy(at[0] / DISTANCE),
     )  # fmt: skip
     return sightings, poses
 
