@@ -221,7 +221,21 @@ class SynthesizeOptions:
     height: Annotated[int, typer.Option(help="Height in pixels.")] = 256
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0
     seed: SeedOption = 0
-    moving_camera: Annotated[bool, typer.Option("--moving-camera/--fixed-camera", help="Let the scope move.")] = False
+    random: Annotated[
+        bool,
+        typer.Option(
+            "--random",
+            help="Draw every property of tissue, scope, tools, camera and air from the seed; options fix one.",
+        ),
+    ] = False
+    moving_camera: Annotated[
+        bool | None,
+        typer.Option("--moving-camera/--fixed-camera", help="Motion of the scope; fixed, or drawn by --random."),
+    ] = None
+    stereo: Annotated[
+        bool | None,
+        typer.Option("--stereo/--mono", help="Second eye; written, or drawn by --random. --mono may have distortion."),
+    ] = None
     scene: Annotated[
         str, typer.Option(help="open (a sheet of tissue with a tool) or colon (a tube along its axis).")
     ] = "open"
@@ -231,22 +245,35 @@ class SynthesizeOptions:
     flow: Annotated[bool, typer.Option("--flow", help="Optical flow and scene flow to the next frame.")] = False
     tracks: Annotated[bool, typer.Option("--tracks", help="Which of the followed points each frame sees.")] = False
     behind: Annotated[bool, typer.Option("--behind", help="Pictures and depth of the tissue behind the tool.")] = False
-    smoke: Annotated[float, typer.Option(help="Smoke that comes and goes: 0 none, 1 dense.")] = 0.0
+    smoke: Annotated[
+        float | None, typer.Option(help="Smoke that comes and goes: 0 none, 1 dense; none, or drawn by --random.")
+    ] = None
     depth_noise: Annotated[
         float, typer.Option(metavar="MM", help="Noise of the depth at 74 mm; the true one is kept in true_depth.")
     ] = 0.0
-    exposure_changes: Annotated[bool, typer.Option("--exposure-changes", help="Let the exposure go up and down.")] = (
-        False
-    )
+    exposure_changes: Annotated[
+        bool | None,
+        typer.Option(
+            "--exposure-changes/--constant-exposure", help="Changes of the exposure; none, or drawn by --random."
+        ),
+    ] = None
     breathing_ratio: Annotated[
-        float, typer.Option(help="Duration of expiration over that of inspiration; 2 is usual at rest.")
-    ] = 1.0
+        float | None,
+        typer.Option(
+            help="Duration of expiration over that of inspiration; 2 is usual at rest. 1, or drawn by --random."
+        ),
+    ] = None
     rate_wander: Annotated[
-        float, typer.Option(help="Largest deviation of the breathing rate, as a share of it: 0.15 is ±15 %.")
-    ] = 0.0
+        float | None,
+        typer.Option(help="Largest deviation of the breathing rate, as a share of it: 0.15 is ±15 %. 0, or drawn."),
+    ] = None
     scope_path: Annotated[
-        str, typer.Option(help="Way of a moving scope: usual (of every seed) or seeded (another one for each seed).")
-    ] = "usual"
+        str | None,
+        typer.Option(
+            help="Path of a moving scope: usual (of every seed), seeded (another one for each seed); with --random also"
+            " hand-held, translation, rotation or insertion."
+        ),
+    ] = None
 
 
 def takes_options(kind: type[Section], command: Command) -> Callable[[Callable[..., int]], Callable[..., int]]:

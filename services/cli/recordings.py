@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import typer
@@ -13,7 +13,8 @@ from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.recording import FileRecording
-from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
+from gsplat_core.io.recordings.synthetic.random_scene import draw_scene
 from gsplat_core.poses.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
 from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
@@ -191,13 +192,32 @@ def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) 
         flow=options.flow,
         tracks=options.tracks,
         behind=options.behind,
-        smoke=options.smoke,
         depth_noise_mm=options.depth_noise,
-        exposure_changes=options.exposure_changes,
-        breathing_ratio=options.breathing_ratio,
-        rate_wander=options.rate_wander,
-        scope_path=options.scope_path,
     )
+    drawn = None
+    if options.random:
+        drawn = draw_scene(
+            options.seed,
+            scene=options.scene,
+            moving=options.moving_camera,
+            stereo=options.stereo,
+            distorted=False if options.flow else None,
+            smoke=options.smoke,
+            exposure=options.exposure_changes,
+            breathing_ratio=options.breathing_ratio,
+            rate_wander=options.rate_wander,
+            scope_path=options.scope_path,
+        )
+        extras = replace(extras, scope_path=options.scope_path if options.scope_path == "seeded" else CLEAR.scope_path)
+    else:
+        given = {
+            "smoke": options.smoke,
+            "exposure_changes": options.exposure_changes,
+            "breathing_ratio": options.breathing_ratio,
+            "rate_wander": options.rate_wander,
+            "scope_path": options.scope_path,
+        }
+        extras = replace(extras, **{name: value for name, value in given.items() if value is not None})
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as show:
 
         def progress(done: int, total: int) -> None:
@@ -215,7 +235,9 @@ def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) 
                 fps=options.fps,
                 seed=options.seed,
                 camera="moving" if options.moving_camera else "fixed",
+                stereo=options.stereo is not False,
                 extras=extras,
+                drawn=drawn,
                 progress=progress,
             )
     recording = open_recording(out)

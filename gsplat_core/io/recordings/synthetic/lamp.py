@@ -22,6 +22,18 @@ SHADOW_MM = (0.0, -7.0, 0.0)
 
 
 @dataclass(frozen=True)
+class LampPlan:
+    """Positions of the fibres in mm around the centre of the scope's tip, and width of their beam."""
+
+    lights_mm: tuple[tuple[float, float, float], tuple[float, float, float]] = LIGHTS_MM
+    beam: float = 2.0
+    """Exponent of the cosine of the angle from the beam axis; larger values darken the picture's corners."""
+
+
+USUAL_LAMP = LampPlan()
+
+
+@dataclass(frozen=True)
 class Lamp:
     """Geometry of the light source in mm, in the coordinates of the rendering camera."""
 
@@ -33,18 +45,21 @@ class Lamp:
     """Origin of the shadow rays in mm, [3]."""
     reference_mm: float = REFERENCE_MM
     """Reference distance in mm that sets the exposure."""
+    beam: float = 2.0
+    """Exponent of the cosine of the angle from the beam axis."""
 
     @classmethod
-    def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM) -> Lamp:
+    def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM, plan: LampPlan = USUAL_LAMP) -> Lamp:
         """Return the light source for an eye that looks in the scope's direction.
 
         Args:
             scope_x_mm: x coordinate of the centre of the scope's tip.
             reference_mm: distance at which a white surface has radiance 1.
+            plan: positions and beam of the fibres.
         """
-        fibres = np.array(LIGHTS_MM, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
+        fibres = np.array(plan.lights_mm, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
         above = fibres.mean(axis=0) + np.array(SHADOW_MM, np.float32)
-        return cls(fibres, np.array([0, 0, 1], np.float32), above, reference_mm)
+        return cls(fibres, np.array([0, 0, 1], np.float32), above, reference_mm, plan.beam)
 
     def seen_from(self, eye_to_view: NDArray[np.float64]) -> Lamp:
         """Return the light source in the coordinates of another camera.
@@ -78,5 +93,5 @@ class Lamp:
                 distance2 = np.maximum(distance2, np.float32(nearest_mm2))
             along = np.clip(-(to_light @ self.axis), 0, 1)
             # A fibre's light falls off with the angle from the beam axis.
-            found.append((to_light, np.float32(0.5 * self.reference_mm**2) / distance2 * along**2))
+            found.append((to_light, np.float32(0.5 * self.reference_mm**2) / distance2 * along**self.beam))
         return found

@@ -6,6 +6,7 @@ exact and not that of a mesh. A pixel (column i, row j) has its centre at (i + 0
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.synthetic.air import Air
 from gsplat_core.io.recordings.synthetic.lamp import Lamp
+from gsplat_core.io.recordings.synthetic.sensor import RadialLens, develop
 from gsplat_core.io.recordings.synthetic.tissue import SurfacePoints, Tissue, Tug
-from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, Part, distance, trace
+from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, USUAL_PLAN, Part, ToolLook, distance, trace
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.floating]
@@ -35,6 +37,7 @@ def shade_tissue(
 
     Combines scattering that bleeds red with a wet film over a fine relief.
     """
+    look = tissue.look
     reflectance, slope = tissue.texture.sample(u, v)
     turn = camera.world_to_camera[:3, :3].T.astype(np.float32)
     along_u = np.stack(points.along_u, axis=-1) @ turn
@@ -49,11 +52,14 @@ def shade_tissue(
         half = _unit(to_light - rays)
         shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
         light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
-        light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
+        light_wet += power * (
+            np.float32(look.glint) * shine ** np.float32(look.glint_power)
+            + np.float32(look.sheen) * shine ** np.float32(look.sheen_power)
+        )
     shade = _tool_shade(parts, camera, local, lamp)
     diffuse = (light_diffuse * shade)[..., None]
     # Light scattered inside tissue emerges red. Add red where little direct light arrives.
-    bleed = np.array([0.060, 0.014, 0.010], np.float32) * np.sqrt(np.maximum(diffuse, 0))
+    bleed = np.array(look.bleed, np.float32) * np.sqrt(np.maximum(diffuse, 0))
     wet = (light_wet * shade * reflectance[..., 3])[..., None] * np.array([1.0, 0.97, 0.93], np.float32)
     return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)
 
@@ -87,16 +93,18 @@ def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
     return np.asarray((1 - weight) * wide[low] + weight * wide[high], np.float32)
 
 
-def shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lamp: Lamp) -> Array:
+def shade_tool(
+    at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lamp: Lamp, look: ToolLook = USUAL_PLAN.look
+) -> Array:
     """Return the linear radiance [N, 3] of the tool.
 
-    The shaft is dark polymer, the jaws are brushed steel reflecting pink surroundings.
+    The shaft is usually polymer, the jaws are brushed steel reflecting pink surroundings.
     """
-    metal = (material != SHAFT)[:, None]
-    base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
-    base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
-    gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
-    glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))
+    metal = ((material != SHAFT) | look.metal_shaft)[:, None]
+    base = np.where((material != SHAFT)[:, None], np.array(look.steel, np.float32), np.array(look.shaft, np.float32))
+    base = np.where((material == RING)[:, None], np.array(look.ring, np.float32), base)
+    gloss = np.where(metal[:, 0], np.float32(look.gloss), np.float32(14))
+    glint = np.where(metal[:, 0], np.float32(look.glint), np.float32(0.16))
     total = np.zeros((len(at), 3), np.float32)
     for to_light, power in lamp.rays_to(at, nearest_mm2=400):
         facing = np.clip(np.einsum("ni,ni->n", normal, to_light), 0, 1)
@@ -112,13 +120,6 @@ def shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8]
 
 def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.sqrt(np.einsum("...i,...i->...", vector, vector))[..., None], np.float32)
-
-
-def develop(radiance: Array) -> NDArray[np.uint8]:
-    """Convert radiance to a picture: soft-shoulder tone curve, then sRGB (IEC 61966-2-1)."""
-    exposed = 1 - np.exp(np.float32(-1.45) * radiance)
-    curve = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.asarray(np.clip(np.round(255 * curve), 0, 255), np.uint8)
 
 
 NEWTON_STEPS = 6
@@ -143,28 +144,32 @@ class Eye:
 def render_eye(
     tissue: Tissue,
     tug: Tug,
-    parts: list[Part],
+    tools: Sequence[tuple[list[Part], ToolLook]],
     camera: Camera,
     time_s: float,
     lamp: Lamp,
     air: Air | None = None,
     *,
     transparent: bool = False,
+    lens: RadialLens | None = None,
+    after: Callable[[Array, Array], NDArray[np.uint8]] | None = None,
 ) -> Eye:
     """Render one camera's view of the scene at a time.
 
     Args:
         tissue: deforming tissue.
         tug: pull of the tool on the tissue.
-        parts: capsules that make up the tool.
+        tools: capsules and look of each tool.
         camera: camera with its pose.
         time_s: time in seconds.
         lamp: light source in the camera's coordinates; the same light serves all cameras.
         air: smoke and exposure; None for clear air and constant exposure.
         transparent: omit the tools from the picture but keep their shadow on the tissue.
+        lens: distortion of the lens; None for a pinhole.
+        after: function that turns radiance [H, W, 3] and depth [H, W] into a picture; None for `develop`.
     """
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-    ray_x, ray_y = pixel_rays(camera)
+    ray_x, ray_y = pixel_rays(camera) if lens is None else lens.rays(camera)
     u, v, points = cast_tissue(tissue, tug, camera, ray_x, ray_y, time_s)
     position = np.stack(points.position, axis=-1)
     local = position @ rotation.T.astype(np.float32) + translation.astype(np.float32)
@@ -173,30 +178,28 @@ def render_eye(
     length = np.sqrt(ray_x * ray_x + ray_y * ray_y + 1)
     rays = np.stack([ray_x / length, ray_y / length, 1 / length], axis=-1)
     world_rays = (rays @ rotation.astype(np.float32)).reshape(-1, 3)
-    hits = trace(
-        [] if transparent else parts,
-        camera.position,
-        world_rays,
-        (tissue_depth * length).ravel(),
-        1 / float(camera.K[0, 0]),
-    )
     shape = tissue_depth.shape
-    tool_depth = hits.distance_mm.reshape(shape) / length
-    cover = hits.cover.reshape(shape)
-
-    radiance = shade_tissue(tissue, u, v, points, local, rays, parts, camera, lamp)
-    touched = cover > 0
-    if touched.any():
-        normal = hits.normal.reshape(*shape, 3)[touched] @ rotation.T.astype(np.float32)
-        reach = np.where(np.isfinite(tool_depth), tool_depth, tissue_depth * np.float32(0.9))[touched]
-        at = rays[touched] * (reach * length[touched])[:, None]
-        steel = shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lamp)
-        share = cover[touched][:, None]
-        radiance[touched] = (1 - share) * radiance[touched] + share * steel
-    depth = np.minimum(tissue_depth, tool_depth).astype(np.float32)
+    every_part = [part for parts, _ in tools for part in parts]
+    radiance = shade_tissue(tissue, u, v, points, local, rays, every_part, camera, lamp)
+    depth, tool = tissue_depth, np.zeros(shape, np.bool_)
+    for parts, look in [] if transparent else tools:
+        hits = trace(parts, camera.position, world_rays, (depth * length).ravel(), 1 / float(camera.K[0, 0]))
+        tool_depth = hits.distance_mm.reshape(shape) / length
+        cover = hits.cover.reshape(shape)
+        touched = cover > 0
+        if touched.any():
+            normal = hits.normal.reshape(*shape, 3)[touched] @ rotation.T.astype(np.float32)
+            reach = np.where(np.isfinite(tool_depth), tool_depth, depth * np.float32(0.9))[touched]
+            at = rays[touched] * (reach * length[touched])[:, None]
+            steel = shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lamp, look)
+            share = cover[touched][:, None]
+            radiance[touched] = (1 - share) * radiance[touched] + share * steel
+        depth, tool = np.minimum(depth, tool_depth).astype(np.float32), tool | touched
+    depth = depth.astype(np.float32)
     if air is not None:
         radiance = air.through(radiance, camera, ray_x, ray_y, depth, lamp, time_s)
-    return Eye(image=develop(radiance), depth=depth, tool=touched, tissue_depth=tissue_depth, u=u, v=v)
+    image = develop(radiance) if after is None else after(radiance, depth)
+    return Eye(image=image, depth=depth, tool=tool, tissue_depth=tissue_depth, u=u, v=v)
 
 
 def pixel_rays(camera: Camera) -> tuple[Array, Array]:

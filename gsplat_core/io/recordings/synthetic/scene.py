@@ -5,8 +5,9 @@ Each frame can be rendered independently.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,54 +15,23 @@ from numpy.typing import NDArray
 from gsplat_core.io.recordings.synthetic.air import Air
 from gsplat_core.io.recordings.synthetic.colon import Colon
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
-from gsplat_core.io.recordings.synthetic.lamp import Lamp
+from gsplat_core.io.recordings.synthetic.lamp import USUAL_LAMP, Lamp
+from gsplat_core.io.recordings.synthetic.particles import Particles
+from gsplat_core.io.recordings.synthetic.paths import USUAL_SWAY, Sway, looking, rigid
+from gsplat_core.io.recordings.synthetic.random_scene import RandomScene
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
+from gsplat_core.io.recordings.synthetic.sensor import RadialLens
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Tissue, Tug
-from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, Part, ToolMotion
+from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, USUAL_PLAN, Part, ToolLook, ToolMotion
 from gsplat_core.scene.cameras import Camera
 
 BASELINE_MM = 4.4
 THIRD_MM = (-7.0, -5.0, 3.0)
 """Position of the third camera in the left camera's coordinates, in mm."""
 View = Literal["left", "right", "third"]
+VIEWS: tuple[View, ...] = get_args(View)
+Array = NDArray[np.floating]
 SCENES: dict[str, type[Tissue]] = {"open": Tissue, "colon": Colon}
-
-
-@dataclass(frozen=True)
-class Sway:
-    """Trajectory of a moving scope: a sine along each axis and a sinusoidal roll, all 0 at time 0."""
-
-    periods_s: tuple[float, float, float, float] = (4.1, 5.3, 6.7, 4.7)
-    """Periods in seconds of the motion along x, y and z, and of the roll."""
-    reaches: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    """Factors on the usual amplitudes."""
-    phases: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-
-    @classmethod
-    def seeded(cls, rng: np.random.Generator) -> Sway:
-        """Draw another trajectory: 0.7 to 1.5 times the usual periods, 0.6 to 1.3 times the amplitudes.
-
-        Phases are random.
-        """
-        periods = np.array(cls.periods_s) * rng.uniform(0.7, 1.5, 4)
-        return cls(
-            *(tuple(each.tolist()) for each in (periods, rng.uniform(0.6, 1.3, 4), rng.uniform(0, 2 * np.pi, 4)))
-        )
-
-    def at(self, time_s: float, sway_mm: tuple[float, float, float]) -> tuple[NDArray[np.float64], float]:
-        """Return the centre [3] in mm and the roll in radians, for the usual amplitudes along x, y and z."""
-        turn = 2 * np.pi * time_s
-        ways = [
-            most * reach * (np.sin(turn / period + phase) - np.sin(phase))
-            for most, reach, period, phase in zip(
-                (*sway_mm, USUAL_ROLL), self.reaches, self.periods_s, self.phases, strict=True
-            )
-        ]
-        return np.array(ways[:3]), float(ways[3])
-
-
-USUAL_ROLL = 0.05
-USUAL_SWAY = Sway()
 
 
 @dataclass(frozen=True)
@@ -73,14 +43,32 @@ class SyntheticScene:
     camera: Camera
     moving: bool
     air: Air | None = None
-    sway: Sway = field(default_factory=lambda: USUAL_SWAY)
+    sway: Sway = USUAL_SWAY
     """Amplitudes and periods of a moving scope's sway."""
+    drawn: RandomScene | None = None
+    """Random properties; None for the usual scene."""
+    others: tuple[ToolMotion, ...] = ()
+    """Tools that do not pull the tissue."""
+    lens: RadialLens | None = None
+    particles: Particles | None = None
 
     @classmethod
     def from_seed(
-        cls, seed: int, width_px: int, height_px: int, duration_s: float, moving: bool, extras: Extras = CLEAR
+        cls,
+        seed: int,
+        width_px: int,
+        height_px: int,
+        duration_s: float,
+        moving: bool,
+        extras: Extras = CLEAR,
+        drawn: RandomScene | None = None,
     ) -> SyntheticScene:
-        """Create the scene of a seed; the picture size does not change the scene."""
+        """Create the scene of a seed; the picture size does not change the scene.
+
+        `drawn` replaces the usual properties by random ones, including the motion of the scope and the smoke.
+        """
+        if drawn is not None:
+            return cls._random(width_px, height_px, duration_s, extras, drawn)
         kind = SCENES[extras.scene]
         camera = Camera.from_focal(kind.focal_factor * max(width_px, height_px), width_px, height_px)
         seeds = np.random.SeedSequence(seed).spawn(3)
@@ -95,6 +83,42 @@ class SyntheticScene:
         sway = Sway.seeded(path) if extras.scope_path == "seeded" else USUAL_SWAY
         return cls(tissue, ToolMotion(tool, cycles=int(duration_s // CYCLE_S) + 1), camera, moving, air, sway)
 
+    @classmethod
+    def _random(
+        cls, width_px: int, height_px: int, duration_s: float, extras: Extras, drawn: RandomScene
+    ) -> SyntheticScene:
+        side = max(width_px, height_px)
+        camera = Camera.from_focal(drawn.focal * side, width_px, height_px)
+        seeds = np.random.SeedSequence((drawn.seed, 27)).spawn(6)
+        rngs = [np.random.default_rng(child) for child in seeds]
+        texel_mm = min(0.6 * TISSUE_DISTANCE_MM / (SCENES[drawn.scene].focal_factor * side), 0.3)
+        tissue = SCENES[drawn.scene](rngs[0], texel_mm, drawn.look, drawn.shape)
+        tissue.breathing, tissue.exposed_mm, tissue.tools = drawn.breathing, drawn.exposed_mm, bool(drawn.tools)
+        if drawn.scene == "open":
+            tissue.looked_at_mm = drawn.shape.distance_mm
+        cycles = lambda plan: int(duration_s // plan.cycle_s) + 1
+        tools = [ToolMotion(rngs[1], cycles(plan), plan) for plan in drawn.tools or (USUAL_PLAN,)]
+        particles = None
+        if drawn.particles:
+            particles = Particles.drawn(rngs[2], drawn.particles, drawn.particle_mm, drawn.shape.distance_mm)
+        return cls(
+            tissue,
+            tools[0],
+            camera,
+            drawn.moving,
+            Air.from_seed(seeds[3], drawn.smoke, False) if drawn.smoke else None,
+            Sway.seeded(rngs[4]) if extras.scope_path == "seeded" else USUAL_SWAY,
+            drawn,
+            tuple(tools[1:]),
+            RadialLens.from_corner(camera, *drawn.lens) if any(drawn.lens) else None,
+            particles,
+        )
+
+    @property
+    def baseline_mm(self) -> float:
+        """Distance between the eyes in mm."""
+        return BASELINE_MM if self.drawn is None else self.drawn.baseline_mm
+
     def camera_at(self, time_s: float, view: View = "left") -> Camera:
         """Return a camera at a time; the left camera at time 0 is at the world's origin."""
         left = self._left_at(time_s)
@@ -104,18 +128,20 @@ class SyntheticScene:
         """Return the left camera: at rest, or swaying around a fixed point on the tissue."""
         if not self.moving:
             return self.camera
+        if self.drawn is not None and self.drawn.path is not None:
+            return self.camera.with_pose(self.drawn.path.pose(time_s))
         centre, roll = self.sway.at(time_s, self.tissue.sway_mm)
-        rotation = _looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, roll)
-        return self.camera.with_pose(_pose(rotation, centre))
+        rotation = looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, roll)
+        return self.camera.with_pose(rigid(rotation, centre))
 
     def left_to(self, view: View) -> NDArray[np.float64]:
         """Return the rigid transform [4, 4] from the left camera to another camera of the same scope."""
         if view == "left":
             return np.eye(4)
         if view == "right":
-            return self.camera.right_eye(BASELINE_MM).world_to_camera
+            return self.camera.right_eye(self.baseline_mm).world_to_camera
         centre = np.array(THIRD_MM)
-        return _pose(_looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.0), centre)
+        return rigid(looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.0), centre)
 
     def render(self, time_s: float, view: View = "left", transparent: bool = False) -> Eye:
         """Render one camera's view at a time.
@@ -125,39 +151,75 @@ class SyntheticScene:
             view: camera to render.
             transparent: omit the tools but keep their shadow on the tissue.
         """
-        reference_mm = self.tissue.exposed_mm
+        reference_mm, half_mm = self.tissue.exposed_mm, self.baseline_mm / 2
+        plan = USUAL_LAMP if self.drawn is None else self.drawn.lamp
         if view == "third":
-            lamp = Lamp.of_eye(BASELINE_MM / 2, reference_mm).seen_from(self.left_to(view))
+            lamp = Lamp.of_eye(half_mm, reference_mm, plan).seen_from(self.left_to(view))
         else:
-            lamp = Lamp.of_eye(BASELINE_MM / 2 if view == "left" else -BASELINE_MM / 2, reference_mm)
+            lamp = Lamp.of_eye(half_mm if view == "left" else -half_mm, reference_mm, plan)
         camera = self.camera_at(time_s, view)
-        tug, parts = self.tug(time_s), self.parts(time_s)
-        return render_eye(self.tissue, tug, parts, camera, time_s, lamp, self.air, transparent=transparent)
+        draw = lambda lens, after: render_eye(
+            self.tissue, self.tug(time_s), self.tools(time_s), camera, time_s, lamp, self.air,
+            transparent=transparent, lens=lens, after=after,
+        )  # fmt: skip
+        if self.drawn is None:
+            return draw(None, None)
+
+        def picture(radiance: Array, depth: Array) -> NDArray[np.uint8]:
+            assert self.drawn is not None
+            if self.particles is not None:
+                radiance = self.particles.over(radiance, depth, camera, lamp, time_s)
+            noise = np.random.default_rng((self.drawn.seed, round(time_s * 1e6), VIEWS.index(view), 28))
+            return self.drawn.sensor.picture(np.float32(self.exposure_at(time_s)) * radiance, noise)
+
+        eye = draw(None if view == "third" else self.lens, picture)
+        inside = self.inside
+        return eye if inside is None else replace(eye, depth=np.where(inside, eye.depth, 0), tool=eye.tool & inside)
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_] | None:
+        """Pixels inside of the field of view, bool [H, W]; None if all are."""
+        if self.drawn is None or self.drawn.sensor.field.kind == "full":
+            return None
+        inside = self.drawn.sensor.field.mask(self.camera.width_px, self.camera.height_px)
+        return None if inside.all() else inside
+
+    def exposure_at(self, time_s: float) -> float:
+        """Return the exposure factor at a time."""
+        if self.drawn is None:
+            return 1.0 if self.air is None else self.air.exposure_at(time_s)
+        exposure = self.drawn.sensor.exposure
+        if exposure.kind == "drift":
+            waves = zip(exposure.stops, exposure.periods_s, strict=True)
+            return float(2 ** sum(stops * np.sin(2 * np.pi * time_s / period) for stops, period in waves))
+        if exposure.kind == "automatic":
+            before_s = max(0.0, time_s - exposure.delay_s)
+            return float((self._distance(before_s) / self._distance(0.0)) ** (2 * exposure.gain))
+        return 1.0
+
+    def _distance(self, time_s: float) -> float:
+        """Return the distance in mm between the scope and the tissue that it looked at in the beginning."""
+        if self.drawn is not None and self.drawn.scene != "open":
+            return self.tissue.looked_at_mm - float(self.camera_at(time_s).position[2])
+        at = self.tissue.position((0.0, 0.0), time_s, NO_TUG)
+        return float(np.linalg.norm(at - self.camera_at(time_s).position))
 
     def tug(self, time_s: float) -> Tug:
         """Return the tool's pull on the tissue at a time."""
         return self.motion.tug(time_s) if self.tissue.tools else NO_TUG
 
-    def parts(self, time_s: float) -> list[Part]:
-        """Return the capsules of the tool at a time; empty in scenes without a tool."""
-        return self.motion.parts(self.tissue, time_s) if self.tissue.tools else []
+    def tools(self, time_s: float) -> list[tuple[list[Part], ToolLook]]:
+        """Return the capsules and the look of each tool at a time; empty in scenes without a tool."""
+        if not self.tissue.tools:
+            return []
+        tug = self.tug(time_s)
+        return [(motion.parts(self.tissue, time_s, tug), motion.plan.look) for motion in (self.motion, *self.others)]
 
     def track(self, time_s: float) -> NDArray[np.float32]:
         """Return a grid of material points in the world [63, 3] in mm."""
         u, v = np.meshgrid(np.linspace(-32, 32, 9, dtype=np.float32), np.linspace(-24, 24, 7, dtype=np.float32))
+        if self.drawn is not None and self.drawn.scene == "open":  # the same part of the picture
+            share = self.tissue.focal_factor / self.drawn.focal * self.drawn.shape.distance_mm / TISSUE_DISTANCE_MM
+            u, v = np.float32(share) * u, np.float32(share) * v
         points = self.tissue.points(u.ravel(), v.ravel(), time_s, self.tug(time_s))
         return np.stack(points.position, axis=1)
-
-
-def _looking(towards: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
-    """Return the rotation of a camera looking in a direction; its rows are the camera's axes."""
-    forward = towards / np.linalg.norm(towards)
-    right = np.cross([-np.sin(roll), np.cos(roll), 0], forward)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
-
-
-def _pose(rotation: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
-    return pose

@@ -6,6 +6,7 @@ masks/frame-000000.mask.png          255 = tool
 depth/frame-000000.depth.png         16 bit, units of 0.01 mm: first surface hit, tool or tissue
 poses_bounds.npy                     camera-to-world, size, focal length, near and far depth
 tracks.npy                           float32 [frames, points, 3]: tissue points in the world, mm
+valid_mask.png                       255 = inside of a circular or octagonal field of view, if there is one
 recording.json                       frame rate, camera, units, seed, description of the files
 
 Additional files, by field of `Extras`:
@@ -25,7 +26,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,8 +38,10 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.files import PartialFolder, read_regular
 from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
+from gsplat_core.io.recordings.synthetic.random_scene import RandomScene
 from gsplat_core.io.recordings.synthetic.renderer import Eye
-from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
+from gsplat_core.io.recordings.synthetic.sensor import RadialLens
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM
 from gsplat_core.io.recordings.synthetic.truth import motion_to, seen_points
 from gsplat_core.io.recordings.truth import VIEWS_FILE, VIEWS_FORMAT, VIEWS_VERSION
@@ -50,7 +53,7 @@ _FRAME = r"frame-\d{6}\."
 _WRITTEN = re.compile(
     rf"(views/third/)?(images/{_FRAME}color|masks/{_FRAME}mask|depth/{_FRAME}depth)\.png"
     rf"|images_right/{_FRAME}color\.png|true_depth/{_FRAME}depth\.png|(scene_)?flow/\d{{6}}\.npy"
-    r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json"
+    r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json|valid_mask\.png"
 )
 """Pattern of the files written by `synthesize`."""
 _FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for name in ("images", "masks", "depth")) | {
@@ -115,6 +118,7 @@ def _made_here(description: Path) -> bool:
 
 
 DEPTH_UNIT_MM = 0.01
+VALID_MASK_FILE = "valid_mask.png"
 
 
 @dataclass(frozen=True)
@@ -172,11 +176,14 @@ class FrameFiles:
         row = np.zeros((3, 5))
         row[:, :3], row[:, 3] = view.world_to_camera[:3, :3].T, view.position
         row[:, 4] = view.height_px, view.width_px, view.K[0, 0]
-        pose_bounds = np.concatenate([row.ravel(), [left.depth.min(), left.depth.max()]])
+        known = left.depth if scene.inside is None else left.depth[scene.inside]
+        pose_bounds = np.concatenate([row.ravel(), [known.min(), known.max()]])
         return FrameRow(pose_bounds, scene.track(time_s), seen_points(scene, left, time_s) if extras.tracks else None)
 
     def finish(self, rows: list[FrameRow]) -> None:
         """Write the files shared by all frames."""
+        if self.scene.inside is not None:
+            _save(self.folder / VALID_MASK_FILE, np.where(self.scene.inside, 255, 0).astype(np.uint8))
         np.save(self.folder / "poses_bounds.npy", np.stack([row.pose_bounds for row in rows]))
         np.save(self.folder / "tracks.npy", np.stack([row.track for row in rows]).astype(np.float32))
         if self.extras.tracks:
@@ -264,16 +271,18 @@ def describe(files: FrameFiles, frames: int) -> None:
         "frames": frames,
         "fps": files.fps,
         "units": "mm",
-        "camera": _intrinsics(scene.camera),
+        "camera": _intrinsics(scene.camera) | _distortion(scene.lens),
         "camera_moves": scene.moving,
         "depth_unit_mm": DEPTH_UNIT_MM,
-        "stereo_baseline_mm": BASELINE_MM if files.stereo else None,
+        "stereo_baseline_mm": scene.baseline_mm if files.stereo else None,
         "ground_truth": meaning,
     }
     if extras != CLEAR:
         description["made_with"] = extras.described()
-    if extras.exposure_changes and scene.air is not None:
-        description["exposure"] = [scene.air.exposure_at(index / files.fps) for index in range(frames)]
+    if extras.exposure_changes or scene.drawn is not None:
+        description["exposure"] = [scene.exposure_at(index / files.fps) for index in range(frames)]
+    if scene.drawn is not None:
+        description["random"] = scene.drawn.described()
     _write_json(files.folder / "recording.json", description)
     if extras.third:
         third = {
@@ -298,6 +307,10 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
         "cx": float(camera.K[0, 2]),
         "cy": float(camera.K[1, 2]),
     }
+
+
+def _distortion(lens: RadialLens | None) -> dict[str, Any]:
+    return {} if lens is None else {"distortion": lens.coefficients}
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
@@ -325,17 +338,24 @@ def synthesize(
     camera: Literal["fixed", "moving"] = "fixed",
     stereo: bool = True,
     extras: Extras = CLEAR,
+    drawn: RandomScene | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write a synthetic recording with exact ground truth into the folder `out` and return the folder.
 
     Equal arguments give equal bytes. The folder appears once complete. A folder written by an earlier call is replaced;
-    any other non-empty folder is refused. `progress(done, frames)` is called after each frame.
+    any other non-empty folder is refused. `progress(done, frames)` is called after each frame. `drawn` (`draw_scene`)
+    gives the scene random properties; its seed, `moving` and `stereo` replace `seed`, `camera` and `stereo`.
 
     Raises:
-        InvalidSetting: if an argument is out of range, or `out` has foreign content, is a link or is the root of a
+        InvalidSetting: if an argument is out of range, if flow is requested of a distorted lens, or `out` has foreign content, is a link or is the root of a
             disk.
     """
+    if drawn is not None:
+        seed, camera, stereo = drawn.seed, "moving" if drawn.moving else "fixed", drawn.stereo
+        extras = replace(extras, scene=drawn.scene)
+        if any(drawn.lens) and (extras.flow or stereo):
+            raise InvalidSetting("a distorted lens has neither flow nor a second eye; draw a scene without distortion")
     check_arguments(frames, width_px, height_px, fps, seed, camera)
     target = Path(out)
     check_target(target)
@@ -343,7 +363,7 @@ def synthesize(
     target.parent.mkdir(parents=True, exist_ok=True)
     with PartialFolder(target) as partial:
         # The scene extends to the time of one more frame, because the flow of the last frame needs it.
-        scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving", extras)
+        scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving", extras, drawn)
         _write_frames(FrameFiles(scene, partial.path, fps, seed, stereo, extras), frames, progress, threads)
         check_target(target)  # check again, because another process may have created files
         earlier = partial.finish()

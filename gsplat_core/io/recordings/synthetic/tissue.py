@@ -33,12 +33,18 @@ class Breathing:
     wander: float = 0.0
     """Largest relative deviation of the rate."""
     wander_phases: tuple[float, float] = (0.0, 0.0)
+    period_s: float = PERIOD_S
+    """Mean period of a breath, in seconds."""
+    pause: float = 0.0
+    """Share of each breath without motion, after expiration."""
 
     def phase(self, time_s: float) -> float:
         """Return the phase at `time_s` in radians; continuous and increasing."""
-        uniform = 2 * np.pi * time_s / PERIOD_S + self.start
+        uniform = 2 * np.pi * time_s / self.period_s + self.start
         if self.wander:
-            uniform += 2 * np.pi / PERIOD_S * self.wander * self._ahead_s(time_s)
+            uniform += 2 * np.pi / self.period_s * self.wander * self._ahead_s(time_s)
+        if self.pause:
+            uniform = paused(float(uniform), self.pause)
         return float(uniform) if self.ratio == 1 else unequal(float(uniform), self.ratio)
 
     def _ahead_s(self, time_s: float) -> float:
@@ -48,6 +54,20 @@ class Breathing:
             for period, phase in zip(WANDER_PERIODS_S, self.wander_phases, strict=True)
         )
         return float(sum(waves)) / len(WANDER_PERIODS_S)
+
+
+def paused(phase: float, share: float) -> float:
+    """Map a uniform phase to one that rests at the minimum of the sine for a share of each turn.
+
+    Motion starts and ends smoothly if the rest is at least `SMOOTH_PAUSE` of the turn.
+    """
+    turns, at = divmod((phase + np.pi / 2) / (2 * np.pi), 1.0)
+    at = min(at / (1 - share), 1.0)
+    at -= min(share / SMOOTH_PAUSE, 1.0) * np.sin(2 * np.pi * at) / (2 * np.pi)
+    return float(2 * np.pi * (turns + at) - np.pi / 2)
+
+
+SMOOTH_PAUSE = 0.15
 
 
 def unequal(phase: float, ratio: float) -> float:
@@ -65,19 +85,60 @@ def unequal(phase: float, ratio: float) -> float:
 Array = NDArray[np.floating]
 
 HALF_EXTENT_MM = 84.0
-# Linear RGB reflectances of tissue, fat and vessels.
-_PINK = np.array([0.62, 0.175, 0.115], np.float32)
-_PALE = np.array([0.76, 0.315, 0.215], np.float32)
-_DEEP = np.array([0.40, 0.072, 0.055], np.float32)
-_FAT = np.array([0.86, 0.420, 0.150], np.float32)
-_VEIN = np.array([0.130, 0.022, 0.040], np.float32)
-_ARTERY = np.array([0.300, 0.014, 0.012], np.float32)
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TissueLook:
+    """Colours, texture and gloss of a tissue. Colours are linear RGB reflectances."""
+
+    base: Colour = (0.62, 0.175, 0.115)
+    pale: Colour = (0.76, 0.315, 0.215)
+    deep: Colour = (0.40, 0.072, 0.055)
+    fat: Colour = (0.86, 0.420, 0.150)
+    vein: Colour = (0.130, 0.022, 0.040)
+    artery: Colour = (0.300, 0.014, 0.012)
+    mottling: float = 1.0
+    """Factor on the amplitude of the large light and dark areas."""
+    fat_from: float = 0.75
+    """Level of normal noise from which there is fat; larger values give less fat."""
+    veins: int = 7
+    arteries: int = 16
+    vessel_strength: float = 1.0
+    grain: float = 0.10
+    """Standard deviation of the fine texture, relative to the colour."""
+    creases: float = 0.20
+    """Darkening of the creases."""
+    roughness: float = 1.0
+    """Factor on the slopes of the fine relief."""
+    wetness: float = 0.12
+    """Smallest wetness, 0 to 1."""
+    glint: float = 9.0
+    """Strength of the narrow highlight lobe."""
+    glint_power: float = 900.0
+    """Exponent of the narrow highlight lobe."""
+    sheen: float = 0.20
+    """Strength of the broad highlight lobe."""
+    sheen_power: float = 40.0
+    """Exponent of the broad highlight lobe."""
+    bleed: Colour = (0.060, 0.014, 0.010)
+    """Colour of the light that scatters inside the tissue."""
+    zoom: float = 1.0
+    """Size of the texture relative to its usual size."""
+
+
+USUAL_LOOK = TissueLook()
 
 
 class TissueTexture:
     """Reflectance, wetness and the gradient of the fine relief over the undeformed sheet."""
 
-    def __init__(self, rng: np.random.Generator, texel_mm: float) -> None:
+    def __init__(self, rng: np.random.Generator, texel_mm: float, look: TissueLook = USUAL_LOOK) -> None:
+        base, pale, deep, fat_colour, vein, artery = (
+            np.array(colour, np.float32)
+            for colour in (look.base, look.pale, look.deep, look.fat, look.vein, look.artery)
+        )
+        self._per_mm = np.float32(1 / look.zoom)
         self.size = 2 * int(np.ceil(HALF_EXTENT_MM / texel_mm))
         self.texel_mm = 2 * HALF_EXTENT_MM / self.size
         cloud = self._noise(rng, (46.0, 21.0, 9.0, 4.2, 2.0, 0.9), 0.62)
@@ -86,32 +147,34 @@ class TissueTexture:
         folds = 1 - np.abs(self._noise(rng, (23.0, 11.0), 0.45))  # ridged: long soft creases
         lobules = np.abs(self._noise(rng, (4.6, 2.3), 0.5))
 
-        colour = _mix(_PINK, _PALE, _smoothstep(0.1, 1.3, cloud))
-        colour = _mix(colour, _DEEP, _smoothstep(0.0, 1.5, -cloud))
-        fat = _smoothstep(0.75, 1.25, fat_cloud)
-        colour = _mix(colour, _FAT * (0.86 + 0.14 * _smoothstep(0.0, 0.5, lobules))[..., None], 0.85 * fat)
+        mottled = np.float32(look.mottling) * cloud
+        colour = _mix(base, pale, _smoothstep(0.1, 1.3, mottled))
+        colour = _mix(colour, deep, _smoothstep(0.0, 1.5, -mottled))
+        fat = _smoothstep(look.fat_from, look.fat_from + 0.5, fat_cloud)
+        colour = _mix(colour, fat_colour * (0.86 + 0.14 * _smoothstep(0.0, 0.5, lobules))[..., None], 0.85 * fat)
         crease = _smoothstep(0.72, 1.0, folds) * (1 - fat)
-        colour *= (1 - 0.20 * crease)[..., None]
-        veins, vein_relief = self._vessels(rng, count=7, width_mm=2.1, blur_mm=0.42)
-        arteries, artery_relief = self._vessels(rng, count=16, width_mm=0.85, blur_mm=0.12)
-        colour = _mix(colour, _VEIN, 0.66 * veins * (1 - 0.5 * fat))
-        colour = _mix(colour, _ARTERY, 0.80 * arteries)
-        colour *= (1 + 0.10 * grain)[..., None]
+        colour *= (1 - look.creases * crease)[..., None]
+        veins, vein_relief = self._vessels(rng, count=look.veins, width_mm=2.1, blur_mm=0.42)
+        arteries, artery_relief = self._vessels(rng, count=look.arteries, width_mm=0.85, blur_mm=0.12)
+        colour = _mix(colour, vein, look.vessel_strength * 0.66 * veins * (1 - 0.5 * fat))
+        colour = _mix(colour, artery, look.vessel_strength * 0.80 * arteries)
+        colour *= (1 + look.grain * grain)[..., None]
 
         relief_mm = 0.040 * grain + 0.22 * cloud - 0.20 * crease + 0.34 * fat * lobules + 0.25 * fat
         relief_mm += 0.30 * vein_relief + 0.14 * artery_relief
         relief_mm = cv2.GaussianBlur(relief_mm.astype(np.float32), (0, 0), 0.22 / self.texel_mm)
-        wetness = 0.12 + 0.88 * _smoothstep(-0.3, 1.2, self._noise(rng, (16.0, 6.0, 2.5), 0.6))
+        wetness = look.wetness + (1 - look.wetness) * _smoothstep(-0.3, 1.2, self._noise(rng, (16.0, 6.0, 2.5), 0.6))
         self.reflectance = np.ascontiguousarray(np.clip(np.dstack([colour, wetness]), 0.004, 0.95), np.float32)
         """Linear RGB reflectance and wetness of each texel, [S, S, 4]."""
+        relief_mm *= np.float32(look.roughness)
         slope_v, slope_u = np.gradient(relief_mm, np.float32(self.texel_mm))
         self.slope = np.ascontiguousarray(np.dstack([slope_u, slope_v]), np.float32)
         """Derivatives of the fine relief by u and v at each texel, [S, S, 2]."""
 
     def sample(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return reflectance and wetness [H, W, 4] and relief slopes [H, W, 2] of material points [H, W]."""
-        column = (u + np.float32(HALF_EXTENT_MM)) / np.float32(self.texel_mm) - np.float32(0.5)
-        row = (v + np.float32(HALF_EXTENT_MM)) / np.float32(self.texel_mm) - np.float32(0.5)
+        column = (u * self._per_mm + np.float32(HALF_EXTENT_MM)) / np.float32(self.texel_mm) - np.float32(0.5)
+        row = (v * self._per_mm + np.float32(HALF_EXTENT_MM)) / np.float32(self.texel_mm) - np.float32(0.5)
         reflectance = cv2.remap(self.reflectance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         slope = cv2.remap(self.slope, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         return np.asarray(reflectance, np.float32), np.asarray(slope, np.float32)
@@ -179,11 +242,36 @@ TUG_RADIUS_MM = 12.0
 
 
 @dataclass(frozen=True)
+class TissueShape:
+    """Shape of a sheet of tissue at rest, and amplitudes of its motion."""
+
+    distance_mm: float = TISSUE_DISTANCE_MM
+    """Mean distance from a scope at rest, in mm."""
+    relief: float = 1.0
+    """Factor on the slopes of the hills."""
+    width: float = 1.0
+    """Factor on the wavelengths of the hills."""
+    bowl: float = 1.0
+    """Factor on the curvature of the sheet towards the scope."""
+    tilt: float = 0.10
+    """Largest slope of the sheet along each axis."""
+    breath: float = 1.0
+    """Factor on the amplitude of breathing."""
+    pulse: float = 1.0
+    """Factor on the amplitude of the pulse."""
+    pulse_period_s: float = PULSE_PERIOD_S
+
+
+USUAL_SHAPE = TissueShape()
+
+
+@dataclass(frozen=True)
 class Tug:
     """Local displacement by a tool: `pull` at the material point `grasp` with a Gaussian falloff."""
 
     grasp: tuple[float, float]
     pull: tuple[float, float, float]
+    radius_mm: float = TUG_RADIUS_MM
 
 
 NO_TUG = Tug((0.0, 0.0), (0.0, 0.0, 0.0))
@@ -215,35 +303,42 @@ class Tissue:
     tools = True
     """True if the scene contains a tool."""
 
-    def __init__(self, rng: np.random.Generator, texel_mm: float) -> None:
-        wavelengths = np.array([74.0, 58.0, 43.0, 33.0, 26.0, 21.0])
-        slopes = np.array([0.16, 0.17, 0.15, 0.14, 0.10, 0.07])
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        texel_mm: float,
+        look: TissueLook = USUAL_LOOK,
+        shape: TissueShape = USUAL_SHAPE,
+    ) -> None:
+        self.look, self.shape = look, shape
+        wavelengths = shape.width * np.array([74.0, 58.0, 43.0, 33.0, 26.0, 21.0])
+        slopes = shape.relief * np.array([0.16, 0.17, 0.15, 0.14, 0.10, 0.07])
         angles = rng.uniform(0, 2 * np.pi) + np.arange(6) * 2.4 + rng.uniform(-0.4, 0.4, 6)
         wave_numbers = 2 * np.pi / wavelengths
         self._relief = [
             (float(k * np.cos(angle)), float(k * np.sin(angle)), float(phase), float(slope / k))
             for k, angle, phase, slope in zip(wave_numbers, angles, rng.uniform(0, 2 * np.pi, 6), slopes, strict=True)
         ]
-        self._tilt = rng.uniform(-0.10, 0.10, 2)
+        self._tilt = rng.uniform(-shape.tilt, shape.tilt, 2)
         self.breathing = Breathing(float(rng.uniform(0, 2 * np.pi)))
         """Breathing of a tissue without extras; replaced if a recording requests other breathing."""
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
-        self.texture = TissueTexture(rng, texel_mm)
+        self.texture = TissueTexture(rng, texel_mm, look)
 
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
         """Return start values of Newton's method for the ray intersections.
 
         The rays from `origin` [3] along `directions` [H, W, 3] are intersected with the plane at the mean distance.
         """
-        s = (np.float32(TISSUE_DISTANCE_MM) - origin[2]) / directions[..., 2]
+        s = (np.float32(self.shape.distance_mm) - origin[2]) / directions[..., 2]
         return origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
 
     def _at_rest(self, u: Array, v: Array) -> SurfacePoints:
         """Return undeformed positions of the material points (u, v) and their derivatives by u and v."""
         one, zero = np.ones_like(u), np.zeros_like(u)
-        bowl = np.float32(-0.0022)
+        bowl = np.float32(-0.0022 * self.shape.bowl)
         tilt_u, tilt_v = (np.float32(tilt) for tilt in self._tilt)
-        z = np.float32(TISSUE_DISTANCE_MM) + tilt_u * u + tilt_v * v + bowl * (u * u + v * v)
+        z = np.float32(self.shape.distance_mm) + tilt_u * u + tilt_v * v + bowl * (u * u + v * v)
         z_u, z_v = tilt_u + 2 * bowl * u, tilt_v + 2 * bowl * v
         for k_u, k_v, phase, amplitude in self._relief:
             angle = np.float32(k_u) * u + np.float32(k_v) * v + np.float32(phase)
@@ -259,13 +354,14 @@ class Tissue:
 
         # Breathing is a long wave that lifts and shears the sheet. The pulse is a short wave that runs across it.
         breath = self.breathing.phase(time_s)
-        pulse = 2 * np.pi * time_s / PULSE_PERIOD_S
+        pulse = 2 * np.pi * time_s / self.shape.pulse_period_s
         direction = (np.cos(self._breath_angle), np.sin(self._breath_angle))
-        for wavelength_mm, phase, lift_mm, shear_mm in ((130.0, breath, 2.4, 1.6), (55.0, -pulse, 0.35, 0.25)):
+        waves = ((130.0, breath, 2.4, 1.6, self.shape.breath), (55.0, -pulse, 0.35, 0.25, self.shape.pulse))
+        for wavelength_mm, phase, lift_mm, shear_mm, factor in waves:
             wave_u, wave_v = (np.float32(2 * np.pi / wavelength_mm * component) for component in direction)
             angle = wave_u * u + wave_v * v + np.float32(phase)
             sine, cosine = np.sin(angle), np.cos(angle)
-            lift, shear = np.float32(lift_mm), np.float32(shear_mm)
+            lift, shear = np.float32(factor * lift_mm), np.float32(factor * shear_mm)
             z, z_u, z_v = z + lift * sine, z_u + lift * wave_u * cosine, z_v + lift * wave_v * cosine
             for axis, component in enumerate(direction):
                 part = shear * np.float32(component)
@@ -275,7 +371,7 @@ class Tissue:
                     y, y_u, y_v = y + part * cosine, y_u - part * wave_u * sine, y_v - part * wave_v * sine
 
         # Add the tool's pull with its Gaussian falloff around the grasp point.
-        inverse = np.float32(1 / TUG_RADIUS_MM**2)
+        inverse = np.float32(1 / tug.radius_mm**2)
         d_u, d_v = u - np.float32(tug.grasp[0]), v - np.float32(tug.grasp[1])
         weight = np.exp(np.float32(-0.5) * inverse * (d_u * d_u + d_v * d_v))
         w_u, w_v = -inverse * d_u * weight, -inverse * d_v * weight

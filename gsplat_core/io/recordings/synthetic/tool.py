@@ -1,4 +1,4 @@
-"""Grasper that enters through a port, grasps the tissue, tugs and releases it.
+"""Tool that enters through a port, grasps the tissue, tugs and releases it.
 
 Its shape is a signed distance function of tapered capsules, intersected by sphere tracing.
 """
@@ -6,15 +6,16 @@ Its shape is a signed distance function of tapered capsules, intersected by sphe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.io.recordings.synthetic.tissue import TUG_RADIUS_MM, Colour, Tissue, Tug
 
 Array = NDArray[np.floating]
 
-PORT_MM = np.array([58.0, 44.0, 8.0])
+PORT_MM = (58.0, 44.0, 8.0)
 """Entry point of the shaft in mm: to the lower right of the scope."""
 CYCLE_S = 2.4
 HOVER_MM = 13.0
@@ -55,64 +56,142 @@ class ToolHits:
 SHAFT, STEEL, RING = 0, 1, 2
 
 
+@dataclass(frozen=True)
+class ToolLook:
+    """Colours and gloss of a tool. Colours are linear RGB reflectances."""
+
+    shaft: Colour = (0.085, 0.093, 0.108)
+    ring: Colour = (0.10, 0.105, 0.12)
+    steel: Colour = (0.26, 0.265, 0.28)
+    gloss: float = 64.0
+    """Exponent of the highlight lobe of steel."""
+    glint: float = 2.6
+    """Strength of the highlight lobe of steel."""
+    metal_shaft: bool = False
+    """True if the shaft is polished like the jaws."""
+
+
+Kind = Literal["grasper", "scissors", "hook", "suction"]
+
+
+@dataclass(frozen=True)
+class ToolPlan:
+    """Kind, size, entry point and habits of a tool."""
+
+    kind: Kind = "grasper"
+    scale: float = 1.0
+    """Factor on the thickness and the jaws."""
+    port_mm: tuple[float, float, float] = PORT_MM
+    cycle_s: float = CYCLE_S
+    """Duration of one approach, tug and retreat."""
+    hover_mm: float = HOVER_MM
+    """Distance from the tissue between two tugs."""
+    reach_mm: float = 15.0
+    """Largest distance of the grasp points from their centre."""
+    centre_mm: tuple[float, float] = (-4.0, -3.0)
+    pull: float = 1.0
+    """Factor on the displacement of the grasped tissue; 0 if the tool does not touch it."""
+    tug_radius_mm: float = TUG_RADIUS_MM
+    look: ToolLook = ToolLook()
+
+
+USUAL_PLAN = ToolPlan()
+
+
 class ToolMotion:
     """Tool motion in cycles of approach, tug and retreat, each with a new grasp point."""
 
-    def __init__(self, rng: np.random.Generator, cycles: int) -> None:
+    def __init__(self, rng: np.random.Generator, cycles: int, plan: ToolPlan = USUAL_PLAN) -> None:
+        self.plan = plan
         angle = rng.uniform(0, 2 * np.pi, cycles + 1)
-        radius = 15 * np.sqrt(rng.uniform(0.05, 1, cycles + 1))
-        self._grasps = np.stack([radius * np.cos(angle) - 4, 0.75 * radius * np.sin(angle) - 3], axis=1)
+        radius = plan.reach_mm * np.sqrt(rng.uniform(0.05, 1, cycles + 1))
+        self._grasps = np.stack([radius * np.cos(angle), 0.75 * radius * np.sin(angle)], axis=1) + plan.centre_mm
         side = rng.uniform(-0.6, 0.6, cycles + 1)
         # Pull towards the port and away from the surface.
-        self._pulls = np.stack([2.8 + side, 1.8 - side, np.full(cycles + 1, -6.0)], axis=1)
+        if plan.port_mm == PORT_MM:
+            across = np.stack([2.8 + side, 1.8 - side], axis=1)
+        else:
+            to_port = np.array(plan.port_mm[:2]) / np.linalg.norm(plan.port_mm[:2])
+            across = 3.3 * to_port + side[:, None] * np.array([-to_port[1], to_port[0]])
+        self._pulls = plan.pull * np.concatenate([across, np.full((cycles + 1, 1), -6.0)], axis=1)
 
     def tug(self, time_s: float) -> Tug:
         """Return the pull on the tissue; 0 outside the middle half of a cycle."""
         cycle, phase = self._phase(time_s)
         strength = np.sin(np.pi * np.clip((phase - 0.25) / 0.5, 0, 1)) ** 2
         pull = self._pulls[cycle] * strength
-        return Tug(self._grasp(cycle), (float(pull[0]), float(pull[1]), float(pull[2])))
+        return Tug(self._grasp(cycle), (float(pull[0]), float(pull[1]), float(pull[2])), self.plan.tug_radius_mm)
 
-    def parts(self, tissue: Tissue, time_s: float) -> list[Part]:
-        """Return the tool's capsules in world mm. During a tug the tip holds the grasped material point."""
+    def parts(self, tissue: Tissue, time_s: float, tug: Tug | None = None) -> list[Part]:
+        """Return the tool's capsules in world mm. During a tug the tip holds the grasped material point.
+
+        Args:
+            tissue: deforming tissue.
+            time_s: time in seconds.
+            tug: pull on the tissue by another tool; None if this tool pulls.
+        """
         cycle, phase = self._phase(time_s)
-        tug = self.tug(time_s)
-        held = tissue.position(tug.grasp, time_s, tug)
+        plan, scale, port = self.plan, self.plan.scale, np.array(self.plan.port_mm)
+        tug = self.tug(time_s) if tug is None else tug
+        held = tissue.position(self._grasp(cycle), time_s, tug)
         away = _smooth(1 - phase / 0.25) if phase < 0.25 else _smooth((phase - 0.75) / 0.25)
         if phase > 0.75:  # on the way to the next grasp
             after = tissue.position(self._grasp(cycle + 1), time_s, tug)
             held = held + _smooth((phase - 0.75) / 0.25) * (after - held)
-        back = PORT_MM - held
+        back = port - held
         back /= np.linalg.norm(back)
-        tip = held + back * HOVER_MM * away + np.array([0, 0, -0.4])
-        axis = PORT_MM - tip
+        tip = held + back * plan.hover_mm * away + np.array([0, 0, -0.4])
+        axis = port - tip
         axis /= np.linalg.norm(axis)
         sideways = np.cross(axis, [0.25, 0.1, 1.0])
         sideways /= np.linalg.norm(sideways)
-        opening = 0.9 + 3.4 * away
-        hinge, wrist, collar = tip + 11 * axis, tip + 16.5 * axis, tip + 22 * axis
-        jaws = [
-            part
-            for side in (-1, 1)
-            for knee in [tip + 5.5 * axis + side * (0.75 * opening + 0.5) * sideways]
-            for part in (
-                Part(hinge, knee, 1.9, 1.45, STEEL),
-                Part(knee, tip + side * 0.5 * opening * sideways, 1.45, 0.75, STEEL),
-            )
-        ]
+        opening = scale * (0.9 + 3.4 * away)
+        hinge, wrist, collar = tip + 11 * scale * axis, tip + 16.5 * scale * axis, tip + 22 * scale * axis
         return [
-            *jaws,
-            Part(hinge - 0.5 * axis, wrist, 2.6, 3.1, STEEL),
-            Part(wrist, collar, 3.3, 3.8, RING),
-            Part(collar, PORT_MM + 20 * axis, 4.0, 4.0, SHAFT),
+            *(
+                Part(part.a, part.b, scale * part.radius_a_mm, scale * part.radius_b_mm, part.material)
+                for part in (
+                    *_end(plan.kind, tip, hinge, axis, sideways, opening, scale),
+                    Part(hinge - 0.5 * scale * axis, wrist, 2.6, 3.1, STEEL),
+                    Part(wrist, collar, 3.3, 3.8, RING),
+                    Part(collar, port + 20 * axis, 4.0, 4.0, SHAFT),
+                )
+            )
         ]
 
     def _grasp(self, cycle: int) -> tuple[float, float]:
         return float(self._grasps[cycle, 0]), float(self._grasps[cycle, 1])
 
     def _phase(self, time_s: float) -> tuple[int, float]:
-        cycle = int(time_s // CYCLE_S)
-        return cycle, time_s / CYCLE_S - cycle
+        cycle = int(time_s // self.plan.cycle_s)
+        return cycle, time_s / self.plan.cycle_s - cycle
+
+
+def _end(
+    kind: Kind,
+    tip: NDArray[np.float64],
+    hinge: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    sideways: NDArray[np.float64],
+    opening: float,
+    scale: float,
+) -> list[Part]:
+    """Return the capsules between the tip and the hinge. Radii are those of a tool of scale 1."""
+    if kind == "suction":
+        return [Part(hinge, tip, 2.6, 2.4, SHAFT)]
+    if kind == "hook":
+        bend = tip + 1.5 * scale * axis + 3.0 * scale * sideways
+        return [Part(hinge, bend, 1.1, 0.8, STEEL), Part(bend, tip, 0.8, 0.6, STEEL)]
+    knee_at, thick = (5.5, 1.45) if kind == "grasper" else (3.0, 1.0)
+    return [
+        part
+        for side in (-1, 1)
+        for knee in [tip + knee_at * scale * axis + side * (0.75 * opening + 0.5 * scale) * sideways]
+        for part in (
+            Part(hinge, knee, 1.9, thick, STEEL),
+            Part(knee, tip + side * 0.5 * opening * sideways, thick, 0.75 if kind == "grasper" else 0.35, STEEL),
+        )
+    ]
 
 
 def _smooth(x: float) -> float:
