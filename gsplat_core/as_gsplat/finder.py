@@ -22,7 +22,9 @@ _OLD_CONSTANTS: Mapping[str, Mapping[str, Any]] = {
     "rasterize_to_indices_in_range": {"max_alpha": 0.999},
     "rasterize_to_pixels": {"max_alpha": 0.999},
 }
-"""Options that give functions the constants of gsplat 1.5.3, as in `gsplat_core.rendering.settings.CONSTANTS`."""
+"""Functions whose option defaults change to the constants of gsplat 1.5.3, with those options; see
+`gsplat_core.rendering.settings.CONSTANTS`.
+"""
 
 
 class AliasModule(ModuleType):
@@ -67,12 +69,12 @@ def _bound(function: Any, options: tuple[tuple[str, Any], ...]) -> Any:
 
 
 def _with_options(value: Any, options: Mapping[str, Any] | None) -> Any:
-    """Return a function with other default values of options; the same object for every module."""
+    """Return a function with other default values of its options; the same wrapper object at every call."""
     return value if options is None else _bound(value, tuple(options.items()))
 
 
 class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds the modules of `MODULES` before any installed gsplat."""
+    """Import hook that finds the modules of `MODULES` before any installed gsplat."""
 
     def __init__(self, constants: str) -> None:
         self.constants = constants
@@ -88,7 +90,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         )
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
-        """Return the module, without importing what it names."""
+        """Create the module object without importing the modules that define its attributes."""
         return AliasModule(spec.name, MODULES[spec.name], _OLD_CONSTANTS if self.constants == "1.5.3" else {})
 
     def exec_module(self, module: ModuleType) -> None:

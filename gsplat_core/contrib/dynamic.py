@@ -24,11 +24,11 @@ from gsplat_core.training.strategies.strategy import Optimizers, Params
 AXES = tuple(combinations(range(4), 2))
 """Axes of gsplat's planes in its order: xy, xz, xt, yz, yt, zt."""
 ORDER = tuple(AXES.index(axes) for axes in plain_torch.PLANE_AXES)
-"""Place of each plane of `hexplane_features` among gsplat's planes."""
+"""Index among gsplat's planes of each plane that `hexplane_features` takes."""
 SPACE = tuple(place for place, axes in enumerate(AXES) if 3 not in axes)
-"""Places of the planes without time."""
+"""Indices among gsplat's planes of those without time."""
 TIME = tuple(place for place, axes in enumerate(AXES) if 3 in axes)
-"""Places of the planes with time."""
+"""Indices among gsplat's planes of those with time."""
 PLANES_CONFIG: Mapping[str, Any] = {
     "grid_dimensions": 2,
     "input_coordinate_dim": 4,
@@ -52,7 +52,7 @@ class HexPlaneField(torch.nn.Module):
         planes_config: Mapping[str, Any] | None = None,
         multires: Sequence[int] | None = None,
     ) -> None:
-        """Create planes: those of space uniform in 0.1..0.5, those with time 1.
+        """Create planes. Space planes start uniform in 0.1..0.5, time planes at 1.
 
         Args:
             bounds: half the side of the cube of positions.
@@ -198,7 +198,7 @@ class DynamicStrategy(DefaultStrategy):
         device: torch.device | str | None = None,
         init_dynamic: bool = True,
     ) -> dict[str, Any]:
-        """Return empty statistics and the mask.
+        """Return empty statistics and the mask of deforming Gaussians.
 
         Args:
             scene_scale: size of the scene, as in `DefaultStrategy`.

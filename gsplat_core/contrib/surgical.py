@@ -168,7 +168,7 @@ class TwoStageScheduleStep:
     stage: Literal["coarse", "fine"]
     frame_index: int
     shuffle: bool
-    """True in the fine stage, in which a loader may choose frames at random instead."""
+    """True in the fine stage, in which a data loader may choose frames at random instead of in turn."""
 
 
 class TwoStageScheduler:

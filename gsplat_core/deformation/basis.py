@@ -41,7 +41,9 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
 class BasisSlot:
-    """Slot for a basis field with spare capacity for Gaussians and bumps. Unused rows and columns are inert."""
+    """Preallocated copy of a basis field (see `FieldSlot`) with spare capacity for Gaussians and bumps. Unused rows and
+    columns are inert.
+    """
 
     def __init__(self, source: BasisField, rows: int) -> None:
         # A ring uses all of its columns from the start, and the copy needs the same number.
@@ -86,7 +88,9 @@ class BasisSlot:
         return True
 
     def _continue(self, source: Continuation | None, count: int) -> None:
-        """Copy the source's continuation, or disable the slot's continuation if the source has none."""
+        """Copy the extrapolation after the newest frame from the source, or disable the slot's own if the source has
+        none.
+        """
         mine = self.field.continuation
         if mine is None:
             return
@@ -117,7 +121,7 @@ class BasisSlot:
 
 
 OVERSHOOT = 0.25
-"""Bound on a fitted trajectory outside its offsets, as a share of their range.
+"""Largest distance of fitted motion beyond the range of the given offsets, as a share of that range.
 
 Least squares alone overshoots where offsets jump.
 """
@@ -220,7 +224,7 @@ class BasisField(BumpTensors):
         towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
 
     def share_motion(self, neighbours: Tensor, amount: float) -> None:
-        """Smooth each bump's position weights; see `Capabilities.share_motion`."""
+        """Smooth each bump's position weights towards those of neighbouring Gaussians; see `Capabilities.share_motion`."""
         towards_others_(self.weights.data[: self.count, : self.bumps, POSITION], neighbours, amount)
 
     @property
@@ -293,7 +297,7 @@ class BasisField(BumpTensors):
         return self._whole_parameters()
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> None:
-        """Fit weights of the initial bumps by least squares; see `Capabilities.follow`. Not for a ring.
+        """Fit the position weights to given trajectories by least squares; see `Capabilities.follow`. Not for a ring.
 
         The result is bounded by `OVERSHOOT`.
         """

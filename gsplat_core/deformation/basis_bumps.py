@@ -91,7 +91,9 @@ class Columns:
         return self.places - self.count
 
     def moved_on(self, added: int) -> tuple[Columns, int]:
-        """Return the columns after adding `added` at the head, and the number of replaced columns."""
+        """Return the column layout after adding `added` columns at the head, and the number of oldest columns that they
+        replace.
+        """
         passed = max(0, self.count + added - self.places)
         origin_s = self.origin_s + passed * self.spacing_s
         oldest = (self.oldest + passed) % self.places
@@ -118,7 +120,9 @@ class Columns:
         return torch.cat([tensor[:, self.oldest :], tensor[:, : self.oldest]], dim=1)
 
     def laid_out(self, like: Tensor) -> Tensor:
-        """Return initial centres [places] with dtype and device of `like`."""
+        """Return initial bump centres [places] in bump spacings, with dtype and device of `like`; unused columns are
+        inert.
+        """
         columns = torch.arange(self.count, dtype=like.dtype, device=like.device)
         if self.spare:
             columns = torch.cat([columns, like.new_full((self.spare,), INERT_CENTER)])
@@ -313,7 +317,9 @@ class BumpTensors(ContinuedField):
             self._spare_rows += added
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Apply row moves, see `FixedRows.close_gaps`; tensors keep their addresses."""
+        """Move rows into the gaps that removed Gaussians left; see `FixedRows.close_gaps`. Tensors keep their
+        addresses.
+        """
         for tensor, inert in self._tensors_and_fill():
             moves.apply(tensor, inert)
         self._spare_rows += moves.before - moves.count

@@ -37,7 +37,7 @@ class Continuation(torch.nn.Module):
         self.horizon_s = 0.0
         """Duration of the extrapolation in seconds; afterwards the deltas stay constant."""
         self._written = 0
-        """Number of rows that may be non-zero."""
+        """Number of leading rows of `velocity` that may be non-zero."""
 
     def write(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """Extrapolate with `velocity` from `from_s` on.

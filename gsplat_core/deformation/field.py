@@ -44,7 +44,7 @@ class FixedRows(Protocol):
         """Allocate memory for `rows` Gaussians in total."""
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Remove Gaussians by applying row moves."""
+        """Remove Gaussians by moving rows into their gaps, without moving a tensor."""
 
     def restart(self, time_s: float, count: int) -> None:
         """Reset in place to an untrained field of `count` Gaussians for a stream starting at `time_s`.
@@ -58,7 +58,9 @@ class EditableMotion(Protocol):
     """Deformation that is independent of the Gaussians' parameters and can be set directly."""
 
     def deltas(self, time_s: float) -> Tensor:
-        """Return the deltas [N, C] at `time_s`: the first C columns of the raw row."""
+        """Return the deltas [N, C] at `time_s`, added to the first C of the 16 columns of the Gaussians' raw
+        parameters.
+        """
 
     def move_to(self, time_s: float, deltas: Tensor) -> None:
         """Set the deltas at `time_s`, with little change at other times."""
@@ -81,7 +83,7 @@ class Continuable(Protocol):
 
 
 class FrameDeltas(Protocol):
-    """Deltas for pictures and training steps in a CUDA graph."""
+    """Deltas from operations that a CUDA graph can capture, for pictures and training steps."""
 
     def frame_time(self, time_s: float) -> float:
         """Convert `time_s` to the field's normalised time."""
@@ -233,7 +235,7 @@ class DeformationField(torch.nn.Module):
         return self._time_window_s
 
     def continued_window(self, window_s: tuple[float, float]) -> tuple[float, float]:
-        """Return a time window extended by the times for which the field extrapolates."""
+        """Return a time window whose end is extended by the duration for which the field extrapolates."""
         return window_s
 
     def clamp_time(self, time_s: float) -> float:
@@ -338,7 +340,7 @@ def ops_for(tensor: Tensor, compiled: ModuleType, plain: ModuleType) -> ModuleTy
 
 
 class WholeFieldSlot:
-    """Slot for fields without per-Gaussian tensors, whose shapes never change."""
+    """`FieldSlot` for fields without per-Gaussian tensors, whose shapes never change."""
 
     def __init__(self, source: DeformationField) -> None:
         self.field = source.detached_copy()

@@ -87,7 +87,7 @@ AGES = (1, 2, 3, 5, 8)
 PREVIOUS_FRAME, NEIGHBOUR_MEAN, TRAIN_MEAN = "previous_frame", "neighbour_mean", "train_mean"
 HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
 SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
-"""Baselines that use the frame after the scored one, unavailable to a live system."""
+"""Baselines computed from the frame after the scored one, which a live system does not have yet."""
 _MAX_THREADS = 4
 
 
@@ -188,7 +188,9 @@ def measure_baselines(
 
 @dataclass(frozen=True)
 class _Values:
-    """PSNR of the baselines on one frame by group and name: tissue, whole frame, tissue in both."""
+    """PSNR of the baselines on one frame, by baseline name: over tissue, over the whole frame, and over pixels that are
+    tissue in both pictures.
+    """
 
     frame: Frame
     by_key: dict[tuple[str, object], tuple[float, ...]]
@@ -258,7 +260,7 @@ def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Fra
 
 
 class _Sums:
-    """Mean of each measure of each baseline."""
+    """Accumulator of the mean of each measure, by baseline."""
 
     def __init__(self) -> None:
         self._means: dict[tuple[str, object], tuple[ScoredMean, ...]] = {}

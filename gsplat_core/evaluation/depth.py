@@ -23,7 +23,7 @@ from gsplat_core.training.metrics import ScoredMean
 
 Array = NDArray[np.float64]
 MOST_STEPS = 100
-"""Largest number of Levenberg-Marquardt steps from each start; the fit converges in about ten."""
+"""Largest number of Levenberg-Marquardt steps of a plane fit from each start; the fit converges in about ten."""
 CONVERGED = 1e-10
 """Relative decrease of the squared error that ends the iteration."""
 STEEPEST_RATIO = 1e-6
@@ -104,7 +104,8 @@ def _descended(plane: Array, rays: Array, z: Array) -> tuple[Array, float]:
 
 
 def pixels_to_compare(camera: Camera, where: NDArray[np.bool_], most: int, *planes: NDArray[Any]) -> tuple[Array, ...]:
-    """Return rays [N, 3] and the values [N] of each plane at evenly spaced pixels.
+    """Return the rays (x/z, y/z, 1) [N, 3] of at most `most` evenly spaced pixels in the mask `where`, and the values
+    [N] of each plane there.
 
     At most about `most` pixels of `where` [H, W] are used.
     """

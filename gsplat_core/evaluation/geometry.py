@@ -55,10 +55,12 @@ PART_FRAMES = 8
 
 @dataclass(frozen=True)
 class PartShares:
-    """Shares of the squared change of the recorded pictures against the model frozen at `reference_s`, over tissue."""
+    """Shares of the squared change of the recorded pictures over time that motion, size and colour of the Gaussians
+    explain. The reference is the model frozen at `reference_s`.
+    """
 
     motion: float
-    """Positions and orientations of Gaussians."""
+    """Share explained by changes of positions and orientations."""
     colour: float
     size: float
     """Share explained by changes of sizes and opacities."""
@@ -69,7 +71,9 @@ class PartShares:
 
 
 class PartSums:
-    """Streaming accumulator of the squared errors for each subset of unfrozen parts."""
+    """Streaming accumulator of squared errors, one for each subset of the parts motion, size and colour that may change
+    over time.
+    """
 
     def __init__(self, gaussians_at: Callable[[float], Gaussians], reference_s: float) -> None:
         """Create an empty accumulator.
@@ -83,7 +87,7 @@ class PartSums:
         self._frames = 0
 
     def add(self, frame: Frame, picture_of: Callable[[Gaussians], NDArray[Any]]) -> None:
-        """Render a frame with each subset of parts unfrozen.
+        """Render a frame once for each subset of parts, with all other parts frozen at the reference time.
 
         Args:
             frame: reference frame.
@@ -129,7 +133,9 @@ def _subsets(names: tuple[str, ...]) -> list[frozenset[str]]:
 MOST_FRAMES = 48
 """Maximum number of compared frames, spread evenly over the recording."""
 NO_SCALING = 0.005
-"""Tolerance around a scale factor of 1 within which the scaled pictures are not rendered again."""
+"""Tolerance around a scale factor of 1. Within it, the scores of the scaled model are copied from the unscaled one
+instead of being rendered.
+"""
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class AgeHistogram:
 
 
 MOST_BEHIND = 8
-"""Largest lateness in frames with its own counter. The counter also includes pictures that are later."""
+"""Largest lateness in frames with its own counter. Later pictures are counted with it."""
 SETTLING_S = 1.0
 """Start-up time in seconds, excluded from `settled` but included in `score`."""
 NOTHING_SHOWN = "nothing shown yet"
@@ -81,7 +81,7 @@ class Live:
 
     score: Score
     settled: Score
-    """Score without the first second."""
+    """Score without the start-up time `SETTLING_S`."""
     previous: BaselineScore
     """Baseline for `score`: the previous raw frame, over the same frames and pixels."""
     settled_previous: BaselineScore

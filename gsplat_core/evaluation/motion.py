@@ -99,7 +99,7 @@ class Tracking:
     scaled: TrackErrors
     """Errors after scaling the model by the sequence's depth factor."""
     still: TrackErrors
-    """Baseline without motion: each point keeps its first pixel and its first true depth."""
+    """Baseline without motion: each point keeps the pixel and the true depth of its first frame."""
     points: int
     compared: int
     """Number of compared positions."""

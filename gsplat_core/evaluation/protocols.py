@@ -181,7 +181,7 @@ def published(learner: Learner, frame: Frame) -> Model | Snapshot:
 
 
 def _hidden(frame: Frame, exposure: tuple[float, float, float]) -> Frame:
-    """Return a frame with only number, time and pose of this one and a black picture.
+    """Return a copy of the frame that contains only number, time, pose and the given exposure, with a black picture.
 
     Prevents the image from influencing a prediction.
     """
@@ -244,7 +244,8 @@ NEAR_SHARE = 0.05
 """Distance below which two positions count as the same place, as a share of the largest pairwise distance."""
 NEAR_DEGREES = 10.0
 AWAY = 3.0
-"""Least distance of the scope from a place between two stays, in multiples of the limit of the same place.
+"""Smallest distance of the scope from a place between two stays, in multiples of the distance below which positions
+count as the same place.
 
 The distance is the larger of the position and the angle measure of `_distances`.
 """

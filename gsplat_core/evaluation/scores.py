@@ -11,9 +11,9 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import MEASURES, FrameQuality, ImageLike, QualityTracker, frame_quality
 
 Entry = dict[str, float | int | bool | str | None]
-"""Figures of one frame by name; None for a measure that the frame does not have."""
+"""Measures of one frame by name; None for a measure that the frame does not have."""
 Record = Callable[[Entry], None]
-"""Callback that receives each frame's figures in order."""
+"""Callback that receives each frame's measures in order."""
 
 
 @dataclass(frozen=True)

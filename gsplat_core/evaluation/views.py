@@ -208,7 +208,7 @@ Proportionally less in smaller pictures.
 """
 BORDER_OF_PX = 360
 BEYOND_TYPICAL = 1.3
-"""Width of the columns visible only to one eye, in typical disparities, if not given."""
+"""Width of the columns visible only to one eye, in multiples of the typical disparity, used if no width is given."""
 SEARCHED = 0.07
 """Search range of semi-global matching around the typical disparity, as a share of the width."""
 MODEL = "model"

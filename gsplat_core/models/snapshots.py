@@ -52,7 +52,7 @@ class SnapshotSlot:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rows. Rows beyond the count have an opacity logit of -inf and are in no tile list."""
+        """All rows of the slot. Rows beyond the count have an opacity logit of -inf and are in no tile list."""
         assert self._gaussians is not None
         return self._gaussians
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class BirthDeath:
-    """Splats that die and the parents whose copies replace them; int64 [D] each."""
+    """Indices of the splats that die, and of the parents whose copies replace them; int64 [D] each."""
 
     dying: Tensor
     parents: Tensor
@@ -60,7 +60,7 @@ def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator, *, sing
         marked = marked[torch.randperm(len(marked), generator=random)[:possible]].sort().values
     if len(marked) == 0:
         return BirthDeath(marked.to(phi.device), marked.to(phi.device))
-    # Inverse transform sampling: torch.multinomial is limited to 2^24 splats.
+    # Inverse transform sampling, because torch.multinomial is limited to 2^24 splats.
     if single:
         keys = torch.rand(len(birth), generator=random, dtype=birth.dtype).log() / birth
         parents = keys.argsort(descending=True, stable=True)[: len(marked)]

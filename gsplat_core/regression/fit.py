@@ -41,9 +41,9 @@ class FitOptions:
     birth_spread: float = 2.0
     """Distance of a copy from its parent in standard deviations of the parent, for a normal draw."""
     centre_decay: float = 0.0
-    """λ_b, weight of Σ|b|²."""
+    """Weight λ_b of the penalty Σ|b|² on the centres."""
     factor_decay: float = 0.0
-    """λ_A, weight of Σ|A|²."""
+    """Weight λ_A of the penalty Σ|A|² on the factors."""
     start_width: float = 0.05
     """Standard deviation of the first splats, relative to the extent of the points."""
     seed: int = 0
@@ -141,7 +141,8 @@ class _Fitting:
             losses.append(loss)
             if options.metric:
                 gradients = gradients.divided_by_mass(self._splats.masses)
-            # ∂L/∂ln|v|; with the metric per mass, which is the first variation of the loss at the splat.
+            # ∂L/∂ln|v|. With `metric`, it is divided by the mass, which gives the first variation of the loss at the
+            # splat.
             phi = (self._splats.values * gradients.values).sum(1)
             self._descend(gradients, step)
             rounds = options.birth_death and step < options.birth_until * options.steps

@@ -16,18 +16,18 @@ SMALLEST_MASS = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """f(x) = Σ v g(x) with normal densities g of mean b and covariance A Aᵀ. Float32.
+    """Function f(x) = Σ v g(x), where each g is a normal density of mean b and covariance A Aᵀ. Float32.
 
     Raises:
         InvalidInput: if shapes are inconsistent.
     """
 
     centres: Tensor
-    """b, [k, d] with d = 1 to 4."""
+    """Means b of the normal densities, [k, d] with d = 1 to 4."""
     factors: Tensor
-    """A, [k, d, d]."""
+    """Square roots A of the covariances A Aᵀ, [k, d, d]."""
     values: Tensor
-    """v, [k, m]: integral of each splat over space."""
+    """Weights v, [k, m]: integral of each splat over space."""
 
     def __post_init__(self) -> None:
         check_splats(self.centres, self.centres, self.factors, self.values)

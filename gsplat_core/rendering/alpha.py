@@ -53,12 +53,12 @@ class AlphaRenderer:
 
     @staticmethod
     def extended(gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians, to which alpha blending adds nothing."""
+        """Return the Gaussians unchanged, because alpha blending has no tensors of its own."""
         return gaussians
 
     @staticmethod
     def first_values(distance: float) -> Mapping[str, float]:
-        """Return no values; see `TrainableRenderer.first_values`."""
+        """Return an empty mapping, because alpha blending has no learned values for the whole scene."""
         return {}
 
     @staticmethod
@@ -69,7 +69,7 @@ class AlphaRenderer:
         values: Mapping[str, Tensor],
         depth: bool = True,
     ) -> RenderOutput:
-        """See `TrainableRenderer.picture`."""
+        """Render a differentiable picture; see `TrainableRenderer.picture`."""
         return render(gaussians, camera, background, depth)
 
     def __init__(
@@ -79,12 +79,14 @@ class AlphaRenderer:
         self._background = background
         self._model: Model | Snapshot | None = None
         self._frames: FrameRenderer | None = None
-        """CUDA-graph renderer of the prepared model; None renders it by single launches."""
+        """CUDA-graph renderer of the prepared model; None if the model is rendered by separate kernel launches."""
         self._by_slot: dict[int, tuple[tuple[int, int], FrameRenderer]] = {}
         """Graph renderer by slot number, with the slot and layout for which it was captured."""
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """See `Renderer.prepare`. Raises InvalidInput for a model on another device."""
+        """Set the model of the following frames; see `Renderer.prepare`. Raises InvalidInput for a model on another
+        device.
+        """
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
         check_trained_by("alpha", model)
@@ -97,7 +99,7 @@ class AlphaRenderer:
         self._model = model
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
-        """See `Renderer.render`."""
+        """Enqueue the picture of the prepared model; see `Renderer.render`."""
         asked = checked_outputs("alpha", outputs, self.capabilities)
         check_camera(self._camera, camera)
         model = self._model
@@ -159,19 +161,19 @@ class _FrameInFlight:
     _asked: tuple[str, ...]
 
     def outputs(self) -> Mapping[str, Tensor]:
-        """See `PendingFrame.outputs`."""
+        """Return the requested outputs by name; see `PendingFrame.outputs`."""
         with self._reading():  # an overflowing frame is rendered again from the slot
             return _chosen(self._launched.result(), self._asked)
 
     def result(self) -> RenderOutput:
-        """See `PendingFrame.result`."""
+        """Return the three standard outputs; see `PendingFrame.result`."""
         return standard_outputs(self.outputs())
 
 
 def _with_further(
     model: Model, camera: Camera, time_s: float, background: Tensor | None, asked: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """Render outputs by single launches, also on a GPU; they are not meant for live frames."""
+    """Render outputs by separate kernel launches, also on a GPU. Too slow for live frames."""
     outputs: dict[str, Tensor] = model.render(time_s, camera, background)._asdict()
     if {*asked} & {*SURFACE_OUTPUTS}:
         outputs = {**model.surface(time_s, camera)._asdict(), **outputs}

@@ -83,7 +83,8 @@ def all_cameras(viewmats: Tensor, Ks: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def exchanged(splats: ColoredSplats, cameras: int) -> ColoredSplats:
-    """Send splats to the processes of their cameras, and return those of this process's cameras; differentiable.
+    """Send each splat to the process that renders its camera, and return the splats of this process's cameras;
+    differentiable.
 
     Args:
         splats: splats of this process's Gaussians for the cameras of all processes.
@@ -134,7 +135,7 @@ def _exchange(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
 
 
 class _Exchange(torch.autograd.Function):
-    """Rows sent to each process and received from it; gradients take the opposite way."""
+    """Autograd function that sends rows to each process and returns the received ones. Gradients are sent back."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
@@ -147,7 +148,7 @@ class _Exchange(torch.autograd.Function):
 
 
 class _Gather(torch.autograd.Function):
-    """Rows of all processes, in their order; the gradient is the sum of those of all processes."""
+    """Autograd function that concatenates the rows of all processes. The gradient is the sum over all processes."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor) -> Tensor:
@@ -165,7 +166,7 @@ class _Gather(torch.autograd.Function):
 
 
 def all_gather_int32(world_size: int, value: int | Tensor, device: torch.device | None = None) -> list[Any]:
-    """Return the numbers of all processes, in the order of their ranks.
+    """Gather one integer from each process, in the order of their ranks.
 
     Args:
         world_size: number of processes.

@@ -120,9 +120,9 @@ def _capture(
 
 
 CAPACITY_STEP = 1 << 16
-"""Granularity in instances of the capacity of a shared buffer."""
+"""Granularity of the capacity of a buffer shared by all tiles, in instances (pairs of splat and tile)."""
 TILE_STEP = 32
-"""Granularity in instances of the capacity of each tile's buffer."""
+"""Granularity of the capacity of each tile's own buffer, in instances (pairs of splat and tile)."""
 HEADROOM = 1.25
 """Capacity relative to a frame's need, so that a moving scene seldom exceeds it."""
 
@@ -168,7 +168,7 @@ class TileListCapacity:
 
 
 class FrameNeeds(NamedTuple):
-    """Instances needed by rendered frames, and the number of overflows."""
+    """Tile-list entries (instances) needed by rendered frames, and the number of overflows."""
 
     instances: int
     """Largest number of instances in all tiles of a frame."""

@@ -49,13 +49,17 @@ class StepOperations:
     spherical_harmonics: Callable[..., Tensor]
     bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
     rasterize_to_pixels: Callable[..., tuple[Tensor, ...]]
-    """Returns colours, alphas, and further values that `render_splats` passes on to its caller."""
+    """Function that returns colours, alphas, and further values that `render_splats` passes on to its caller."""
     splat_rays: Callable[..., tuple[Tensor, Tensor]] | None = None
     blend_rays: Callable[..., tuple[Tensor, ...]] | None = None
-    """Distance along rays and normals, as `gsplat_core.ops.splat_rays` and `gsplat_core.ops.ray_blending`."""
+    """Function that blends the distance along rays and the normals, as in `gsplat_core.ops.ray_blending`. Its input
+    comes from `splat_rays`.
+    """
     values_of_rows: Callable[..., Tensor] | None = None
     visible_harmonics: Callable[..., Tensor] | None = None
-    """Values of packed rows, as in `gsplat_core.ops.packed_projection`."""
+    """Function that evaluates the spherical harmonics of packed rows (visible pairs of camera and Gaussian), as in
+    `gsplat_core.ops.packed_projection`.
+    """
     zero_gradients_stay_zero: bool = False
     """True if a zero gradient stays zero in backward operations, even times NaN, as on CUDA."""
 
@@ -220,7 +224,7 @@ class Signal(NamedTuple):
     degree: int | None
     """Degree of the spherical harmonics; None for plain values."""
     clamped: bool = True
-    """False for harmonics with values below 0."""
+    """True to clamp evaluated harmonics to 0 or more; False to keep negative values."""
 
     def seen(self, ops: StepOperations, means: Tensor, viewmats: Tensor, visible: Tensor) -> Tensor:
         """Return the values [..., C, N, D] seen by each camera, before shift and clamp."""
@@ -371,7 +375,7 @@ class Operations(StepOperations):
     """`rasterization` on top of one implementation of the pipeline's operations."""
 
     in_one_call: Callable[[Arguments, RenderSettings], Rasterized | None] | None = None
-    """Renders in one native call; returns None for unsupported arguments."""
+    """Function that renders in one native call. It returns None for unsupported arguments."""
 
     def rasterization(
         self,

@@ -53,7 +53,7 @@ step_by_step = Operations(
     visible_harmonics=visible_harmonics,
     zero_gradients_stay_zero=True,
 )
-"""Chain of compiled operations, on any supported device."""
+"""Rendering pipeline as a chain of separate compiled operations, on any supported device."""
 _operations = replace(step_by_step, in_one_call=rasterize_in_one_call)
 _PARAMETERS = inspect.signature(_operations.rasterization).parameters
 _POSITIONAL = [name for name, each in _PARAMETERS.items() if each.kind is each.POSITIONAL_OR_KEYWORD]

@@ -190,7 +190,7 @@ class TrainableRenderer(RendererKind, Protocol):
         values: Mapping[str, Tensor],
         depth: bool = True,
     ) -> RenderOutput:
-        """Render a picture that is differentiable in the Gaussians' tensors and in the values [].
+        """Render a picture that is differentiable in the Gaussians' tensors and in the scene-wide scalars `values`.
 
         Args:
             gaussians: scene, `extended`.

@@ -78,7 +78,9 @@ class SampledRenderer:
         return self._drawn
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """See `Renderer.prepare`. Raises InvalidInput for a model on another device or trained by another renderer."""
+        """Set the model of the following frames. Raises InvalidInput for a model on another device or trained by
+        another renderer.
+        """
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
         check_trained_by(self.name, model)
@@ -93,7 +95,7 @@ class SampledRenderer:
                 self._scene = STORAGES[self._options.storage](model.gaussians)
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
-        """See `Renderer.render`."""
+        """Enqueue the sampled picture of the prepared model; see `Renderer.render`."""
         asked = checked_outputs(self.name, outputs, self.capabilities)
         check_camera(self._camera, camera)
         if self._model is None:

@@ -62,7 +62,7 @@ class Surface(NamedTuple):
 
 
 def certainty(unseen_s: Tensor) -> Tensor:
-    """Return the confidence [N] in Gaussians, 0 to 1, by the time [N] in seconds since last seen."""
+    """Return the confidence [N] in Gaussians, 0 to 1, from the time [N] in seconds since each was last visible."""
     return 1 / (1 + unseen_s / HALVED_AFTER_S)
 
 

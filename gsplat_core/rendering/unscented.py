@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class UnscentedCamera(NamedTuple):
-    """Arguments of `rasterization` that only the unscented transform and blending along rays take."""
+    """Arguments of `rasterization` that are used only by the unscented transform and by blending along rays."""
 
     with_ut: bool
     with_eval3d: bool
@@ -41,7 +41,7 @@ class UnscentedCamera(NamedTuple):
 
     @property
     def given(self) -> bool:
-        """True if any argument differs from its default."""
+        """True if any argument was passed that differs from its default."""
         return any(
             value is not None and value is not False and getattr(value, "name", None) != "GLOBAL" for value in self
         )
@@ -123,7 +123,8 @@ def with_unscented_camera(
     def bin_by_boxes(
         *arguments: Any, conics: Tensor, opacities: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
-        # The response along rays is no ellipse in the picture, so only the boxes of the splats limit their tiles.
+        # Evaluated along rays, a splat is no ellipse in the picture, so only the bounding boxes of the splats limit
+        # their tiles.
         return ops.bin_splats(*arguments, **options)
 
     changes: dict[str, Any] = {"in_one_call": None}

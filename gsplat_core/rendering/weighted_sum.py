@@ -77,7 +77,9 @@ class WeightedSumRenderer:
         self._values: dict[str, Tensor] = {}
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """See `Renderer.prepare`. Raises InvalidInput for a model on another device, InvalidSetting for one of another renderer."""
+        """Set the model of the following frames. Raises InvalidInput for a model on another device, InvalidSetting for
+        one of another renderer.
+        """
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
         check_trained_by(self.name, model, self.name)
@@ -89,7 +91,7 @@ class WeightedSumRenderer:
         }
 
     def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
-        """See `Renderer.render`."""
+        """Enqueue the picture of the prepared model; see `Renderer.render`."""
         asked = checked_outputs(self.name, outputs, self.capabilities)
         check_camera(self._camera, camera)
         if self._model is None:
@@ -102,7 +104,9 @@ class WeightedSumRenderer:
 
     @classmethod
     def extended(cls, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians with the renderer's tensors; missing ones start with the present opacity and v_i = 1."""
+        """Return the Gaussians with the renderer's tensors. Missing ones start with the present opacity in all
+        directions and v_i = 1.
+        """
         extra = dict(gaussians.extra)
         if OPACITY not in extra:
             extra[OPACITY] = gaussians.means.new_zeros(gaussians.count, OPACITY_BASES)
@@ -113,7 +117,7 @@ class WeightedSumRenderer:
 
     @classmethod
     def first_values(cls, distance: float) -> dict[str, float]:
-        """Return the scene's values before training, all positive.
+        """Return the values for the whole scene before training, all positive.
 
         Args:
             distance: typical distance of the scene from the camera, in its unit.
@@ -134,7 +138,7 @@ class WeightedSumRenderer:
         values: Mapping[str, Tensor],
         depth: bool = True,
     ) -> RenderOutput:
-        """See `TrainableRenderer.picture`."""
+        """Render a differentiable picture; see `TrainableRenderer.picture`."""
         viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device, gaussians.dtype))
         position = torch.as_tensor(camera.position, dtype=gaussians.dtype).to(gaussians.device, non_blocking=True)
         directions = gaussians.means - position
@@ -178,34 +182,36 @@ def _opacities(harmonics: Tensor, directions: Tensor) -> Tensor:
 
 
 class DirectWeightedSumRenderer(WeightedSumRenderer):
-    """Variant with ω = 1."""
+    """Weighted-sum renderer in which every weight ω is 1."""
 
     name: ClassVar[str] = "weighted_sum_direct"
     rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, "background": 1e-2}
 
     @classmethod
     def first_values(cls, distance: float) -> dict[str, float]:
-        """See `WeightedSumRenderer.first_values`."""
+        """Return the values for the whole scene before training; the weights have none."""
         return {"background": 0.1, "distance": distance}
 
     @classmethod
     def weights(cls, depths: Tensor, gaussians: Gaussians, values: Mapping[str, Tensor]) -> Tensor:
-        """See `WeightedSumRenderer.weights`."""
+        """Return the weights ω [N], all 1."""
         return torch.ones_like(depths)
 
 
 class ExpWeightedSumRenderer(WeightedSumRenderer):
-    """Variant with ω = exp(-σ (d/D)^β), D the distance at the start, σ and β learned for the scene."""
+    """Weighted-sum renderer with ω = exp(-σ (d/D)^β). D is the typical camera distance before training. σ and β are
+    learned for the scene.
+    """
 
     name: ClassVar[str] = "weighted_sum_exp"
     rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, "sigma": 5e-3, "beta": 5e-3, "background": 1e-2}
 
     @classmethod
     def first_values(cls, distance: float) -> dict[str, float]:
-        """See `WeightedSumRenderer.first_values`."""
+        """Return the values for the whole scene before training, with σ = 1 and β = 1."""
         return {**super().first_values(distance), "sigma": 1.0, "beta": 1.0}
 
     @classmethod
     def weights(cls, depths: Tensor, gaussians: Gaussians, values: Mapping[str, Tensor]) -> Tensor:
-        """See `WeightedSumRenderer.weights`."""
+        """Return the weights ω [N] of the Gaussians at the camera depths [N]."""
         return torch.exp(-values["sigma"] * (depths.clamp(min=0) / values["distance"] + 1e-12) ** values["beta"])

@@ -12,7 +12,7 @@ from typing import Literal
 from gsplat_core.registry import Registry
 
 BELIEVED = 0.5
-"""Confidence from which a depth is used where it can only be used or rejected."""
+"""Confidence from which a depth is used, in steps that either use or reject it."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,9 @@ class DepthOrigin:
     differences between the eyes move Gaussians.
     """
     least_confidence: float = BELIEVED
-    """Confidence from which the depth is a better start value than an extrapolation of its surroundings."""
+    """Smallest confidence at which the depth is a better start value of new Gaussians than an extrapolation of its
+    surroundings.
+    """
     edge_margin_px: int = 0
     """Margin around unknown pixels within which the depth is not trained on. Half of it applies to start values."""
     tool_margin_px: int = 0

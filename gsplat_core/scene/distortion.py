@@ -29,7 +29,7 @@ FTHETA_PIXEL_CENTRE = 0.5
 
 
 class FThetaPolynomialType(Enum):
-    """Polynomial of an f-theta camera that is exact; the other one is an approximate inverse."""
+    """Polynomial that defines an f-theta camera exactly; the other one is an approximate inverse."""
 
     PIXELDIST_TO_ANGLE = 0
     ANGLE_TO_PIXELDIST = 1
@@ -157,7 +157,7 @@ class Lens:
 
     @torch.no_grad()
     def fold_limit(self, Ks: Tensor) -> Tensor:
-        """Return the bound [..., C, 1] of points before the lens folds over.
+        """Return the largest radius or angle [..., C, 1] of points for which the lens model is one-to-one.
 
         It is the radius at z = 1 of a pinhole lens, and the angle to the axis in radians of a fisheye lens.
         """

@@ -47,7 +47,7 @@ class Frame:
     depth_origin: DepthOrigin | None = None
     """Origin of `depth`; None without depth. Depth without an origin counts as recorded with the frame (`MEASURED`)."""
     ranges: RangeScan | None = None
-    """Scan of a range sensor at the camera's place; None without one."""
+    """Scan of a range sensor at the camera's position; None without one."""
     mask: NDArray[np.uint8] | None = None
     """Tissue mask [H, W]; 1 = tissue (keep), 0 = tool."""
     pose: NDArray[np.float64] | None = None
@@ -63,7 +63,7 @@ class Frame:
     Used outside the field of view and for a recorder's overlay. None excludes nothing.
     """
     rehearsal_mask: NDArray[np.uint8] | None = None
-    """Rehearsal mask uint8 [H, W]; 0 excludes a pixel from the rehearsal loss but not from display.
+    """Mask uint8 [H, W] for training again on past frames; 0 excludes a pixel from that loss but not from display.
 
     Used for highlights, which move with the light instead of the tissue.
     """

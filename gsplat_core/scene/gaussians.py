@@ -199,7 +199,7 @@ RAW_COLUMNS = 16
 POSITION = slice(0, 3)
 """Columns of the position delta x, y, z in a raw row."""
 ROTATION = slice(3, 7)
-"""Quaternion as w, x, y, z."""
+"""Columns of the quaternion delta w, x, y, z in a raw row."""
 LOG_SCALE = slice(7, 10)
 COLOUR = slice(10, 13)
 """Columns of the delta of the degree-0 spherical-harmonics coefficient: red, green, blue."""

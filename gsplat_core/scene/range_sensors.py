@@ -65,7 +65,9 @@ class TimeOfFlight(RangeSensor):
     name = "time_of_flight"
 
     def factors(self, camera: Camera) -> NDArray[np.float32] | None:
-        """See `RangeSensor`. Raises InvalidInput for a camera other than a pinhole."""
+        """Return measured distance / depth z of each pixel [H, W]. Raises InvalidInput for a camera other than a
+        pinhole.
+        """
         if camera.model != "pinhole":
             raise InvalidInput(
                 f"the sensor {self.name!r} is for pinhole cameras, this one is {camera.model}; use structured_light"
@@ -82,7 +84,7 @@ class StructuredLight(RangeSensor):
     name = "structured_light"
 
     def factors(self, camera: Camera) -> NDArray[np.float32] | None:
-        """See `RangeSensor`."""
+        """Return None, because the sensor measures the depth z."""
         return None
 
 
@@ -104,7 +106,7 @@ class OctLine(RangeSensor):
             )
 
     def factors(self, camera: Camera) -> NDArray[np.float32] | None:
-        """See `RangeSensor`."""
+        """Return 1 in the measured row of the picture and 0 elsewhere, [H, W]."""
         factors = np.zeros((camera.height_px, camera.width_px), np.float32)
         first = round(self.row * camera.height_px - self.thickness_px / 2)
         first = min(max(first, 0), max(camera.height_px - self.thickness_px, 0))

@@ -99,7 +99,7 @@ class GaussianRows:
             tensor[first:] = values
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Remove Gaussians by applying row moves."""
+        """Remove Gaussians by moving rows into their gaps."""
         for tensor in self.all.tensors().values():
             moves.apply(tensor, 0.0)
         self._make_inert(moves.count)
