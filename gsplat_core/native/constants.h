@@ -16,7 +16,7 @@ constexpr float kMaxRadiusPx = 1e9f;          // fits in an int32
 constexpr float kFieldOfViewMargin = 0.3f;    // in half fields of view; the pinhole Jacobian is clamped outside
 constexpr int kTileSize = 16;                 // px
 
-// Upper bound of alpha, for calls that override kMaxAlpha.
+// Upper bound of alpha and its logarithm, for calls that replace kMaxAlpha by another bound.
 struct AlphaLimit {
   float most = kMaxAlpha, log2_most = kLog2MaxAlpha;
 };

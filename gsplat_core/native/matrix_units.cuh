@@ -40,7 +40,7 @@ struct Split {
 
 struct SplitLeft {
   uint32_t high[4], low[4];
-  // Elements of the lane: (row, k 0), (row + 8, k 0), (row, k 1), (row + 8, k 1).
+  // Split the lane's elements of a left operand: (row, k 0), (row + 8, k 0), (row, k 1), (row + 8, k 1).
   __device__ SplitLeft(float a0, float a1, float a2, float a3) {
     const Split s0(a0), s1(a1), s2(a2), s3(a3);
     high[0] = s0.high, high[1] = s1.high, high[2] = s2.high, high[3] = s3.high;
@@ -69,7 +69,8 @@ __device__ __forceinline__ void copy_16(void* shared, const void* from) {
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(uint32_t(__cvta_generic_to_shared(shared))), "l"(from));
 }
 
-// As above if `inside`; otherwise write 16 zero bytes. `from` must be readable in both cases.
+// Start an asynchronous copy of 16 bytes to shared memory if `inside`; otherwise write 16 zero bytes. `from` must be
+// readable in both cases.
 __device__ __forceinline__ void copy_16(void* shared, const void* from, bool inside) {
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(uint32_t(__cvta_generic_to_shared(shared))), "l"(from),
                "r"(inside ? 16 : 0));
@@ -80,7 +81,7 @@ __device__ __forceinline__ void wait_for_copies() { asm volatile("cp.async.wait_
 // Close the current group of asynchronous copies.
 __device__ __forceinline__ void commit_copies() { asm volatile("cp.async.commit_group;" ::: "memory"); }
 
-// Wait until all but the last `kGroups` groups have completed.
+// Wait until all groups of asynchronous copies except the last `kGroups` have completed.
 template <int kGroups>
 __device__ __forceinline__ void wait_for_copies() {
   asm volatile("cp.async.wait_group %0;" ::"n"(kGroups) : "memory");

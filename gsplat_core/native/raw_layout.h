@@ -10,7 +10,7 @@ constexpr int kRawColor = 10;    // red, green, blue of the first spherical-harm
 constexpr int kRawOpacity = 13;  // logit
 constexpr int kRawUsed = 14;     // later columns are unused and zero
 
-// The basis-function field changes the columns before the opacity.
+// Number of columns that the basis-function field changes: all before the opacity.
 constexpr int kRawBasisChannels = kRawOpacity;
 
 // Outputs of the HexPlane field's network, in the order position, log-scale, rotation, opacity.

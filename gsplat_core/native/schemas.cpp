@@ -11,8 +11,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
-  // As above, with the learning rate (float32) and step (int64) read from device memory. The number of skipped rows is
-  // added to `skipped` (int64).
+  // In-place Adam step of one dense tensor, with the learning rate (float32) and step (int64) read from device memory.
+  // The number of skipped rows is added to `skipped` (int64).
   m.def(
       "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
       "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
@@ -46,8 +46,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "blend_world(Tensor gaussians, Tensor colors, Tensor opacities, Tensor rays, Tensor isect_offsets, Tensor flatten_ids, "
       "Tensor? masks, int tile_size, float max_alpha) -> (Tensor colors, Tensor through)");
 
-  // As above for visible pairs of camera and Gaussian only, in ascending order of their ids: (batch * cameras + camera) *
-  // gaussians + gaussian (int64 [rows]). The gradients have one row per pair. The host waits for the number of pairs.
+  // Projection of visible pairs of camera and Gaussian only, in ascending order of their ids: (batch * cameras +
+  // camera) * gaussians + gaussian (int64 [rows]). The gradients have one row per pair. The host waits for the number
+  // of pairs.
   m.def(
       "project_visible(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
       "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
@@ -58,7 +59,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor ids, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
       "float eps2d, int camera_model, bool needs_viewmats, float compensation_floor) -> (Tensor v_means, Tensor v_covars, "
       "Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
-  // Adds values [rows, D] of pairs to their Gaussians [B, N, D], camera by camera.
+  // Add values [rows, D] of visible pairs of camera and Gaussian to their Gaussians [B, N, D], camera by camera.
   m.def("add_packed_rows_(Tensor(a!) out, Tensor values, Tensor ids, int cameras) -> ()");
 
   // Colours of R rows of directions [R, M, 3]; all rows share the coefficients [M, K, 3]. The result is 0 where the
@@ -87,9 +88,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
-  // As above with a fixed list length `capacity`, so that the host does not wait for the required length. Unused
-  // entries are -1 and precede the first tile's list. If the list overflows, the farthest splats are dropped. `needed`
-  // (int64 [1]) is the required length.
+  // Tile intersection with a fixed list length `capacity`, so that the host does not wait for the required length.
+  // Unused entries are -1 and precede the first tile's list. If the list overflows, the farthest splats are dropped.
+  // `needed` (int64 [1]) is the required length.
   m.def(
       "bin_splats_within(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, "
       "int images, int tile_size, int tile_width, int tile_height, int capacity) -> (Tensor tiles_per_gauss, "
@@ -122,7 +123,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "blend_rays(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
       "Tensor flatten_ids, int width, int height, float max_alpha=0.99) -> (Tensor values, Tensor alphas, Tensor depths, "
       "Tensor medians, Tensor variances, Tensor last, Tensor median_at)");
-  // Largest blending weight [N] of each splat over the pixels; arguments as above.
+  // Largest blending weight [N] of each splat over the pixels; arguments as for blend_rays.
   m.def(
       "splat_contributions(Tensor means2d, Tensor conics, Tensor opacities, Tensor rays, Tensor values, Tensor isect_offsets, "
       "Tensor flatten_ids, int width, int height, float max_alpha=0.99) -> Tensor");
@@ -285,13 +286,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
-  // As above for the frame path: image [H, W, 4] with colours and the weighted sum of z, alphas [H, W]. Returns (loss,
-  // terms, dL/dimage, dL/dalphas).
+  // Loss over tissue pixels and its gradients for the frame path: image [H, W, 4] with colours and the weighted sum of
+  // z, alphas [H, W]. Returns (loss, terms, dL/dimage, dL/dalphas).
   m.def(
       "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
       "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
-  // Write up to 64 values, passed as kernel arguments.
+  // Write up to 64 numbers, passed as kernel arguments, to device memory without a copy from the host.
   m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");
 
   // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the two halves of

@@ -35,7 +35,7 @@ GSPLAT_INLINE void store_rows(float* p, int64_t first, int count, const vfloat* 
     for (int k = 0; k < K; ++k) p[i * K + k] = transposed[k][i];
 }
 
-// As store_rows, but add to the memory contents.
+// Store one row per lane like store_rows, but add to the memory contents.
 template <int K>
 GSPLAT_INLINE void add_rows(float* p, int64_t first, int count, const vfloat* columns) {
   p += first * K;

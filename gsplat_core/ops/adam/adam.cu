@@ -8,11 +8,11 @@ constexpr int kMostRows = 1024;            // per block
 constexpr int64_t kChunk = 4 * kThreads;   // values per block, unless a row is longer
 constexpr int64_t kFew = 1024 * kThreads;  // up to this size one value per thread, for more memory requests in flight
 
-// Step whose factors were computed on the host.
+// Return the factors of a step that were computed on the host.
 __device__ __forceinline__ AdamStep step_of(const AdamStep& step) { return step; }
 
-// Step computed from device memory. One thread per block computes the powers in double; -expm1 keeps 1 - beta^t
-// accurate for beta near 1 and small t. Ends with a barrier.
+// Compute the factors of a step from device memory. One thread per block computes the powers in double; -expm1 keeps 1
+// - beta^t accurate for beta near 1 and small t. Ends with a barrier.
 __device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
   __shared__ float rate, inv_bias2;
   if (threadIdx.x == 0) {

@@ -43,7 +43,8 @@ AdamStep step_of(int64_t step, double learning_rate, const Options& o) {
           o.row_size};
 }
 
-// Both versions add the number of skipped rows to `skipped` in device memory.
+// Step with the factors from the host, and step with learning rate and step number in device memory. Both add the
+// number of skipped rows to `skipped` in device memory.
 #if defined(GSPLAT_CUDA)
 
 void update(const Call& call, const Rows& rows, const AdamStep& step, int64_t* skipped) {

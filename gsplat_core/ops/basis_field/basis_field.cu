@@ -113,7 +113,7 @@ __global__ void __launch_bounds__(kBlock)
   }
 }
 
-// As above for all channels, with the difference to `target` [N, 13] as the change.
+// Minimum-norm change of all weights such that the deltas become `target` [N, 13].
 __global__ void __launch_bounds__(kBlock)
     move_to(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ target) {
   const Place at;

@@ -28,7 +28,7 @@ __device__ __forceinline__ Update adam_update(Update old, float g, float rate, f
   return {old.parameter - rate * m * reciprocal(root(v) * inverse_root_bias2 + a.epsilon), m, v};
 }
 
-// As above for a lane's own bump parameter: a centre or a log-width.
+// Update a lane's own bump parameter, a centre or a log-width, in memory with `adam_update`.
 __device__ __forceinline__ void update_own(float* p, float* m, float* v, int64_t own, const Update& old, float g, float rate,
                                            float inverse_root_bias2, const DeviceBasisAdam& a) {
   const Update now = adam_update(old, g, rate, inverse_root_bias2, a);

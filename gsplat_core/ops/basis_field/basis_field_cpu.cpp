@@ -185,7 +185,7 @@ GSPLAT_INLINE void adam_update(vfloat& p, vfloat& m, vfloat& v, vfloat g, vfloat
   p -= rate * m / (square_root(v) * inverse_root_bias2 + a.epsilon);
 }
 
-// As above for the active lanes of one [N, B] tensor.
+// Apply `adam_update` to the active lanes of one [N, B] tensor.
 GSPLAT_INLINE void adam_update_active(float* p, float* m, float* v, vfloat g, vint active, vfloat rate, vfloat inverse_root_bias2,
                                       int64_t count, const BasisAdam& a) {
   const vfloat p0 = load_first(p, count), m0 = load_first(m, count), v0 = load_first(v, count);

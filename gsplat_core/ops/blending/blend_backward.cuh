@@ -10,8 +10,8 @@ namespace {
 constexpr int kShapeMoments = 6;    // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
 constexpr int kBackwardBatch = 64;  // splats staged per batch
 
-// A gradient row: the moments, |dL/dx| and |dL/dy| (with absgrad, or for any number of channels), then the colours.
-// Padded to whole float4s.
+// Number of values of a gradient row without the colours: the moments, then |dL/dx| and |dL/dy| (with absgrad, or if
+// the number of channels is not compiled in). Rows are padded to whole float4s.
 constexpr int shape_size(int D, bool absgrad) { return kShapeMoments + (D == 0 || absgrad ? 2 : 0); }
 constexpr int quads_of(int shape, int channels) { return (shape + channels + 3) / 4; }
 
@@ -62,7 +62,7 @@ __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32]
   return count;
 }
 
-// A pixel's terms of a splat's gradient; computing them advances the pixel to in front of the splat.
+// Terms of a splat's gradient at one pixel. Computing them moves the pixel's state in front of the splat.
 struct Terms {
   float s, w;  // both in units of 1 / AlphaLimit::most
 };

@@ -14,8 +14,8 @@ struct BlendedPixels {
   int last[kPixelsEach];
 };
 
-// A pixel is closed once the transmittance after all its splats, including the one that closed it, is at most
-// kMinTransmittance.
+// Window blended front to back by a block. A pixel is closed once the transmittance after all its splats, including the
+// one that closed it, is at most kMinTransmittance.
 template <int D, bool kCapped, bool kLast>
 struct FloatPixels {
   float front[kPixelsEach];  // transmittance in front of the next splat

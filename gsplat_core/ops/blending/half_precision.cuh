@@ -13,8 +13,8 @@
 namespace gsplat::blending {
 namespace {
 
-// Opacities are scaled so that the smallest normal half-precision number corresponds to the alpha cut-off. Flushing
-// denormals to zero then implements the cut-off. Before that step they are in units of 1 / kHalfUnits.
+// Opacities are scaled so that the smallest normal half-precision number corresponds to the alpha cut-off (1/255).
+// Flushing denormals to zero then implements the cut-off. Before flushing, opacities are in units of 1 / kHalfUnits.
 constexpr float kHalfUnits = 64.875f;  // 2^-14 of them are 1/255 of 1 / 0.99, to within 4e-4
 constexpr float kLog2HalfUnits = 6.0195907f;
 constexpr float kGreatestHalf = 65504;
@@ -116,7 +116,7 @@ struct HalfSplats {
   uint32_t shapes[kTiles / 2][4];  // for two tiles: high, low, high, low
   uint32_t colors[kTiles];
 
-  // `hits`: shared-memory address of the list of the splats' addresses.
+  // Load the operands of splats. `hits` is the shared-memory address of a list of the splats' addresses.
   __device__ explicit HalfSplats(uint32_t hits) {
     constexpr uint32_t kEachTile = 2 * sizeof(uint16_t);
     const int row = threadIdx.x % 8, matrix = threadIdx.x / 8 % 4;
@@ -180,7 +180,7 @@ struct HalfWeights {
   __device__ bool closes(const HalfPixels& pixels) const {
     return !__hbge2(behind, __hmin2(pixels.front, __float2half2_rn(kMinTransmittance)));
   }
-  // Remove the splats that would close a pixel, and all splats behind them.
+  // Remove the splat at which a pixel closes, and all splats behind it.
   __device__ void cut() {
     const __half2 most = __float2half2_rn(kMaxAlpha), stop = __float2half2_rn(kMinTransmittance);
     __half2 through = __float2half2_rn(1);

@@ -102,7 +102,8 @@ __device__ inline void add_moments(const Record<D>& r, const Falloff& f, const B
   }
 }
 
-// For any number of channels: the whole block processes one splat at a time, and 16 values of its row at a time.
+// Gradient rows for any number of channels: the whole block processes one splat at a time, and 16 values of its row at
+// a time.
 template <bool kAbs>
 __global__ void __launch_bounds__(kBlockThreads)
     backward_windows_of_any(Inputs in, const Record<0>* records, PictureGradient from, float4* rows, float* background_parts) {

@@ -37,7 +37,7 @@ __global__ void __launch_bounds__(kBlockThreads, 8) composite_windows(Inputs in,
   write_pixels<D>(in, place, w, blended, out);
 }
 
-// For any number of channels: the sums are accumulated in the image.
+// Blending for any number of channels: the sums are accumulated in the output image.
 __global__ void __launch_bounds__(kBlockThreads) composite_windows_of_any(Inputs in, const Record<0>* records, Pixels out) {
   __shared__ Record<0> staged[kBlockThreads];
   __shared__ int staged_ids[kBlockThreads];

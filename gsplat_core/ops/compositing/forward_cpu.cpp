@@ -152,7 +152,7 @@ void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* rec
       const float *mean = in.means2d + 2 * splat, *conic = in.conics + 3 * splat, *color = in.colors + channels * splat;
       SplatRecord& r = records[splat];
       const float a = conic[0], b = conic[1], c = conic[2];
-      // NaN if any value is not finite.
+      // 0 times a non-finite value is NaN, so the sum is NaN if any value is not finite.
       float check = 0 * mean[0] + 0 * mean[1] + 0 * a + 0 * b + 0 * c + 0 * in.opacities[splat];
       for (int d = 0; d < channels; ++d) check += 0 * color[d];
       const bool usable = check == 0;
@@ -171,8 +171,8 @@ void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* rec
   }
 }
 
-// Layout: colours (forward) or their gradients (backward) of a window; in the backward pass followed by a splat's sums
-// per lane and in total.
+// Return the scratch memory of one thread: colours (forward) or their gradients (backward) of a window, in the backward
+// pass followed by a splat's sums per lane and in total.
 int64_t scratch_floats(int channels) { return int64_t(channels) * (kPixels + kLanes + 1); }
 
 void composite_tile(const Splats& in, int64_t tile, const Pixels& out, float* scratch) {

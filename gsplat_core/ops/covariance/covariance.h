@@ -12,7 +12,8 @@ namespace gsplat::covariance {
 struct Kernels {
   // Computes R S^p S^p R^T with p = 1, or p = -1 if `inverse`, as rows of 6 (upper triangle) or 9 floats.
   void (*forward)(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t begin, int64_t end);
-  // Either output may be null.
+  // Computes the gradients of quaternions and scales from those of covariances and precisions. Either gradient of the
+  // outputs may be null.
   void (*backward)(const float* quats, const float* scales, const float* v_covars, const float* v_precis, bool triu,
                    float* v_quats, float* v_scales, int64_t begin, int64_t end);
 };

@@ -48,7 +48,7 @@ __device__ inline void window(const Fit& fit, const Tile& tile, Shared& shared, 
   }
 }
 
-// Call work(i, pixel) for this thread's pixels of the tile.
+// Call work(i, pixel) for the tile's pixels that this thread processes.
 template <class Work>
 __device__ inline void for_own(const Fit& fit, const Tile& tile, const Work& work) {
 #pragma unroll

@@ -30,7 +30,7 @@ struct Taps {
   float tap[kRadius + 1];
 };
 
-// Images and planes are [height, width].
+// Inputs, settings and results of a refinement. Images and planes are [height, width].
 struct Fit {
   const uint8_t *left, *right;
   const int32_t* sixteenths;

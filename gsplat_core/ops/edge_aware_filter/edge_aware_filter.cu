@@ -30,7 +30,7 @@ struct Equation {
   float before, after, known;
 };
 
-// kEach: pixels per thread, kMostThreads apart.
+// Smooth one line per block. kEach: pixels per thread, kMostThreads apart.
 template <int kEach>
 __global__ void __launch_bounds__(kMostThreads) smooth(Lines lines, int64_t plane_size) {
   extern __shared__ Equation equations[];

@@ -17,7 +17,7 @@ GSPLAT_INLINE float squared_change(const Guide& guide, int64_t one, int64_t othe
   return squares;
 }
 
-// Convert squared changes to links, in place.
+// Convert squared changes of the guide between neighbouring pixels to links (weights of the smoothing), in place.
 GSPLAT_INLINE void weaken(float* links, int64_t count, float per_step) {
   const float scale = -1.44269504f * per_step;
   for (int64_t x = 0; x < count; x += kLanes) {
@@ -40,7 +40,7 @@ void link(const Guide& guide, float* right, float* down, int64_t begin, int64_t 
   }
 }
 
-// Load the pixels of neighbouring lines; the last group may have fewer lines than lanes.
+// Load the pixels of neighbouring lines, one line per vector lane; the last group may have fewer lines than lanes.
 GSPLAT_INLINE vfloat take(const float* from, int64_t across, int lanes) {
   if (across == 1 && lanes == kLanes) return load(from);
   vfloat taken = vfloat{};

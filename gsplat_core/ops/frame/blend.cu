@@ -34,7 +34,8 @@ struct TileSplats {
   }
 };
 
-// Range of a tile's list. With segments, the tile also adds its required length to the status.
+// Return the range of a tile's list. If tiles have their own segments, also add the tile's required length to the
+// status.
 template <Mode mode>
 struct TileList {
   int begin, end;

@@ -23,7 +23,7 @@ constexpr int kRowQuads = 3;              // float4s per gradient row of an inst
 constexpr int kMaxSegment = 1024;         // maximum capacity of a tile's segment
 constexpr int kMaxTilesAcross = 1 << 13;  // tile coordinates are packed into 13 bits
 
-// Indices into the frame's status.
+// Indices into the status of a frame, which reports whether its tile lists overflowed.
 constexpr int kStatusNeeded = 0;    // instances required by the frame
 constexpr int kStatusLongest = 1;   // instances of the longest tile list
 constexpr int kStatusOverflow = 2;  // 1 if the capacity was exceeded and instances were dropped

@@ -68,7 +68,7 @@ __device__ inline RawGaussian load_gaussian(const Scene& in, int64_t n) {
   for (int k = 0; k < 3; ++k) g.log_scale[k] = in.log_scales[3 * n + k] + delta[kRawLogScale + k];
   for (int k = 0; k < 3; ++k) g.color[k] = delta[kRawColor + k];
   g.logit = in.logit_opacities[n] + delta[kRawOpacity];
-  // 0 x is 0 for finite x, otherwise NaN.
+  // 0 times a non-finite value is NaN, so the sum is NaN if any value is not finite.
   float sum = 0 * g.logit;
   for (int k = 0; k < 3; ++k) sum += 0 * g.mean[k] + 0 * g.log_scale[k] + 0 * g.color[k];
   for (int k = 0; k < 4; ++k) sum += 0 * g.quat[k];

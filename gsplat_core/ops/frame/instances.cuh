@@ -27,7 +27,8 @@ __device__ inline uint32_t inclusive_warp_sum(uint32_t value) {
   }
   return value;
 }
-// `warp_sums` is shared memory for 32 values; it may be reused after the next barrier.
+// Return the prefix sum of `value` over the threads of a block. `warp_sums` is shared memory for 32 values; it may be
+// reused after the next barrier.
 __device__ inline BlockSum sum_over_block(uint32_t value, uint32_t* warp_sums) {
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, warps = int(blockDim.x) / 32;
   const uint32_t through = inclusive_warp_sum(value), before = __shfl_up_sync(kAll, through, 1);

@@ -73,7 +73,7 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   }
   const uint32_t depth = footprint.y != 0 ? __float_as_uint(p.depth) : 0;
   if (lists.segment > 0) {
-    // Every tile has its own segment, so keys can be written before the list lengths are known.
+    // In the mode with one segment per tile, keys can be written before the list lengths are known.
     if (n == 0)
       for (int i = 0; i < kStatusSize; ++i) lists.status[i] = 0;  // blend adds the counts of the tiles
     __syncwarp();                                                 // all records are written, and all coefficients are read

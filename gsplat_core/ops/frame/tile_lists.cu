@@ -25,7 +25,8 @@ struct Total {
 
 __device__ inline Total unpack(uint64_t state) { return {uint32_t(state) & kMaxSum, uint32_t(state >> 32) & kMaxSum}; }
 
-// The returned total is valid only in the first thread of the last block.
+// Return the prefix sum of the counts of one block. The returned total is valid only in the first thread of the last
+// block.
 __device__ inline Total scan_part(const Counts& in, int64_t block) {
   __shared__ uint32_t warp_sums[32], warp_maxima[32];
   __shared__ Total preceding;

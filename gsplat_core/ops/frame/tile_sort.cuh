@@ -31,7 +31,7 @@ __device__ inline void sort_in_registers(uint64_t (&keys)[kEach], int count, uin
 #pragma unroll
       for (int i = 0; i < kEach; ++i)
         if ((i & distance) == 0) compare_exchange(keys[i], keys[i | distance], (i & size) == 0);
-  // From here on, `size` and `step` are in threads.
+  // From here on, neighbouring keys are in other threads: `size` and `step` count threads.
   for (int size = 1; size <= kBlockThreads && size * kEach < 2 * count; size *= 2) {
     const bool ascending = (t & size) == 0;
     for (int step = size / 2; step > 0; step /= 2) {

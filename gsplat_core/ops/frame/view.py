@@ -33,7 +33,9 @@ class View(NamedTuple):
     eps2d: float = EPS2D
     near_plane: float = NEAR_PLANE
     far_plane: float = FAR_PLANE
-    """Camera model, blur and clipping planes have the meaning and defaults of `gsplat_core.rasterization`."""
+    """Largest rendered z. Camera model, blur and clipping planes have the meaning and defaults of
+    `gsplat_core.rasterization`.
+    """
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -15,7 +15,7 @@ struct ColourCorrection {
   const float* relaxation;  // [1]
 };
 
-// dL/dimage, and the forward pass's results that are not in `Lists`.
+// dL/dimage, dL/dalphas and the results of the forward pass that are not in `Lists`.
 struct PictureGradient {
   const float* v_image;   // [H, W, 4]: red, green, blue, sum of w z
   const float* v_alphas;  // [H, W], or null for zero

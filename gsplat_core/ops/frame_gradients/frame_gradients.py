@@ -41,14 +41,18 @@ class GaussianAdam(NamedTuple):
     """
 
     first_moments: Sequence[Tensor]
-    """Five contiguous tensors with the Gaussians' shapes and separate memory; also `second_moments`."""
+    """First moments of Adam: five contiguous tensors with the Gaussians' shapes and separate memory. The same holds for
+    `second_moments`.
+    """
     second_moments: Sequence[Tensor]
     rates: Tensor
     """Learning rates in the order of the tensors, float32 [5]."""
     step: Tensor
-    """Step number from 1, int64 or int32 [1]; smaller values count as 1."""
+    """Number of the optimiser step, counted from 1, int64 or int32 [1]; smaller values count as 1."""
     skipped: Tensor
-    """Number of rows left unchanged so far, for each tensor, int64 [5]; incremented by the step."""
+    """Number of rows left unchanged so far because of non-finite gradients, for each tensor, int64 [5]; incremented by
+    the step.
+    """
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 

@@ -1,5 +1,5 @@
-// As splat_gradients.cu, followed by Adam in the same kernel. The Gaussians' gradients are never stored in global
-// memory.
+// Gradients of the Gaussians' raw parameters as in splat_gradients.cu, followed by Adam in the same kernel. The
+// gradients are never stored in global memory.
 #include "warp_rows.cuh"
 
 namespace gsplat::frame {
@@ -36,7 +36,7 @@ __device__ inline AdamFactors factors_of(const Adam& adam, int lane) {
   return f;
 }
 
-// Accurate to 2 ulp, which is negligible compared to Adam's epsilon and learning rates.
+// Square root with an error of 2 ulp, which is negligible compared to Adam's epsilon and learning rates.
 __device__ inline float square_root(float x) {
   float y;
   asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -73,7 +73,7 @@ __device__ inline void update_value(const Adam& adam, int tensor, int64_t at, fl
   update(adam.parameters[tensor][at], g, adam.first[tensor][at], adam.second[tensor][at], f.rates[tensor], f);
 }
 
-// All tensors except the last (sh), and their columns in a raw row.
+// Number of tensors except the last (sh), and their columns in a raw row.
 constexpr int kSmall = kTensors - 1;
 constexpr int small_columns(int tensor) { return tensor == 1 ? 4 : tensor == 3 ? 1 : 3; }
 constexpr int small_offset(int tensor) {

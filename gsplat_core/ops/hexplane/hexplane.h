@@ -26,8 +26,8 @@ struct HexPlanes {
   int64_t channels;
 };
 
-// Inference at a fixed time: cached space features times three lines per level, then an MLP with ReLU between its
-// layers.
+// Largest numbers of levels and layers for inference at a fixed time, which multiplies cached space features by three
+// lines per level and decodes them by an MLP with ReLU between its layers.
 constexpr int kMaxLevels = 16;
 constexpr int kMaxLayers = 66;
 
@@ -72,7 +72,7 @@ struct Kernels {
   // Computes features[n, c] = space[n, c] * product over the axes of line[axis] (given [U, C]) at the point's x, y, z.
   void (*modulate)(const HexPlanes& level, const float* space, float* features, int64_t begin, int64_t end);
   int lanes;  // padding multiple of a decoded layer's outputs
-  // `buffer` holds 2 * kBlockRows * stride floats.
+  // Decodes the features of Gaussians by the MLP. `buffer` holds 2 * kBlockRows * stride floats.
   void (*decode)(const Decode& d, float* buffer, int64_t begin, int64_t end);
 };
 

@@ -133,8 +133,8 @@ void modulate(const HexPlanes& level, const float* space, float* features, int64
   }
 }
 
-// Outputs that a micro-kernel keeps in registers: rows x vectors of accumulators, the weight vectors, and one broadcast
-// input.
+// Size of the block of outputs that a micro-kernel keeps in registers: rows x vectors of accumulators, next to the
+// weight vectors and one broadcast input.
 #if defined(__AVX512F__)
 constexpr int kTileRows = 6, kTileVectors = 4;
 #else

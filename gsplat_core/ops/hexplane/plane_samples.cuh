@@ -80,7 +80,7 @@ __device__ __forceinline__ Channels<kLane> between(const Channels<kLane>& a, con
   return plus(a, t, b - a);
 }
 
-// The cells around a point: four in a plane, two in a line. Offsets are in floats from the start of the plane.
+// Grid nodes around a point: four in a plane, two in a line. Offsets are in floats from the start of the plane.
 struct Corners {
   int64_t start;
   int32_t right, below;  // offsets to the neighbours; 0 if the axis has only one cell
@@ -108,7 +108,7 @@ struct Sample {
   }
   __device__ Channels<kLane> along_u(const Corners& at) const { return between(p10 - p00, p11 - p01, at.v.fraction); }
   __device__ Channels<kLane> along_v(const Corners& at) const { return between(p01 - p00, p11 - p10, at.u.fraction); }
-  // Compute the value and its derivatives per cell together; they share most of the computation.
+  // Compute the interpolated value and its derivatives along u and v together; they share most of the computation.
   __device__ void value_and_slopes(const Corners& at, Channels<kLane>& value, Channels<kLane>& along_u,
                                    Channels<kLane>& along_v) const {
     const Channels<kLane> upper = p10 - p00, lower = p11 - p01, top = plus(p00, at.u.fraction, upper);
@@ -135,7 +135,8 @@ void with_wide_team(int64_t channels, const Run& run) {
   run(four, std::integral_constant<int, 16>());
 }
 
-// As above for any alignment: 4 channels per lane only if `wide`.
+// Call `run` with the channels per lane and the lanes per team as constants, for any alignment: 4 channels per lane
+// only if `wide`.
 template <class Run>
 void with_team(bool wide, int64_t channels, const Run& run) {
   if (wide) return with_wide_team(channels, run);

@@ -21,7 +21,7 @@ struct LinePlaces {
   int offset[3];  // offset of the left node, in items
   float fraction[3];
 
-  // own: the axis computed by this lane; group: the row's lanes
+  // own: position on the axis that this lane computes; group: the row's four lanes
   __device__ LinePlaces(const LinePosition& own, int group, int channels) {
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) {
@@ -38,8 +38,8 @@ constexpr int blocks_of(int item, int width) {
   return item == 2 ? (width == 32 ? 6 : width == 64 ? 4 : 2) : width == 128 ? 1 : 2;
 }
 
-// kChannels: the number of channels if known at compile time and every line has at least two nodes; 0: read from the
-// input.
+// Compute the deltas of Gaussians in one kernel. kChannels: number of channels if known at compile time and every line
+// has at least two nodes; 0: read from the input.
 template <class T, int kWidth, bool kLines, int kChannels>
 __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_of(int(sizeof(T)), kWidth))
     deltas_kernel(FieldInput in, FieldNetwork net, const void* packed, float* deltas, float* hidden) {

@@ -41,7 +41,7 @@ __device__ float packed_bias(const FieldNetwork& net, int at) {
   return output >= 0 && (head || output < net.width) ? net.biases[layer][output] : 0.0f;
 }
 
-// blockIdx.y selects a line; the last index selects the network.
+// Interpolate the lines and pack the network. blockIdx.y selects a line; the last index selects the network.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     prepare(FieldTimePlanes planes, FieldInput input, const float* time, FieldNetwork net, void* packed) {

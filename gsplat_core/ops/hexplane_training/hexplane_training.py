@@ -40,7 +40,8 @@ class TrainingState(NamedTuple):
     hidden: Tensor
     """Outputs of the trunk's layers, zero-padded, [depth, N, padded width]."""
     order: Tensor
-    """int32 [3, 3 * levels * N]. An item is a pair of plane and Gaussian, numbered plane after plane.
+    """Sort order of the items, int32 [3, 3 * levels * N]. An item is a pair of space plane and Gaussian, numbered plane
+    after plane.
 
     The rows are: the items sorted by the cell of the plane; the index of each item among the sorted ones; and the cells
     of the sorted items. The highest bit of a cell is set if the cell has 8 items or more (dense).

@@ -49,7 +49,7 @@ struct Columns {
   __device__ float4 at(int r, int half) const {
     return make_float4(sums[0][2 * r + half], sums[1][2 * r + half], sums[2][2 * r + half], sums[3][2 * r + half]);
   }
-  // Gradient of ReLU, from its outputs at the same positions.
+  // Set the gradient to zero where ReLU's `outputs` at the same positions are zero.
   __device__ void rectify(int r, int half, const float4& outputs) {
     const float out[4] = {outputs.x, outputs.y, outputs.z, outputs.w};
 #pragma unroll
@@ -57,7 +57,7 @@ struct Columns {
   }
 };
 
-// out += `a` times the weight rows at `first` and `second`.
+// Add `a` times the weight rows at `first` and `second` to the accumulators `out`.
 template <int kOut>
 __device__ __forceinline__ void multiply_rows(Columns (&out)[kOut], const SplitLeft& a, const float* first, const float* second) {
 #pragma unroll

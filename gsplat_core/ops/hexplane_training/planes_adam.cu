@@ -32,7 +32,7 @@ __global__ void __launch_bounds__(kThreads) update_network(NetworkParameters par
       scalars.step);
 }
 
-// A thread processes consecutive channels of one node.
+// Update the nodes of a plane, or write their gradients. A thread processes consecutive channels of one node.
 template <int kLane, class Sink>
 __global__ void __launch_bounds__(kThreads, 5)
     space_nodes(FieldPlanes planes, FieldCells cells, FieldRows rows, PlaneBlocks slots, Sink sink) {

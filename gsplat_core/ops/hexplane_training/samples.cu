@@ -24,7 +24,8 @@ __global__ void __launch_bounds__(kThreads)
   *reinterpret_cast<float4*>(coordinates + 4 * n) = placed;
 }
 
-// One thread per item. Counts are integers, so their atomic sums do not depend on the order.
+// Count the items of each cell, with one thread per item. Counts are integers, so their atomic sums do not depend on
+// the order.
 __global__ void __launch_bounds__(kThreads)
     cells_of(FieldPlanes planes, FieldCells cells, uint32_t* keys, int32_t* items, int32_t* counts) {
   const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -52,7 +53,7 @@ __global__ void __launch_bounds__(kThreads) rank_items(FieldCells cells, int64_t
   if (cell < cells.cells && cells.starts[cell + 1] - cells.starts[cell] >= kDenseCell) cells.keys[i] = cell | kDenseBit;
 }
 
-// A team of lanes processes one Gaussian at one level.
+// Compute features from samples. A team of lanes processes one Gaussian at one level.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads, 3)
     features_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, float* __restrict__ features) {

@@ -105,7 +105,8 @@ struct PlanePenalties {
   float sparsity;         // distance of the time planes from 1
 };
 
-// Computed by one thread before the pass, to avoid computing powers of the decay rates in every thread.
+// Factors of an Adam step, computed by one thread before the pass to avoid computing powers of the decay rates in every
+// thread.
 struct AdamScalars {
   AdamStep step;
   bool skip;  // the frame overflowed: skip the update
@@ -123,8 +124,8 @@ void planes_adam(const FieldPlanes& planes, const FieldLines& lines, const Field
                  const float* line_gradient, const float* time, const PlanesState& state, const PlanesAdam& options,
                  CudaScratch& scratch, cudaStream_t stream);
 
-// The passes with penalties (planes_penalties.cu), over the space planes and over the time planes. `wide`: all rows are
-// aligned to 16 bytes.
+// Adam update with penalties (planes_penalties.cu), one function for the space planes and one for the time planes.
+// `wide`: all rows are aligned to 16 bytes.
 void smooth_space_planes(bool wide, const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
                          const PlanesState& state, float smoothness, const AdamScalars* scalars, CudaScratch& scratch,
                          cudaStream_t stream);

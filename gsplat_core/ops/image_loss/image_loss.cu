@@ -38,7 +38,7 @@ __global__ void __launch_bounds__(kThreads) count_pixels(DeviceImageLoss in, int
   }
   tissue = __reduce_add_sync(0xffffffffu, tissue);
   known = __reduce_add_sync(0xffffffffu, known);
-  // Integer sums do not depend on the order. Warps are reduced in their block first, because all blocks add to the same
+  // Integer sums do not depend on the order. Each warp adds one number per block, because all blocks add to the same
   // address.
   if (threadIdx.x % 32 == 0) {
     atomicAdd(totals + kTissue, tissue);

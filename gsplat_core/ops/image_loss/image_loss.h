@@ -53,7 +53,8 @@ struct DeviceImageLoss {
   const float* target;          // [H, W, channels]; null if target_bytes is set
   const uint8_t* target_bytes;  // [H, W, channels], value / 255
   const uint8_t* mask;          // [H, W], non-zero = tissue; null: all pixels
-  // Depth: either a plane, or the channel after the colours, not yet divided by alpha. Both null: no depth.
+  // Rendered depth: either a plane, or the channel after the colours, which is not yet divided by alpha. If `depth` and
+  // `alphas` are both null, there is no depth term.
   const float* depth;   // [H, W]
   const float* alphas;  // [H, W], for the frame path
   const float* target_depth;

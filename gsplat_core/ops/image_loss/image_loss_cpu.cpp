@@ -106,8 +106,8 @@ GSPLAT_INLINE vint valid_depth(const float* depth, const float* target, const ui
   return valid;
 }
 
-// Call `on(offset, depth, target, mask, count)` for kLanes pixels at a time. The remaining pixels are passed as copies
-// padded with invalid pixels.
+// Call the function `on(offset, depth, target, mask, count)` for kLanes pixels at a time. The remaining pixels are
+// passed as copies padded with invalid pixels.
 template <typename Body>
 GSPLAT_INLINE void for_row(const DepthTask& task, int64_t row, Body on) {
   const int64_t at = row * task.width;

@@ -87,7 +87,7 @@ void run(Call& call, const Images& in, const Weights& weights, const Results& ou
 
 constexpr int64_t kRows = 16;  // minimum rows per task
 
-// Sum the rows in order, independent of the thread that computed them.
+// Return the sum of the rows' partial sums, added in row order, independent of the thread that computed each row.
 template <typename T>
 T total(const std::vector<T>& rows) {
   return std::accumulate(rows.begin(), rows.end(), T(0));

@@ -11,7 +11,7 @@ class ImageLoss(NamedTuple):
     """Image loss with its gradients, the input of the renderer's backward op."""
 
     loss: Tensor
-    """Scalar; differentiable in image and depth."""
+    """Weighted sum of the loss terms, scalar; differentiable in image and depth."""
     terms: Tensor
     """Terms [3] before weighting: L1 or squared error, 1 - SSIM (0 if unweighted), inverse-depth L1.
 

@@ -94,7 +94,7 @@ void backward(const Inputs& in, const float* v_out, float* v_after, float* v_tur
       for (int r = 0; r < 9; ++r) scaled[size_t(9 * i + r)] = m.scale * v_both[r], v_turned[9 * i + r] = in.stiffness * v_both[r];
     }
   });
-  // Points of which each point is a neighbour, in a fixed order.
+  // Invert the neighbour lists: find the points of which each point is a neighbour, in a fixed order.
   const int64_t pairs = in.count * in.each;
   auto first = uninitialised<int32_t>(in.count + 1), owners = uninitialised<int32_t>(pairs);
   const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {

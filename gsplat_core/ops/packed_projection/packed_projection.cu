@@ -68,7 +68,7 @@ __global__ void __launch_bounds__(kThreads) emit(ProjectionInput all, Projection
   if (compensate) out.compensations[row] = p.compensation;
 }
 
-// Return the first row with an id of at least `id`.
+// Return the first row whose id is at least `id`; rows are sorted by id.
 __device__ inline int64_t first_row(const Rows& rows, int64_t id) {
   int64_t low = 0, high = rows.count;
   while (low < high) {

@@ -55,7 +55,8 @@ Visible find_visible(const ProjectionInput& in, const ProjectionSize& size, bool
                      cudaStream_t stream);
 void emit_rows(const ProjectionInput& in, const ProjectionSize& size, const Visible& visible, const RowOutput& out,
                cudaStream_t stream);
-// `v_viewmats` [B, C, 4, 4] must be zeroed. The sums of `to.viewmat` are added to it in a fixed order.
+// Compute the gradient of each row. `v_viewmats` [B, C, 4, 4] must be zeroed. The sums of `to.viewmat` are added to it
+// in a fixed order.
 void rows_backward(const ProjectionInput& in, const ProjectionSize& size, const Rows& rows, const RowOutputGradient& from,
                    const RowGradient& to, float* v_viewmats, cudaStream_t stream);
 // Add values [rows, columns] to `out` [B, N, columns], camera by camera.

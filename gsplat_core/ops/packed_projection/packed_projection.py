@@ -24,7 +24,8 @@ ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 18}
 
 
 def row_gradient(pairs: Pairs, values: Tensor, ids: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Return the gradient of values of each Gaussian from those of the rows.
+    """Return the gradient of the Gaussians' values as the sum of the gradients of their rows (visible pairs of camera
+    and Gaussian).
 
     Args:
         pairs: numbers that the ids count.
@@ -133,7 +134,7 @@ class _ProjectVisible(torch.autograd.Function):
 
 
 def values_of_rows(values: Tensor, ids: Tensor, pairs: Pairs, batch_dims: int = 0, sparse_grad: bool = False) -> Tensor:
-    """Return the values [rows, ...] of the rows from those of the Gaussians.
+    """Gather one value per row, a visible pair of camera and Gaussian, from the Gaussians' values: [rows, ...].
 
     Args:
         values: float32 [..., N, columns...].
@@ -167,7 +168,8 @@ def visible_harmonics(
     batch_dims: int = 0,
     sparse_grad: bool = False,
 ) -> Tensor:
-    """Evaluate the spherical harmonics of the rows, without a copy of all their coefficients.
+    """Evaluate the spherical harmonics of the rows (visible pairs of camera and Gaussian), without a copy of all their
+    coefficients.
 
     Args:
         degree: degree used, 0 to 4.

@@ -71,7 +71,7 @@ struct Gathered {
   float means[3 * kBlock], covars[6 * kBlock], quats[4 * kBlock], scales[3 * kBlock], opacities[kBlock];
   ProjectionInput input;
 
-  // `index(i)` returns the number of the i-th Gaussian.
+  // Gather the inputs of up to kBlock Gaussians. `index(i)` returns the number of the i-th Gaussian.
   template <class Index>
   Gathered(const ProjectionInput& from, int64_t count, const Index& index) : input(from) {
     gather<3>(from.means, means, count, index);
@@ -98,7 +98,8 @@ ProjectionInput of_image(const Scene& scene, int64_t image) {
   return of_camera(scene.input, scene.size, image / scene.size.cameras, image % scene.size.cameras);
 }
 
-// Two passes: the first finds visible pairs, the second projects them into memory of their number.
+// Project in two passes: the first finds visible pairs of camera and Gaussian, the second projects them into memory for
+// exactly their number.
 Packed forward(Call& call, const Scene& scene, bool compensate) {
   const int64_t N = scene.size.gaussians, images = scene.size.batches * scene.size.cameras;
   const int64_t per_image = (N + kBlock - 1) / kBlock, count = images * per_image;
@@ -141,7 +142,7 @@ Packed forward(Call& call, const Scene& scene, bool compensate) {
   return packed;
 }
 
-// Return the first row with an id of at least `id`.
+// Return the first row whose id is at least `id`; rows are sorted by id.
 int64_t first_row(const Rows& rows, int64_t id) { return std::lower_bound(rows.ids, rows.ids + rows.count, id) - rows.ids; }
 
 void backward(Call& call, const Scene& scene, const Rows& rows, const RowOutputGradient& from, const RowGradient& to,

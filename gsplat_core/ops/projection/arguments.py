@@ -25,7 +25,7 @@ The point is at most (1 + 0.3) half fields of view off the axis (Kerbl et al. 20
 
 
 class DenseProjection(NamedTuple):
-    """One row per camera and Gaussian; zeros where the Gaussian is culled."""
+    """Results of a projection with one row per camera and Gaussian; zeros where the Gaussian is culled."""
 
     radii: Tensor
     """Half width and half height of the bounding box in pixels, int32 [..., C, N, 2]; (0, 0) = culled."""
@@ -40,7 +40,9 @@ class DenseProjection(NamedTuple):
 
 
 class PackedProjection(NamedTuple):
-    """One row per camera and Gaussian that is not culled, ordered by batch, camera, Gaussian."""
+    """Results of a projection with one row per camera and Gaussian that is not culled, ordered by batch, camera,
+    Gaussian.
+    """
 
     batch_ids: Tensor
     """Batch index of each row, int64 [nnz], over the flattened batch dimensions."""
@@ -56,7 +58,7 @@ class PackedProjection(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Numbers of batches, cameras and Gaussians whose pairs are numbered.
+    """Numbers of batches, cameras and Gaussians. They determine the id of each pair of camera and Gaussian.
 
     The id of a pair is (batch * cameras + camera) * gaussians + gaussian. Values of each camera and Gaussian are those
     of B * C batches with one camera.

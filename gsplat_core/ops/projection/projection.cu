@@ -14,7 +14,7 @@ __device__ void store(float* p, int64_t row, const float* v) {
   for (int k = 0; k < K; ++k) p[K * row + k] = v[k];
 }
 
-// All threads of a block process the same image.
+// Project the Gaussians of all images. All threads of a block process the same image.
 template <CameraModel model>
 __global__ void __launch_bounds__(kThreads) forward(ProjectionInput all, ProjectionSize size, ProjectionOutput out) {
   const int64_t blocks = (size.gaussians + kThreads - 1) / kThreads, image = blockIdx.x / blocks;
@@ -37,7 +37,8 @@ __global__ void __launch_bounds__(kThreads) forward(ProjectionInput all, Project
   if (compensate) out.compensations[at] = p.valid ? p.compensation : 0;
 }
 
-// All threads of a block process the same batch: each thread has one Gaussian and iterates over the cameras in order.
+// Compute the gradients of all Gaussians. All threads of a block process the same batch: each thread has one Gaussian
+// and iterates over the cameras in order.
 template <CameraModel model>
 __global__ void __launch_bounds__(kThreads)
     backward(ProjectionInput all, ProjectionSize size, ProjectionOutputGradient from, ProjectionInputGradient to) {

@@ -104,7 +104,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_backward(
   const auto fits = [&](const OptionalTensor& t, int64_t columns) { return !t.has_value() || t->numel() == rows * columns; };
   check(radii.numel() == 2 * rows && fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_conics, 3) && fits(v_compensations, 1),
         "projection backward: the sizes of the gradients do not fit the ", rows, " projected Gaussians of the inputs");
-  // Without cameras no CPU kernel writes the outputs.
+  // Without cameras no CPU kernel writes the outputs, so they must be zeroed.
   const bool unwritten = C == 0, from_covars = scene.covars.has_value();
   const auto gradient = [&, B = B, N = N](bool wanted, int64_t columns) {
     if (!wanted) return call.empty({0});

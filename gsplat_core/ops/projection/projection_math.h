@@ -103,7 +103,7 @@ struct Projected {
   vfloat determinant = {};          // of the blurred 2D covariance
 };
 
-// `opacity` may be null. Without `compensate` the compensation is 0.
+// Compute a splat's ellipse from its 2D covariance. `opacity` may be null. Without `compensate` the compensation is 0.
 template <CameraModel model>
 GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& view, const vfloat mean[3],
                                 const Geometry& geometry, const vfloat* opacity, bool compensate) {
@@ -156,7 +156,7 @@ GSPLAT_INLINE auto with_camera_model(int model, const Run& run) {
   }
 }
 
-// `project` for the input's camera model.
+// Project Gaussians by the camera model of the input.
 GSPLAT_INLINE Projected project(const ProjectionInput& in, const vfloat mean[3], const Geometry& geometry, const vfloat* opacity,
                                 bool compensate) {
   return with_camera_model(

@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kPixels) tile_backward(Inputs in, const float*
   through = 1;
   int64_t position = tile.begin;
   for (; position < tile.end; ++position) {
-    // The id is the same for the block, and so are all branches around barriers.
+    // The id is the same for all threads of the block, and so are all branches around barriers.
     const int64_t id = id_of(in, position);
     float own[kGradients] = {};
     bool hits = false;

@@ -62,7 +62,8 @@ __device__ inline void load_center(const Scene& scene, int64_t image, float (&ce
   __syncthreads();
 }
 
-// Call run(std::integral_constant) for a degree of 0 to 4 or kPlainColors, which the host has checked.
+// Call run(std::integral_constant) with the degree as a compile-time constant: 0 to 4, or kPlainColors. The host has
+// checked it.
 template <class Run>
 void with_degree(int degree, const Run& run) {
   switch (degree) {

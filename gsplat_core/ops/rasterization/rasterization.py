@@ -36,12 +36,12 @@ class Options(NamedTuple):
     camera_model: int
     """Index into CAMERA_MODELS."""
     degree: int
-    """0 to 4, or PLAIN_COLORS."""
+    """Degree of the spherical harmonics, 0 to 4; PLAIN_COLORS for colours without harmonics."""
     channels: int
     """Number of colour channels, 0 to 3."""
     depth_mode: int
     antialiased: int
-    """1 or 0, as the next two fields."""
+    """1 to scale opacities by the antialiasing compensation, otherwise 0. The next two fields are flags, too."""
     packed: int
     absgrad: int
 
@@ -132,7 +132,9 @@ class Rasterized(NamedTuple):
 
 
 class _Call:
-    """State of one forward pass shared by both autograd nodes."""
+    """State of one forward pass, shared by the autograd functions of its two parts: inputs to splats, and splats to the
+    image.
+    """
 
     __slots__ = ("outputs", "view")
 

@@ -45,7 +45,7 @@ struct Request {
   int64_t tile_height() const { return (options[kHeight] + frame::kTile - 1) / frame::kTile; }
   int64_t pixels() const { return images * options[kWidth] * options[kHeight]; }
 
-  // Return the scene without its pointers.
+  // Return the scene's sizes and options; its pointers are not set.
   Scene scene(int64_t gaussians) const {
     check(gaussians * images < kMostInts, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ", gaussians * images);
     Scene s = {};

@@ -39,7 +39,7 @@ __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& f
   return {left, left * v_left, from.last[pixel]};
 }
 
-// Destination of a row. With absolute sums these are in the middle of the written values, and are moved to the row's
+// Destination of one gradient row. The absolute sums, if any, are computed in the middle of the row, but stored at its
 // end.
 template <bool kAbsolute>
 struct RowWriter {

@@ -179,7 +179,7 @@ __device__ inline void add_terms(const Falloff& f, const float* ray, const float
   v[5] = fmaf(sy, f.dy, v[5]);
 }
 
-// `rows` holds kSums + channels floats per instance.
+// Write the gradient rows of a window's instances. `rows` holds kSums + channels floats per instance.
 template <int D>
 __global__ void __launch_bounds__(kBlockThreads)
     blend_backward(Inputs in, const Record<0>* records, PixelGradients from, float* rows) {

@@ -22,7 +22,7 @@ using compositing::Tile;
 
 constexpr float kInfinity = __builtin_inff();
 
-// Number of channels of a kernel compiled for up to D channels.
+// Number of channels of a call to a kernel that is compiled for up to D channels.
 template <int D>
 GSPLAT_INLINE void padded_values(const Inputs& in, int32_t id, float (&values)[D > 0 ? D : 1]) {
   for (int d = 0; d < D; ++d) values[d] = d < in.channels ? in.values[int64_t(id) * in.channels + d] : 0;
@@ -142,7 +142,7 @@ struct Backward {
   alignas(64) float v_values[D > 0 ? D : 1][kPixels];
 };
 
-// Process one splat over its blocks; add its sums to `sum`.
+// Add the terms of one splat at its blocks of pixels to `sum`.
 template <int D>
 GSPLAT_INLINE void splat_backward(const Inputs& in, const SplatRecord* records, int32_t id, int64_t position, uint64_t blocks,
                                   vfloat block_x, vfloat block_y, Backward<D>& w, vfloat* sum) {

@@ -19,7 +19,7 @@ __device__ UnitDirection unit_direction(const float* dirs, int64_t i) {
   return {{x * inverse, y * inverse, z * inverse}, inverse};
 }
 
-// All threads of a block of 128 sets process the same row of directions.
+// Evaluate the colours. All threads of a block of 128 sets of coefficients process the same row of directions.
 template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4) forward(SphericalHarmonicsInput in, int64_t sets, float* __restrict__ colors) {
   constexpr int used = kBasesOf<degree>;
@@ -45,8 +45,9 @@ __global__ void __launch_bounds__(kBlockSets, 4) forward(SphericalHarmonicsInput
   for (int j = 0; j < 3; ++j) colors[3 * i + j] = color[j];
 }
 
-// A thread has one set of coefficients and iterates over its rows in order, so the sum is reproducible. A direction
-// whose colour gradient is zero is skipped, so that 0 times an infinite coefficient does not produce NaN.
+// Compute the gradient of the coefficients. A thread has one set of coefficients and iterates over its rows in order,
+// so the sum is reproducible. A direction whose colour gradient is zero is skipped, so that 0 times an infinite
+// coefficient does not produce NaN.
 template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4)
     backward(SphericalHarmonicsInput in, int64_t rows, int64_t sets, const float* __restrict__ v_colors,

@@ -22,7 +22,8 @@ struct SphericalHarmonicsInput {
 // CPU kernels for directions `begin` to `end` - 1 of one row.
 struct Kernels {
   void (*forward)(const SphericalHarmonicsInput&, float* colors, int64_t begin, int64_t end);
-  // `v_dirs` [N, 3] may be null. `v_coeffs` [N, K, 3] is added to if `accumulate`, otherwise overwritten completely.
+  // Computes the gradients of directions and coefficients. `v_dirs` [N, 3] may be null. `v_coeffs` [N, K, 3] is added
+  // to if `accumulate`, otherwise overwritten completely.
   void (*backward)(const SphericalHarmonicsInput&, const float* v_colors, float* v_dirs, float* v_coeffs, bool accumulate,
                    int64_t begin, int64_t end);
 };
@@ -30,7 +31,8 @@ struct Kernels {
 // CUDA versions for `rows` rows of `sets` directions; the rows share the coefficients of their sets. All pointers are
 // device memory.
 void harmonics_forward(const SphericalHarmonicsInput& in, int64_t rows, int64_t sets, float* colors, cudaStream_t stream);
-// `v_dirs` may be null. `v_coeffs` is overwritten completely with the sum over the rows in order.
+// Compute the gradients of directions and coefficients. `v_dirs` may be null. `v_coeffs` is overwritten completely with
+// the sum over the rows in order.
 void harmonics_backward(const SphericalHarmonicsInput& in, int64_t rows, int64_t sets, const float* v_colors, float* v_dirs,
                         float* v_coeffs, cudaStream_t stream);
 

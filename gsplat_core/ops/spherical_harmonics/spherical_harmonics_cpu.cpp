@@ -94,7 +94,8 @@ static void backward_degree(const SphericalHarmonicsInput& in, const float* v_co
     const vfloat along = g[0] * unit[0] + g[1] * unit[1] + g[2] * unit[2];
     for (int i = 0; i < 3; ++i) g[i] = (g[i] - along * unit[i]) * inverse_norm;
     if (in.mask != nullptr) {
-      // A masked direction may hold any value, including NaN.
+      // The gradient of a masked direction is 0. Its computed gradient may be NaN, because the direction may hold any
+      // value.
       vfloat seen;
       for (int lane = 0; lane < kLanes; ++lane) seen[lane] = lane < count && in.mask[first + lane];
       for (int i = 0; i < 3; ++i) g[i] = select(seen > 0, g[i], vfloat{});

@@ -85,7 +85,7 @@ std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, Tensor d
   const Tensor v_colors = call.floats(v_colors_, "v_colors");
   check(v_colors.numel() == scene.rows * scene.sets * 3, "v_colors must be [R, M, 3], got ", v_colors.numel(), " values");
   Tensor v_dirs = needs_dirs ? call.empty({scene.rows, scene.sets, 3}) : call.empty({0});
-  // Without rows no CPU kernel writes the gradient.
+  // Without rows no CPU kernel writes the gradient, so it must be zeroed.
   Tensor v_coeffs = scene.rows == 0 ? call.zeros({scene.sets, scene.bases, 3}) : call.empty({scene.sets, scene.bases, 3});
   backward(call, scene, data(v_colors), needs_dirs ? mutable_data(v_dirs) : nullptr, mutable_data(v_coeffs));
   call.finish("spherical_harmonics_backward");

@@ -27,7 +27,7 @@ REACH_SIGMAS = 3.0
 
 
 class SplatRays(NamedTuple):
-    """Values of Gaussians seen by one camera.
+    """Ray coefficients and normals of Gaussians seen by one camera.
 
     Those of Gaussians behind the camera plane, or with values that are not finite, are arbitrary and have no gradient.
     """
@@ -82,7 +82,7 @@ def splat_rays(
 
 
 def _rotations(quats: Tensor) -> Tensor:
-    """Return rotation matrices [N, 3, 3]."""
+    """Convert quaternions [N, 4] to rotation matrices [N, 3, 3]."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -84,7 +84,7 @@ GSPLAT_INLINE State state_of(const View& view, const vfloat mean[3], const vfloa
   return s;
 }
 
-// 1 for the first shortest axis, else 0, with the sign that turns the axis towards the camera.
+// Select the shortest axis: chosen[k] is 0 except for the first shortest one, whose sign turns it towards the camera.
 GSPLAT_INLINE void shortest_axis(const State& s, vfloat chosen[3]) {
   const vint first = (s.s[0] <= s.s[1]) & (s.s[0] <= s.s[2]), second = (s.s[1] < s.s[0]) & (s.s[1] <= s.s[2]);
   const vfloat none = splat(0.0f);
@@ -113,7 +113,8 @@ GSPLAT_INLINE void rays_of(const State& s, vfloat rays[10], vfloat normal[3]) {
   for (int i = 0; i < 3; ++i) normal[i] = chosen[0] * s.axes.m[i][0] + chosen[1] * s.axes.m[i][1] + chosen[2] * s.axes.m[i][2];
 }
 
-// The coefficients do not change with a common factor of the scales, so `largest` is constant in u.
+// Propagate gradients to mean, rotation and scales. The coefficients do not change with a common factor of the scales,
+// so `largest` is constant in u.
 GSPLAT_INLINE void rays_backward(const View& view, const State& s, const vfloat v[10], const vfloat v_normal[3], vfloat v_mean[3],
                                  vfloat v_quat[4], vfloat v_scale[3]) {
   const vfloat none = splat(0.0f);

@@ -78,7 +78,8 @@ __device__ __forceinline__ float block_sum(float value, float* shared) {
   return total;
 }
 
-// Grid: splats, parts, chunks of channels. Writes rows [splats, parts, columns].
+// Sum the gradient terms of each splat over parts of the points. Grid: splats, parts, chunks of channels. Writes rows
+// [splats, parts, columns].
 template <int D>
 __global__ void __launch_bounds__(kThreads)
     sum_part(Inputs in, const Splat* __restrict__ records, const float* __restrict__ gradient, int64_t part_size, float* rows) {
@@ -98,7 +99,7 @@ __global__ void __launch_bounds__(kThreads)
     const float g = density<D>(s, x, y);
     if (g == 0.0f) continue;
     for (int c = 0; c < channels; ++c) {
-      // Index constant after unrolling, so that the sums stay in registers.
+      // The index is constant after unrolling, so that the sums stay in registers.
 #pragma unroll
       for (int k = 0; k < kChunk; ++k)
         if (k == c) channel_sums[k] = fmaf(g, gradient[i * in.channels + first + c], channel_sums[k]);

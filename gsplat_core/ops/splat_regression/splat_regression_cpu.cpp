@@ -29,7 +29,7 @@ GSPLAT_INLINE vfloat density(const Splat& s, const float* points, int64_t stride
     squared = fma(y[r], y[r], squared);
   }
   const vfloat power = fma(splat(-0.5f * kLog2E), squared, splat(s.log2_norm));
-  // A NaN of a point compares false and gives 0.
+  // NaN from a non-finite point compares false, so that the result is 0.
   const vmask counts = at_least(power, splat(-126.0f));
   for (int r = 0; r < D; ++r) y[r] = zero_unless(counts, y[r]);
   return zero_unless(counts, exp2(min(max(power, splat(-126.0f)), splat(126.0f))));

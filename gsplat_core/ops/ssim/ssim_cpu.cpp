@@ -206,7 +206,7 @@ static void load_upstream(const Strip& s, int64_t row) {
   for (int64_t i = 0; i < (to - from) * c; ++i) out[i] = source[i];
 }
 
-// Write the sum and the map of a row that belongs to the band.
+// Write the sum and the similarities of a row, if the row belongs to the band that this task computes.
 static void emit_row(const Strip& s, int64_t strip, int64_t row) {
   const SsimTask& task = s.task;
   const int first = s.begin(0), last = s.end(0);

@@ -20,7 +20,8 @@ static void fill_taps(float* taps) {
 
 void run_ssim(SsimTask& task) {
   fill_taps(task.taps);
-  // A band recomputes two radii of rows, so its height should be several times larger.
+  // Height of the bands of rows that threads process. A band recomputes two radii of rows, so its height should be
+  // several times larger.
   constexpr int64_t kBandRows = 48;
   torch::stable::parallel_for(0, task.height, kBandRows, [&](int64_t begin, int64_t end) {
     thread_local std::vector<float> scratch(kSsimScratchFloats);

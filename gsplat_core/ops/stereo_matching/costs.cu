@@ -7,10 +7,11 @@
 namespace gsplat::stereo_matching {
 namespace {
 
-// Pixels summed per warp or thread; longer segments recompute less overlap.
+// Lengths of the segments of a row or column that one warp or thread sums; longer segments recompute less overlap.
 constexpr int kSegmentColumns = 64, kSegmentRows = 32;
 
-// Slope and brightness of a pixel, and their range within half a pixel to both sides.
+// Features of a pixel that are compared between the images: slope and brightness, and their range within half a pixel
+// to both sides.
 struct __align__(8) Look {
   uint8_t slope, slope_low, slope_high, brightness, brightness_low, brightness_high, unused[2];
 };
@@ -36,7 +37,7 @@ __device__ inline Range range_of(int before, int here, int after) {
   return {uint8_t(min(here, min(one, other))), uint8_t(max(here, max(one, other)))};
 }
 
-// looks: [2, height, width], of the left and of the right image.
+// Compute the features of both images' pixels. looks: [2, height, width], of the left and of the right image.
 __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
   const int64_t pixels = int64_t(pair.height) * pair.width, i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= 2 * pixels) return;
@@ -48,7 +49,8 @@ __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
   looks[i] = {uint8_t(slope), s.low, s.high, uint8_t(brightness), b.low, b.high, {}};
 }
 
-// Distance of each value from the other value's range; returns the smaller of the two.
+// Return the Birchfield-Tomasi difference of two pixels: the smaller of the distances of each value from the other's
+// range.
 __device__ inline int difference(int a, int a_low, int a_high, int b, int b_low, int b_high) {
   return max(0, min(max(a - b_high, b_low - a), max(b - a_high, a_low - b)));
 }
@@ -59,7 +61,7 @@ __device__ inline int pixel_cost(const Look& a, const Look& b) {
   return by_slope + min(by_brightness, kBrightnessMost);
 }
 
-// Sum over the window's columns [height, width, count], with one warp per segment of a row.
+// Sum the differences over the window's columns [height, width, count], with one warp per segment of a row.
 template <int kEach>
 __global__ void __launch_bounds__(kThreads) sum_along_rows(Pair pair, const Look* looks, uint16_t* sums) {
   const int lane = threadIdx.x % 32, segments = (pair.width + kSegmentColumns - 1) / kSegmentColumns;

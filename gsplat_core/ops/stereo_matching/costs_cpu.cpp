@@ -66,7 +66,8 @@ GSPLAT_INLINE void reverse(const Pair& pair, const Range& from, const Range& to)
   }
 }
 
-// Distance of each value from the other value's range; returns the smaller of the two.
+// Return the Birchfield-Tomasi difference of two pixels: the smaller of the distances of each value from the other's
+// range.
 template <class Bytes>
 GSPLAT_INLINE Bytes difference(const Range& left, int64_t x, const Range& right, int64_t at) {
   const auto here = [&](const uint8_t* row) { return Bytes{} + row[x]; };

@@ -28,7 +28,7 @@ GSPLAT_INLINE void store_as(void* to, Values values) {
   __builtin_memcpy(to, &values, sizeof(values));
 }
 
-// Minimum and maximum of numbers, or lane by lane of vectors.
+// Smaller and larger of two numbers, or of two vectors lane by lane.
 template <class Values>
 GSPLAT_INLINE Values less(Values a, Values b) {
   return a < b ? a : b;
@@ -85,7 +85,7 @@ GSPLAT_INLINE uint8_t least_byte(Bytes values) {
 #endif
 }
 
-// Defined in costs_cpu.cpp and winners_cpu.cpp.
+// Kernels defined in costs_cpu.cpp and winners_cpu.cpp, with the scratch memory that they need.
 int64_t cost_scratch(const Pair& pair);
 void sum_costs(const Pair& pair, uint8_t* costs, int64_t begin, int64_t end, uint8_t* scratch);
 void winners(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, int64_t begin, int64_t end,

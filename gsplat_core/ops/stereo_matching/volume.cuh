@@ -8,7 +8,7 @@ namespace gsplat::stereo_matching {
 
 constexpr unsigned kAllLanes = ~0u;
 
-// kEach bytes as one load or store.
+// Load and store of kEach bytes in one instruction.
 template <int kEach>
 struct Packed;
 template <>
@@ -46,8 +46,8 @@ void with_each(int count, const Work& work) {
     work(std::integral_constant<int, 8>());
 }
 
-// Defined in costs.cu, paths.cu and winners.cu; each queues its kernels on the stream. A volume is [height, width,
-// count]. sums: scratch of two bytes per cost.
+// Steps of the matching, defined in costs.cu, paths.cu and winners.cu; each queues its kernels on the stream. A volume
+// is [height, width, count]. sums: scratch of two bytes per cost.
 void sum_costs(const Pair& pair, uint8_t* costs, uint16_t* sums, CudaScratch& scratch, cudaStream_t stream);
 void follow_paths(const Pair& pair, const uint8_t* costs, uint8_t* messages, cudaStream_t stream);  // messages: kPaths volumes
 void choose(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, CudaScratch& scratch,

@@ -18,7 +18,7 @@ constexpr int kCountBits = 42;  // of a round's counter: fragments below, splats
 constexpr unsigned kExpandBlocks = 2048;
 constexpr unsigned kWarp = 0xffffffffu;
 
-// False for a splat that is certainly invisible; then the rest of it is not read.
+// Load a splat; return false if it is certainly invisible, before the rest of it is read.
 __device__ bool load(const Scene& scene, const ProjectionInput& in, int64_t row, Loaded& one) {
   const auto seen = [&](const float* mean) {
     const float* m = in.viewmat;
@@ -77,7 +77,8 @@ __device__ void lower(uint64_t* place, uint64_t word) {
   atomicMin(reinterpret_cast<unsigned long long*>(place), static_cast<unsigned long long>(word));
 }
 
-// Words only decrease, so an outdated one costs an unnecessary atomic operation and nothing else.
+// Read a word of the frame buffer, possibly outdated. Words only decrease, so an outdated one costs an unnecessary
+// atomic operation and nothing else.
 __device__ uint64_t seen_at(const uint64_t* place) { return __ldcg(reinterpret_cast<const unsigned long long*>(place)); }
 
 template <int kSlots>

@@ -68,13 +68,13 @@ struct alignas(16) Splat {
   float conic[3];  // log2(e) / 2 times the coefficients of x^2, 2 xy and y^2
   float log2_opacity;
   float plane[3];     // kFragments: 1 / z of the plane at (x, y) is its product with (x, y, 1).
-                      // kPoints: upper Cholesky factor of the inverse covariance (11, 12, 22)
+                      // For kPoints: upper Cholesky factor of the inverse covariance (11, 12, 22)
   uint32_t row, key;  // key: index in the file
   uint32_t corner;    // first column and row of sub-pixels, 16 bits each
   uint32_t size;      // columns and rows minus 1, 16 bits each
   uint32_t count;     // fragments or points
   float extra;        // kFragments: largest distance of the plane's depth from z.
-                      // kPoints: dilogarithm of the opacity, or -1 if each fragment draws its own points
+                      // For kPoints: dilogarithm of the opacity, or -1 if each fragment draws its own points
 };
 static_assert(sizeof(Splat) == 64);
 
@@ -92,8 +92,8 @@ struct Kernels {
   void (*poisson)(const double* rates, int64_t rate_count, int64_t count, uint64_t seed, int64_t* out);
 };
 
-// CUDA versions. `queue` has room for `queue_splats` large splats, and `starts` for as many numbers. `rounds` is zeroed and
-// has ceil(count / queue_splats) values.
+// Memory for splats with many fragments on CUDA. `queue` has room for `queue_splats` large splats, and `starts` for as
+// many numbers. `rounds` is zeroed and has ceil(count / queue_splats) values.
 struct Queue {
   Splat* splats;
   uint64_t* starts;

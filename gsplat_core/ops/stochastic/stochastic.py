@@ -26,7 +26,9 @@ CHUNK = 4096
 COLOUR_CHUNK = 256
 """Splats that share the range of quantised colours."""
 CHUNK_FLOATS = 20 + 6 * (CHUNK // COLOUR_CHUNK)
-"""Ranges of a chunk: minima and steps of positions and log-scales [3 each], of the four bands, and of each colour chunk."""
+"""Number of float32 values of a chunk's ranges: minima and steps of positions and log-scales [3 each], of the four
+bands, and of each colour chunk.
+"""
 MOST_PIXELS = 1 << 16
 """Largest width and height of a picture in sub-pixels."""
 
@@ -52,7 +54,8 @@ class SplatScene(NamedTuple):
     sh: Tensor | None = None
     """Spherical-harmonics coefficients [N, K, 3]; None if packed."""
     file_index: Tensor | None = None
-    """Index of each row in its file, int32 [N], which selects its random numbers; None for the row."""
+    """Index of each row in the model's file, int32 [N], which selects its random numbers; None if it is the row number.
+    """
     packed: Tensor | None = None
     """Quantised geometry and colour, int32 [N, 4]; `quantised.h` defines the bits."""
     chunks: Tensor | None = None
@@ -165,7 +168,7 @@ def sample_splats(
 
 
 class SampledPicture(NamedTuple):
-    """Mean of the samples."""
+    """Mean picture of random samples."""
 
     image: Tensor
     """Colours [H, W, 3]."""

@@ -26,7 +26,7 @@ constexpr float kMostPoints = 1e9f;
 // Kinds of random numbers, in the upper bits of a counter's last word.
 enum Stream : uint32_t { kAlphaStream = 0, kCountStream = 1u << 28, kPointStream = 2u << 28, kFragmentStream = 3u << 28 };
 
-// Scalar functions of the mathematical library.
+// Scalar functions under the names that CPU kernels use for vectors.
 #if defined(__CUDACC__)
 #define GSPLAT_MATH(name) ::name
 #else
@@ -43,7 +43,7 @@ GSPLAT_INLINE uint64_t word_of(float z, uint32_t row) { return uint64_t(bits_of(
 
 // ---- Dilogarithm ----------------------------------------------------------------------------------------------------
 
-// Li2(x) for 0 <= x <= 1/2 with w = -ln(1 - x): the series of Bernoulli numbers.
+// Return the dilogarithm Li2(x) for 0 <= x <= 1/2 with w = -ln(1 - x), by the series of Bernoulli numbers.
 GSPLAT_INLINE float dilogarithm_series(float w) {
   const float w2 = w * w;
   return w * (1 + w * (-0.25f + w * (1.0f / 36 + w2 * (-1.0f / 3600 + w2 * (1.0f / 211680 - w2 * (1.0f / 10886400))))));
@@ -154,7 +154,7 @@ GSPLAT_INLINE Plane plane_of(const ProjectionInput& in, const Loaded& one, bool 
       n[i] = r[0] * along[0] + r[1] * along[1] + r[2] * along[2];
     }
   } else {
-    // The adjugate is proportional to the inverse.
+    // Extent of the splat from its inverse covariance; the adjugate is proportional to the inverse.
     size = sqrt(one.geometry.sigma.v[0] + one.geometry.sigma.v[3] + one.geometry.sigma.v[5]);
     vfloat c[6];
     for (int k = 0; k < 6; ++k) c[k] = one.geometry.sigma.v[k] / (size * size);
@@ -176,7 +176,8 @@ struct Lane {
   float u, v, z, conic[3], half[2], determinant, opacity, plane[3], reach;
 };
 
-// Box of the sub-pixels whose centres are at most half[0] and half[1] from the centre. False if it is empty.
+// Compute the box of the sub-pixels whose centres are at most half[0] and half[1] from the splat's centre. False if it
+// is empty.
 GSPLAT_INLINE bool box_of(const Request& view, const Lane& lane, Splat& out, int64_t& fragments) {
   const float s = float(view.supersampling);
   const float centre[2] = {lane.u, lane.v};
@@ -197,7 +198,8 @@ GSPLAT_INLINE bool box_of(const Request& view, const Lane& lane, Splat& out, int
   return true;
 }
 
-// Complete a splat; false if it has no fragment or point. `sample` is the sample of the points.
+// Complete a splat; return false if it has no fragment or point. `sample` is the number of the sample whose points are
+// drawn.
 GSPLAT_INLINE bool finish_splat(const Request& view, const Lane& lane, uint32_t row, uint32_t key, Splat& out) {
   int64_t fragments;
   if (!box_of(view, lane, out, fragments)) return false;

@@ -59,7 +59,7 @@ GSPLAT_INLINE Pixels flow_at(const Flow& flow, const Pixels& pixels) {
   return {mixed[0], mixed[1]};
 }
 
-// Convert motion in pixels to world-space motion at the points' depth in `view`.
+// Convert the motion of pixels to motion in world space, at the points' depth in `view`.
 GSPLAT_INLINE void to_world(const View& view, vfloat depth, const Pixels& moved, vint inside, vfloat* world) {
   const vfloat x = select(inside, moved.x * depth / view.fx, vfloat{}), y = select(inside, moved.y * depth / view.fy, vfloat{});
   for (int i = 0; i < 3; ++i) world[i] = x * view.rotation[i] + y * view.rotation[3 + i];

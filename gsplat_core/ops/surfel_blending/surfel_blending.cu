@@ -194,7 +194,7 @@ __device__ inline void add_terms(const Hit& h, float power, float depth, const f
   // Where alpha is clamped to its maximum, opacity and shape have no gradient.
   const float s = power <= limit.log2_most ? alpha * v_alpha : 0;
   const bool on_plane = h.plane <= h.screen;
-  // Elsewhere the intersection may be infinite.
+  // The values on the plane are used only there; elsewhere the intersection may be infinite.
   const Hit hit = {h.dx,    h.dy,    h.denominator, on_plane ? h.inverse : 0, on_plane ? h.u : 0, on_plane ? h.v : 0,
                    h.plane, h.screen};
   math::add_moments(hit, s, on_plane ? s : 0, v);
@@ -205,7 +205,7 @@ __device__ inline void add_terms(const Hit& h, float power, float depth, const f
   }
 }
 
-// `rows` holds sums_of(V, kAbs) floats per instance and window.
+// Write the gradient rows of a window's surfels. `rows` holds sums_of(V, kAbs) floats per instance and window.
 template <int V, bool kAbs>
 __global__ void __launch_bounds__(kBlockThreads) blend_backward(Inputs in, Prepared surfels, PixelGradients from, float* rows) {
   constexpr int kSums = sums_of(V, kAbs), kPasses = passes_of(kSums);

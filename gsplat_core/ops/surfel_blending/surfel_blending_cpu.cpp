@@ -161,7 +161,7 @@ struct Backward {
   alignas(64) float v_values[V][kPixels];
 };
 
-// Process one surfel over its blocks; add its moments, values and absolute gradients to `sum`.
+// Add the terms of one surfel at its blocks of pixels to `sum`: moments, values and absolute gradients.
 template <int V, bool kAbs>
 GSPLAT_INLINE void surfel_backward(const Surfels& in, int32_t id, int64_t position, uint64_t blocks, float reference,
                                    const Centers& centers, Backward<V>& w, vfloat* sum) {
@@ -201,7 +201,7 @@ GSPLAT_INLINE void surfel_backward(const Surfels& in, int32_t id, int64_t positi
     // Where alpha is clamped to its maximum, opacity and shape have no gradient.
     const vmask free = vmask(valid & at_least(splat(in.splats.alpha.log2_most), power));
     const vfloat s = zero_unless(free, alpha * v_alpha);
-    // Elsewhere the intersection may be infinite.
+    // The intersection is used only on the plane; elsewhere it may be infinite.
     const vmask on_plane = vmask(free & at_least(h.screen, h.plane));
     const Hit hit = {
         h.dx,    h.dy,    h.denominator, zero_unless(on_plane, h.inverse), zero_unless(on_plane, h.u), zero_unless(on_plane, h.v),

@@ -54,7 +54,7 @@ GSPLAT_INLINE Plane plane_of(const float* mean, const float* transform) {
 
 GSPLAT_INLINE Record unusable_record() { return {0, 0, -__builtin_inff(), {}}; }
 
-// `usable`: all inputs of the surfel are finite.
+// Prepare a surfel for blending. `usable`: all inputs of the surfel are finite.
 GSPLAT_INLINE Record record_of(const float* mean, const Plane& p, float opacity, bool usable) {
   constexpr float kFaint = gsplat::kAlphaCutoff * (1 - 1e-5f);
   if (!usable || !(opacity >= kFaint) || !(p.scale > 0)) return unusable_record();
@@ -94,7 +94,8 @@ struct Hit {
   vfloat inverse, u, v;  // 1 / q_2, and the intersection
   vfloat plane, screen;  // u^2 + v^2 and 2 d^2; the smaller of them is 2 sigma
 };
-// The order of operations is explicit, so that the forward and backward pass compute identical bits.
+// Intersect the rays of pixels (x, y) with a surfel. The order of operations is explicit, so that the forward and
+// backward pass compute identical bits.
 GSPLAT_INLINE Hit hit_at(const Record& r, vfloat x, vfloat y) {
   Hit h;
   h.dx = x - r.x;

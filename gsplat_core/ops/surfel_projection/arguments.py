@@ -15,7 +15,7 @@ LEAST_EXTENT_SQUARED = 1e-4
 
 
 class DenseSurfels(NamedTuple):
-    """One row per camera and surfel; zeros where the surfel is culled."""
+    """Results of a projection with one row per camera and surfel; zeros where the surfel is culled."""
 
     radii: Tensor
     """Half width and half height of the bounding box in pixels, int32 [..., C, N, 2]; (0, 0) = culled."""
@@ -30,7 +30,7 @@ class DenseSurfels(NamedTuple):
 
 
 class PackedSurfels(NamedTuple):
-    """One row per camera and surfel that is not culled, ordered by batch, camera, surfel."""
+    """Results of a projection with one row per camera and surfel that is not culled, ordered by batch, camera, surfel."""
 
     batch_ids: Tensor
     """Batch index of each row, int64 [nnz], over the flattened batch dimensions."""

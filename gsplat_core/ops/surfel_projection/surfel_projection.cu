@@ -17,7 +17,7 @@ __device__ void store(float* p, int64_t row, const float* v, bool valid = true) 
   for (int k = 0; k < K; ++k) p[K * row + k] = valid ? v[k] : 0;
 }
 
-// All threads of a block process the same image.
+// Project the surfels of all images. All threads of a block process the same image.
 __global__ void __launch_bounds__(kThreads) forward(Inputs all, Size size, Outputs out) {
   const int64_t blocks = (size.surfels + kThreads - 1) / kThreads, image = blockIdx.x / blocks;
   const int64_t n = (blockIdx.x % blocks) * kThreads + threadIdx.x;
@@ -37,7 +37,8 @@ __global__ void __launch_bounds__(kThreads) forward(Inputs all, Size size, Outpu
   store<3>(out.normals, at, p.normal, p.valid);
 }
 
-// All threads of a block process the same batch: each thread has one surfel and iterates over the cameras in order.
+// Compute the gradients of all surfels. All threads of a block process the same batch: each thread has one surfel and
+// iterates over the cameras in order.
 __global__ void __launch_bounds__(kThreads) backward(Inputs all, Size size, OutputGradients from, InputGradients to) {
   const int64_t blocks = (size.surfels + kThreads - 1) / kThreads, batch = blockIdx.x / blocks, block = blockIdx.x % blocks;
   const int64_t n = block * kThreads + threadIdx.x;

@@ -124,7 +124,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> project_surfels_backward(Tensor means
   const auto fits = [&](const OptionalTensor& t, int64_t columns) { return !t.has_value() || t->numel() == rows * columns; };
   check(radii.numel() == 2 * rows && fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_transforms, 9) && fits(v_normals, 3),
         "surfel projection backward: the sizes of the gradients do not fit the ", rows, " projected surfels of the inputs");
-  // Without cameras no CPU kernel writes the outputs.
+  // Without cameras no CPU kernel writes the outputs, so they must be zeroed.
   const bool unwritten = C == 0;
   const auto gradient = [&, B = B, N = N](int64_t columns) {
     return unwritten ? call.zeros({B, N, columns}) : call.empty({B, N, columns});

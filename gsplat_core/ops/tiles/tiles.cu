@@ -10,8 +10,8 @@ __device__ int64_t image_of(const SplatBoxes& in, int64_t splat) {
   return in.image_ids != nullptr ? in.image_ids[splat] : splat / in.per_image;
 }
 
-// A thread counts or writes the tiles of its splat. For a splat with many tiles the whole warp does so, because the
-// other lanes would otherwise wait.
+// Sizes from which a splat has many tiles. A thread counts or writes the tiles of its splat. For a splat with many
+// tiles the whole warp does so, because the other lanes would otherwise wait.
 constexpr int kTallRows = 16, kManyTiles = 32;
 
 __device__ int tiles_of(const SplatBoxes& in, const TileBox& box) {

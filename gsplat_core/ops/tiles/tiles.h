@@ -34,8 +34,8 @@ struct Kernels {
   // Increments the counter of every tile that the splats order[begin..end) touch.
   void (*count)(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end,
                 int32_t* counters);
-  // Writes each of those splats at its tile's cursor and advances the cursor. With `keys`, also writes image|tile|depth
-  // (gsplat's isect_ids).
+  // Writes each of the splats order[begin..end) at the cursor of every tile it touches, and advances the cursor. With
+  // `keys`, also writes image|tile|depth (gsplat's isect_ids).
   void (*emit)(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* cursors,
                int32_t* flatten_ids, int64_t* keys);
   // Writes the tiles of one splat row by row, starting at position `at`.
@@ -71,7 +71,7 @@ void sort_by_tile(const SplatBoxes& in, TileInstances& instances, CudaScratch& s
 
 // Compute offsets[t], the number of sorted instances in tiles before t.
 void encode_offsets(const TileInstances& instances, int64_t tiles, int32_t* offsets, cudaStream_t stream);
-// As above for gsplat's 64-bit ids (image | tile | depth).
+// Compute the same offsets from gsplat's sorted 64-bit ids (image | tile | depth).
 void encode_offsets(const int64_t* ids, int64_t count, int64_t images, int64_t tiles_per_image, int32_t* offsets,
                     cudaStream_t stream);
 void make_ids(const SplatBoxes& in, const TileInstances& instances, int64_t* ids, cudaStream_t stream);

@@ -59,7 +59,7 @@ GSPLAT_INLINE Runs runs_of(const Ellipses& e, vfloat row, float tile_size, vfloa
   return {to_int(from), to_int(to)};
 }
 
-// The contour sigma <= k / 2, slightly outside of alpha = 1/255; negative if the splat reaches no pixel.
+// Return k of the contour sigma = k / 2 slightly outside of alpha = 1/255; negative if the splat reaches no pixel.
 GSPLAT_INLINE vfloat contours(vfloat opacity) {
   const vfloat k = fma(log2(opacity * 255.0f), splat(1.3862944f), splat(1e-3f));  // 2 ln(255 o)
   return where(above(opacity, vfloat{}) & at_least(splat(3e38f), opacity), k, splat(-1.0f));
@@ -73,7 +73,7 @@ GSPLAT_INLINE void prefetch_span(const TileSpan* spans, const uint32_t* order, i
   if (i + kAhead < end) __builtin_prefetch(spans + order[i + kAhead]);
 }
 
-// Return the index of the first counter of this splat's image.
+// Return the index of the first tile counter of this splat's image.
 GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
   const int64_t image = in.image_ids != nullptr ? in.image_ids[splat] : splat < in.per_image ? 0 : splat / in.per_image;
   return image * in.tile_width * in.tile_height;

@@ -59,7 +59,7 @@ struct Lens {
     return min(max(backward() ? 1 - time : time, splat(-1.0f)), splat(2.0f));
   }
 
-  // Camera-space direction of a world point before the translation.
+  // Rotate a world point into the camera's axes at a read-out time, without translation.
   GSPLAT_METHOD Point3 turned(const Point3& world, vfloat time) const {
     const float* w = c + kRotation;
     const Point3 p = {dot3(w, world), dot3(w + 3, world), dot3(w + 6, world)};
@@ -70,7 +70,7 @@ struct Lens {
     if (!rolls()) return {p.x + t[0], p.y + t[1], p.z + t[2]};
     return {p.x + (t[0] + s[0] * time), p.y + (t[1] + s[1] * time), p.z + (t[2] + s[2] * time)};
   }
-  // The transpose of `turned`.
+  // Rotate a direction from the camera's axes at a read-out time to the world's: the transpose of `turned`.
   GSPLAT_METHOD Point3 to_world(const Point3& v, vfloat time) const {
     const Point3 p = rolls() ? rotated(c + kTurn, -time, v) : v;
     const float* w = c + kRotation;
@@ -132,7 +132,7 @@ struct Lens {
              {fy * yx * inverse, fy * yy * inverse, -fy * (yx * x + yy * y) * inverse}}};
   }
 
-  // Pixel of a world point and the time of its read-out.
+  // Compute the pixel of a world point and the time of its read-out by the rolling shutter.
   GSPLAT_METHOD Pixel pixel_of_world(const Point3& world, vfloat& time) const {
     time = splat(0.5f);
     Pixel pixel = pixel_of(moved(turned(world, time), time));

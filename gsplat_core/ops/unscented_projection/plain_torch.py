@@ -49,7 +49,7 @@ def project_unscented(
         usable &= (quats != 0).any(-1)
         if opacities is not None:
             usable &= opacities.isfinite()
-    # A masked NaN would reach the gradient.
+    # Replace unusable means before the projection, because a masked NaN would reach the gradient.
     means = torch.where(usable[..., None], means, torch.zeros_like(means))
     quats = torch.where(usable[..., None], quats, torch.ones_like(quats))
     scales = torch.where(usable[..., None], scales, torch.ones_like(scales))
@@ -94,7 +94,8 @@ def _pixels(
     projected = lens.project(shutter.to_camera(world), Ks)
     if shutter.rolls:
         for _ in range(SHUTTER_STEPS):
-            # Times far outside the read-out would only be reached by points that are far outside the picture.
+            # Limit the times to the read-out and a margin. Other times would only be reached by points far outside the
+            # picture.
             times = shutter.times(projected.points, limits.width, limits.height).clamp(-1, 2)
             projected = lens.project(shutter.to_camera(world, times), Ks)
     x, y = projected.points.detach().unbind(-1)

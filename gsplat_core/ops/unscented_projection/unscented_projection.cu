@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(kThreads) forward(Inputs in, Outputs out) {
   if (out.compensations != nullptr) out.compensations[at] = p.valid ? p.compensation : 0;
 }
 
-// Each thread has one Gaussian and iterates over the cameras in order.
+// Compute the gradients of all Gaussians. Each thread has one Gaussian and iterates over the cameras in order.
 __global__ void __launch_bounds__(kThreads) backward(Inputs in, Gradients from) {
   const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x, N = in.size.gaussians;
   if (n >= in.size.batches * N) return;

@@ -10,7 +10,7 @@
 namespace gsplat::unscented_projection {
 
 enum LensModel : int32_t { kPinhole = 0, kOrtho = 1, kFisheye = 2 };
-// Values of Python's RollingShutterType.
+// Read-out order of a rolling shutter; the values of Python's RollingShutterType.
 enum ShutterKind : int32_t { kTopToBottom = 0, kLeftToRight = 1, kBottomToTop = 2, kRightToLeft = 3, kGlobal = 4 };
 
 // Columns of `cameras`: first column of each group.

@@ -17,7 +17,8 @@ constexpr float kMostTerm = 128.0f;      // |t| is limited to this, so that |t c
 constexpr float kMostChannel = 2048.0f;  // |c| is limited to this; a limited channel has no gradient
 constexpr double kScale = 4294967296.0;  // 2^32
 constexpr float kInverseScale = 2.3283064365386963e-10f;
-// Adding 1.5 * 2^52 to a double below 2^51 rounds it to an integer, which the low bits then contain.
+// Constant for rounding: adding 1.5 * 2^52 to a double below 2^51 rounds it to an integer, which the low bits then
+// contain.
 constexpr double kMagic = 6755399441055744.0;
 constexpr int64_t kMagicBits = 0x4338000000000000;
 constexpr int kMostChannels = 32;
@@ -59,7 +60,7 @@ struct Kernels {
                    const InputGradients& out);
 };
 
-// CUDA versions; all pointers are device memory.
+// CUDA versions of the two passes; all pointers are device memory.
 void weighted_sums_on_device(const Inputs& in, float* sums, cudaStream_t stream);
 void weighted_sums_backward_on_device(const Inputs& in, const float* v_sums, const InputGradients& out, cudaStream_t stream);
 

@@ -54,7 +54,7 @@ def blend_world(
             sizes = sizes * masks.reshape(-1)
         order = torch.argsort(sizes, stable=True)
         lengths = sizes[order].tolist()
-    # [tiles, pixels of a tile, 6]
+    # Arrange the rays by tile: [tiles, pixels of a tile, 6].
     bottom, right = tile_height * tile_size - height, tile_width * tile_size - width
     tiled = torch.nn.functional.pad(rays, (0, 0, 0, right, 0, bottom), value=float("nan"))
     tiled = tiled.reshape(images, tile_height, tile_size, tile_width, tile_size, 6).transpose(2, 3)
@@ -69,7 +69,8 @@ def blend_world(
     shown = torch.cat([opacities.reshape(-1, 1), colors.reshape(-1, channels)], -1)
     parts, first = [], 0
     while first < len(lengths):
-        # Tiles are in rising order of length: the last one of a part decides the memory.
+        # Tiles are sorted by the length of their lists, so the last tile of a part decides how much memory the part
+        # needs.
         last = first + 1
         while last < len(lengths) and (last + 1 - first) * tile_size**2 * lengths[last] <= PAIRS_AT_A_TIME:
             last += 1
@@ -134,7 +135,7 @@ def _blend_tiles(
     alphas = torch.where(hit, alphas.clamp(max=max_alpha), torch.zeros_like(alphas))
     product = torch.cumprod(1 - alphas, -1)
     with torch.no_grad():
-        # The product falls, so this keeps a terminated pixel closed.
+        # The transmittance only falls, so this keeps a terminated pixel closed.
         still_open = product > TRANSMITTANCE_STOP
     alphas = torch.where(still_open, alphas, torch.zeros_like(alphas))
     through = torch.cumprod(1 - alphas, -1)

@@ -12,7 +12,8 @@ constexpr int kSide = 16;               // pixels per side of a thread block
 constexpr int kChannelsAtOnce = 8;      // in registers; further ones repeat the pass over the list
 constexpr int kStaged = kSide * kSide;  // Gaussians in shared memory
 
-// A thread has one pixel. The threads of a block stage the Gaussians of their tile.
+// Blend the Gaussians of a tile. A thread has one pixel. The threads of a block stage the Gaussians of their tile in
+// shared memory.
 __global__ void __launch_bounds__(kStaged) blend(Inputs in, Pixels out, int first_channel) {
   __shared__ float staged[kStaged][kGaussianNumbers + 1];
   __shared__ int32_t ids[kStaged];

@@ -123,7 +123,7 @@ def rasterize_to_pixels_eval3d(
     )  # fmt: skip
     rays = pixel_rays(lens, shutter, Ks, image_width, image_height)
     batches, images = math.prod(batch_dims), math.prod(image_dims)
-    # Rows are the axes divided by the scales.
+    # Whitening matrices: rows are the axes divided by the scales.
     whitening = sigma_offsets(quats, torch.ones_like(scales)) / scales[..., None]
     inputs = (means, quats, scales, colors, opacities, rays)
     blend = blend_world

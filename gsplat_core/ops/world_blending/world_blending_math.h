@@ -11,7 +11,8 @@ using namespace gsplat::world_blending;
 
 constexpr float kHalfLog2E = 0.72134752f;
 
-// In standard deviations. The offset of the ray's closest point is computed first; the difference of squares would cancel.
+// Return the squared distance in standard deviations. The offset of the ray's closest point is computed first; the
+// difference of squares would cancel.
 GSPLAT_INLINE vfloat squared_distance(const float* gaussian, const vfloat ray[kRayNumbers]) {
   vfloat origin[3], direction[3], along = vfloat{}, length = vfloat{};
   const vfloat away[3] = {ray[0] - gaussian[0], ray[1] - gaussian[1], ray[2] - gaussian[2]};
