@@ -37,16 +37,18 @@ from gsplat_core.scene.depth_origin import PARALLAX
 from gsplat_core.scene.frames import Frame
 
 MOVES_PX = 2.0
-"""Error against the periodic motion in pixels from which a point may be pulled."""
+"""Deviation in pixels from the periodic motion beyond which a point counts as possibly pulled by a tool."""
 FEWEST_PULL_POINTS = 30
-"""Average number of points per picture with an error above `MOVES_PX` that an estimate needs."""
+"""Fewest points per picture on average with a deviation above `MOVES_PX` from which a pull is estimated."""
 SPREAD_PX = 0.7
-"""Cauchy scale of errors in pixels."""
+"""Cauchy scale in pixels of the points' deviations."""
 ROUNDS = 8
 HEAD_ON = 0.05
 """Regularising sine of the angle between motion and line of sight; limits the estimate for motion seen head-on."""
 LEAST_TOLD = 15.0
-"""Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the direction is ambiguous."""
+"""Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the direction of the pull is
+ambiguous.
+"""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ class Pull:
     """Median deviation of the points' motion from the common direction, in pixels."""
 
     def along(self, rays: Array, off: Array) -> tuple[Array, Array]:
-        """Return the relative motion along the line of sight and the unexplained error.
+        """Return each point's relative motion along the line of sight, and the part of its deviation that the common
+        direction does not explain.
 
         Args:
             rays: observed rays [N, 2].
@@ -98,7 +101,7 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
         unturned.append(np.repeat(turn[None], len(r), 0))
         where.append(r)
     c, turn, ray = np.concatenate(rows), np.concatenate(unturned), np.concatenate(where)
-    # Derivative of each constraint by the noise of the observed ray.
+    # Derivative of each constraint with respect to noise of the observed ray.
     reach = np.stack([np.tile([1.0, 0.0], (len(ray), 1)), np.tile([0.0, 1.0], (len(ray), 1)), -ray], 2) @ turn.swapaxes(
         1, 2
     )
@@ -117,7 +120,9 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
 
 
 WINDOW_S = 8.0
-"""Length in seconds of a window in which motion is assumed periodic. Windows of longer recordings overlap by half."""
+"""Length in seconds of a window (part of the recording) in which motion is assumed periodic. Windows of longer
+recordings overlap by half.
+"""
 RATE_HZ = 12.5
 """Largest number of frames used per second; several per heart beat."""
 KEY_EVERY_S = 1.2
@@ -150,7 +155,7 @@ class _Window:
     tracks: GridTracks
     motion: PeriodicMotion
     off: Array
-    """Ray errors [T, N, 2], observed minus predicted by the motion."""
+    """Ray errors [T, N, 2]: observed rays minus those predicted by the fitted motion."""
     error: float
     """Relative error common to all distances."""
 
@@ -304,11 +309,11 @@ class BreathingDepth(Estimator):
     evidence = "the given poses"
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap:
-        """See `Estimator`. Rejects every frame, since one frame shows no breathing."""
+        """Reject every frame, because one frame shows no breathing."""
         return doubted(frame.image.shape[:2], PARALLAX, NEEDS_ALL_FRAMES)
 
     def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
-        """See `OfRecording`."""
+        """Estimate the depth of all frames of a recording together."""
         if cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
             return RecordingDepth(list(frames), {})
         tissue = MovingTissue(frames, cameras)

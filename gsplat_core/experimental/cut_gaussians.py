@@ -27,9 +27,11 @@ BINOMIALS = (1.0, 3.0, 3.0, 1.0)
 PAIRS = ((3, 2), (3, 1), (3, 0), (2, 1), (2, 0), (1, 0))
 """Pairs i, j of control points whose terms l_ij make up the implicit form."""
 FARTHEST_FLIP = 0.5
-"""Largest shift of a control point, in standard deviations of the splat, that counts as a flip of a pixel's side."""
+"""Largest shift of a control point, in standard deviations of the splat, that is assumed to move a pixel to the other
+side of the curve (a flip).
+"""
 SMALLEST_FLIP = 0.15
-"""Lower bound of the shift in the gradient, which is inversely proportional to it."""
+"""Lower bound of the shift to a flip in the gradient, which is inversely proportional to the shift."""
 BEND = 1.0
 """Bend of a first curve in standard deviations. Nearly straight curves have an ill-conditioned implicit form."""
 TILE_SIZE, MAX_ALPHA, LEAST_ALPHA = 16, 0.99, 1 / 255
@@ -77,13 +79,15 @@ def implicit_form(points: Tensor, curves: Tensor) -> Implicit:
 
 
 class _Side(torch.autograd.Function):
-    """1 where the implicit form is positive, else 0; with a gradient by the smallest flip."""
+    """Autograd function: 1 where the implicit form is positive, else 0. The gradient assumes the smallest shift of a
+    control point that flips the result.
+    """
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, curves: Tensor) -> Tensor:
         value, slopes = implicit_form(points, curves)
         inside = value > 0
-        # The shift of one coordinate of one control point that moves the curve to the point, to first order.
+        # Smallest shift to first order of one coordinate of one control point that moves the curve to the point.
         flat = slopes.flatten(-2)
         largest, which = flat.abs().max(-1)
         shift = -value / torch.where(largest > 0, flat.gather(-1, which[..., None])[..., 0], torch.inf)
@@ -96,7 +100,7 @@ class _Side(torch.autograd.Function):
         inside, which, shift = ctx.saved_tensors
         near = (shift.abs() <= FARTHEST_FLIP) & shift.isfinite()
         size = shift.abs().clamp(min=SMALLEST_FLIP)
-        # A flip changes the side by 1 - 2 inside, at a cost of one shift.
+        # Crossing the curve changes the result by 1 - 2 inside, at the cost of the shift.
         change = torch.where(inside, -gradient, gradient)
         slope = torch.where(near, change * torch.where(shift < 0, -1.0, 1.0) / size, 0)
         full = slope.new_zeros(*slope.shape, 8).scatter_(-1, which[..., None], slope[..., None])
@@ -131,7 +135,9 @@ class CutKernel(GaussianKernel):
     extra = (CURVES,)
 
     def factors(self, offsets: Tensor, curves: Tensor | None) -> Tensor | None:
-        """See `GaussianKernel`; `curves` are the projected control points [T, L, M, 4, 2] relative to the means."""
+        """Return the factors of alpha at offsets [T, P, L, 2] from the splats' means. `curves` are the projected
+        control points [T, L, M, 4, 2] relative to the means.
+        """
         assert curves is not None
         return side(offsets[..., None, :], curves[:, None]).prod(-1)
 
@@ -205,7 +211,7 @@ def render_kernel(
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = (opacities[lists][:, None] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
     if CURVES in kernel.extra:
-        # In standard deviations, so that the limits of a flip do not depend on the size of the splat.
+        # Offsets are in standard deviations, so that the limits of a flip do not depend on the size of the splat.
         spread = rows.conics.detach()[:, [0, 2]].sum(1).clamp(min=1e-12).mul(0.5).rsqrt()[lists]
         curves = projected_curves(gaussians, camera, rows.means2d)[lists] / spread[:, :, None, None, None]
         factors = kernel.factors(offsets.detach() / spread[:, None, :, None], curves)

@@ -33,15 +33,17 @@ from gsplat_core.transfers import tensor_of
 Field = NDArray[np.float32]
 """Picture or flow, float32 [h, w, channels]."""
 MOST_CELLS = 40
-"""Number of cells along the longer side with separate shares."""
+"""Number of cells along the picture's longer side, each with its own mixing weights (shares)."""
 
 
 @dataclass(frozen=True)
 class SharesSettings:
-    """Settings of the learning; units are squares of the fields' units."""
+    """Settings of the learning of mixing weights (shares) of several predictions; units are squares of the predicted
+    fields' units.
+    """
 
     at_first: tuple[float, ...]
-    """Shares used before any observation."""
+    """Mixing weights used before any observation."""
     decay: float
     """Weight of accumulated sums at each new frame; about 1 / (1 - decay) frames are remembered."""
     around_cells: float
@@ -49,7 +51,7 @@ class SharesSettings:
     pull: float
     """Strength with which a cell's shares are pulled to those of the whole picture."""
     ridge: float
-    """Ridge weight that pulls each forecast's share of the whole picture to its initial share."""
+    """Weight of ridge regression that pulls each prediction's share over the whole picture to its initial value."""
 
 
 class LocalShares:
@@ -88,7 +90,7 @@ class LocalShares:
         return np.linalg.solve(mean[:, :-1] + settings.ridge * np.eye(len(first)), mean[:, -1] + settings.ridge * first)
 
     def local(self, shape: Sequence[int]) -> Field:
-        """Return the local shares [h, w, K] for fields of a shape."""
+        """Return the local mixing weights [h, w, K], interpolated to the size of a field."""
         settings, whole, size = self._settings, self.whole(), (shape[1], shape[0])
         if self._products is None:
             return np.broadcast_to(whole.astype(np.float32), (shape[0], shape[1], len(whole))).copy()
@@ -117,9 +119,9 @@ def blurred(field: NDArray[np.float32], deviation: float) -> NDArray[np.float32]
 REMEMBERED = 256
 """Number of remembered frames: some seconds, several heartbeats."""
 SOONEST = 6
-"""Smallest number of frames between compared moments, since neighbours are always similar."""
+"""Smallest distance in frames between compared moments, because neighbouring frames are always similar."""
 EARLIER_COUNTS = 0.64
-"""Weight of the dissimilarity of preceding moments."""
+"""Weight of the preceding moments in the dissimilarity of two moments."""
 FOLLOWED = 6
 """Number of most similar moments whose next motion is averaged."""
 Weighted: TypeAlias = tuple[float, Flow]
@@ -152,8 +154,7 @@ class SimilarMoments:
         self._motions[row] = motion
         self._coarse[row] = cv2.resize(motion, cells_for(motion.shape), interpolation=cv2.INTER_AREA).ravel()
         apart = np.square(self._coarse - self._coarse[row]).mean(axis=1, dtype=np.float64)
-        # The dissimilarity of two moments combines their last motions and the dissimilarity of the
-        # moments before.
+        # The dissimilarity of two moments combines that of their last motions and that of the moments before.
         of_moments_before = np.roll(self._unlike, 1)
         of_moments_before[np.isinf(of_moments_before)] = 0.0
         self._unlike = apart + EARLIER_COUNTS * of_moments_before
@@ -186,7 +187,7 @@ def weighted_mean(parts: Sequence[Weighted]) -> Field:
 
 
 FOLLOWS = 0.2
-"""Weight of the newest picture in the moving mean."""
+"""Weight of the newest picture in the moving mean of earlier pictures."""
 BLUR_PX = 1.5
 """Standard deviation of the blurred picture in pixels."""
 PICTURE_SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=30.0)
@@ -282,7 +283,7 @@ def moved(picture: Field, motion: Flow) -> Field:
 
 
 def _looked_up(field: Field, back: Field) -> Field:
-    """Sample a field at positions displaced by -`back` [h, w, 2]."""
+    """Sample a field at positions shifted by -`back` [h, w, 2]."""
     height, width = field.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     looked_up = cv2.remap(
@@ -307,7 +308,7 @@ class Expectation:
     picture: Tensor
     """Colours [H, W, 3], 0 to 1."""
     tissue: Tensor
-    """Weights [H, W], 1 on tissue."""
+    """Weights of the pixels [H, W], 1 on tissue."""
 
 
 class LearnedPrior(FlowPrior):
@@ -319,7 +320,7 @@ class LearnedPrior(FlowPrior):
     """
 
     def forget(self) -> None:
-        """See `MotionPrior.forget`."""
+        """Discard everything learned from the stream; see `MotionPrior.forget`."""
         super().forget()
         self._moments = SimilarMoments()
         self._shares = LocalShares(MOTION_SHARES)
@@ -330,11 +331,11 @@ class LearnedPrior(FlowPrior):
 
     @property
     def horizon_s(self) -> float:
-        """See `MotionPrior.horizon_s`. Learned predictions cover the next frame only."""
+        """Duration in seconds of the predicted motion. Learned predictions cover the next frame only."""
         return HORIZON_S if self._expected is None else min(HORIZON_S, self._interval_s)
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
-        """See `MotionPrior.velocity`."""
+        """Return the predicted velocity of the Gaussians' deltas; see `MotionPrior.velocity`."""
         expected = self._expected
         if expected is None or self._usable_motion() is None:
             return super().velocity(step, deltas)

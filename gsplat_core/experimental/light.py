@@ -22,8 +22,8 @@ from gsplat_core.scene.depth_origin import BELIEVED, LIGHT, RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
 
 SOLVED_AT = (1, 2, 4, 8, 12)
-"""Numbers of looks in a window at which all reliefs are re-estimated jointly. At other numbers only the newest look's
-change is estimated.
+"""Numbers of pictures ("looks") in a window at which all reliefs are re-estimated jointly. At other numbers only the
+newest picture's change is estimated.
 """
 
 
@@ -65,7 +65,7 @@ class LightWindow:
         return True
 
     def solve(self) -> None:
-        """Estimate all reliefs from all looks jointly."""
+        """Re-estimate the relief of every look jointly from all looks."""
         found = find_reliefs(self._grid, [look.shading for look in self.looks], self._changes)
         self._reliefs = [found.key + change for change in found.changes]
 
@@ -85,12 +85,13 @@ class LightWindow:
 EVERY_S = 0.3
 """Time from one estimate to the next in seconds. Frames between reuse the previous result."""
 MOST_LOOKS = 12
-"""Largest number of looks fitted together."""
+"""Largest number of looks (pictures of one window) fitted together."""
 NEWEST = 0.2
-"""Least weight of the newest relief relative to the tracked earlier one. The first few estimates are averaged equally.
+"""Smallest weight of the newest relief in its average with the earlier, tracked relief. The first few estimates are
+averaged equally.
 """
 LEAST_SEEN = 0.25
-"""Share of the picture that must be tissue, neither under- nor overexposed."""
+"""Smallest share of the picture that must be tissue that is neither under- nor overexposed."""
 ERROR = 0.05
 """Standard deviation of log brightness caused by pigment and model errors."""
 REACH = 0.05
@@ -117,7 +118,9 @@ class LightDepth(Estimator):
         self._recent: deque[Look] = deque(maxlen=MOST_LOOKS // 2)
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`. A rejected map states why the relief cannot be distinguished from a plane."""
+        """Return the depth of a frame from shading, at most every `EVERY_S` seconds. A rejected map states why the
+        relief cannot be distinguished from a plane.
+        """
         if camera.model != "pinhole":
             return None
         if frame.new_scene is not None or self._resized(frame) or self._moved(camera):

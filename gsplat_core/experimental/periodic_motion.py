@@ -48,7 +48,7 @@ def smoothness(grid: tuple[int, int]) -> Array:
 
 Array = NDArray[np.float64]
 NODES = 9, 8
-"""Number of nodes of the vector grid along the picture's width and height."""
+"""Number of nodes of the grid of motion vectors along the picture's width and height."""
 OUTSIDE = 0.15
 """Extension of the grid beyond the picture, as a share of its side."""
 AMPLITUDE = 0.04
@@ -62,7 +62,7 @@ SPREAD_PX = 0.5
 TRACK_PX = 0.35
 """Standard deviation of a tracked position in pixels."""
 TOGETHER = 3.0
-"""Number of consecutive observations with the same error; errors of neighbouring times are correlated."""
+"""Number of consecutive observations that count as one, because errors of neighbouring times are correlated."""
 ALIKE = 3.0
 """Factor by which depth errors exceed those of independent points. Light that moves with the scope
 shifts neighbouring points alike.
@@ -77,7 +77,7 @@ class PeriodicMotion:
 
     frequencies_hz: tuple[float, ...]
     terms: Array
-    """Rest position, then a and b of each frequency, in the world [N, 3, 1 + 2 F]."""
+    """Rest position, then cosine and sine coefficients of each frequency, in the world [N, 3, 1 + 2 F]."""
     error: Array
     """Relative standard deviation of each point's distance [N]."""
     cost: float
@@ -190,7 +190,7 @@ class _Fit:
         axis, count = pose[2, :3], len(H)
         known = 1 / (RELIEF * self._distance) ** 2
         V = H[:, :, 0, :, 0] + known * (np.outer(axis, axis) + 1e-3 * np.eye(3))
-        # The prior mean has the median depth along the axis and the current position across it.
+        # Prior mean of the rest position: the median depth along the optical axis, and the current position across it.
         rest = self._terms[:, :, 0]
         expected = rest + np.outer(self._distance - (rest @ axis + pose[2, 3]), axis)
         v = g[:, :, 0] + known * expected @ (np.outer(axis, axis) + 1e-3 * np.eye(3))
@@ -218,7 +218,9 @@ class _Fit:
         self._error = ALIKE * np.sqrt(variance) / self._distance
 
     def _field(self, S: Array, s: Array, nodes: Array) -> tuple[Array, Array]:
-        """Return vectors at the nodes [nodes, 3 * 2 F], and the covariance of all of them in the order (vector, node)."""
+        """Return the motion vectors at the grid's nodes [nodes, 3 * 2 F], and their joint covariance in the order
+        (vector, node).
+        """
         size, count = S.shape[1], nodes.shape[1]
         whole = np.zeros((size, count, size, count))
         for row in range(size):
@@ -279,7 +281,7 @@ def _at_one_distance(tracks: GridTracks) -> Array:
 
 
 AROUND_PX = 24.0
-"""Standard deviation of a point's neighbourhood in pixels."""
+"""Standard deviation in pixels of a point's neighbourhood, over which errors are averaged."""
 CELL_PX = 4
 """Side of the cells in which deviations are accumulated, in pixels."""
 FAR_OFF_PX = 8.0
@@ -287,7 +289,9 @@ FAR_OFF_PX = 8.0
 weight for their neighbours.
 """
 LEAST_LEFT = 0.3
-"""Share of a point's observations that must remain; otherwise all of them are used."""
+"""Smallest share of a point's observations that must remain after disturbed ones are excluded; otherwise all of them
+are used.
+"""
 ROBUST_ROUNDS = 2
 """Number of refits that exclude disturbed observations."""
 
@@ -347,7 +351,7 @@ BREATHES, BEATS = 0.9, 0.96
 heart beat are accepted.
 """
 AS_GOOD = 1.06
-"""Ratio to the lowest cost up to which another frequency counts as equally plausible."""
+"""Ratio to the lowest robust cost up to which another frequency counts as equally plausible."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.float64]
 HALF_WAVES = 9
-"""Half periods of the finest cosine along the longer side."""
+"""Number of half periods along the longer side of the finest cosine of the relief's basis."""
 SOFTNESS = 0.25
 """Fill light by subsurface scattering and surrounding walls: cos θ is replaced by (cos θ + SOFTNESS) / (1 + SOFTNESS).
 """
@@ -93,7 +93,7 @@ class Places:
     """Positions in a picture with the values and derivatives of the cosines there."""
 
     x: Array
-    """X / z of the ray, [places]."""
+    """Ray coordinate x / z at each position, [places]."""
     y: Array
     value: Array
     """Values of the cosines, [places, cosines]."""
@@ -129,7 +129,7 @@ class Places:
 
 @dataclass(frozen=True)
 class Appearance:
-    """Appearance of a relief and its derivatives by the coefficients [places, cosines]."""
+    """Appearance (brightness and highlights) of a relief and its derivatives by the coefficients [places, cosines]."""
 
     lit: Array
     """Logarithm of brightness [places]."""
@@ -185,10 +185,10 @@ PIGMENT_HALF_WAVES = 2.0
 FALL_OFF, FALL_OFF_DEVIATION = 1.0, 0.5
 """Prior mean and standard deviation of the vignetting exponent; 1 is a flat lamp."""
 CHANGE_ERROR = 0.02
-"""Standard deviation of a cell's change of log brightness."""
+"""Standard deviation of a cell's change of log brightness that motion does not explain."""
 CHANGES_TELL = 0.3
-"""Weight of brightness changes for the relief itself. It is below 1 because errors of neighbouring
-cells are correlated and carry no relief information.
+"""Weight of brightness changes in the estimate of the relief itself. It is below 1 because errors of neighbouring cells
+are correlated and carry no relief information.
 """
 RARER, RARER_DEVIATION = 12.0, 0.4
 """Prior of the decay rate of highlights with the angle, per radian, and the standard deviation of its logarithm."""
@@ -203,8 +203,8 @@ BRIGHTNESS_LOOKS = 5
 ROUNDS = 16
 ROUNDS_OF_CHANGE = 4
 ROUNDS_TO_SLOPES = 4
-"""Number of rounds over which the cosine term is faded in. Distance alone makes brightness linear
-in the unknowns, so the fit starts without it. Highlights are used after these rounds.
+"""Number of rounds over which the cosine term is faded in. The dependence on distance alone is linear in the unknowns,
+so the fit starts with it. Highlights are used after these rounds.
 """
 DAMPING = 0.6
 """Step size once highlights are used, because they make the problem strongly non-linear."""
@@ -212,7 +212,7 @@ DAMPING = 0.6
 
 @dataclass(frozen=True)
 class Reliefs:
-    """Relief at the key time, and its change at all other times."""
+    """Relief at the key time, the reference of a window, and its change at all other times."""
 
     key: Array
     """Coefficients at the key time, [cosines]."""
@@ -221,7 +221,9 @@ class Reliefs:
 
 
 class Equations:
-    """Normal equations of a relief step for one cue, with the cue's own unknowns eliminated."""
+    """Normal equations of a relief step for one cue (brightness, tracked tissue or highlights). The cue's other
+    unknowns are eliminated.
+    """
 
     def __init__(
         self, own: Array, relief: Array, off: Array, weight: Array, prior: Array, away: Array, tell: float = 1.0
@@ -293,7 +295,7 @@ class Brightness:
         return self._last
 
     def take(self, step: Array) -> None:
-        """Update pigment and light for a step of the relief."""
+        """Update the estimates of pigment and light after a step of the relief."""
         self._own = self._own + self._last.own_step(step)
 
 
@@ -325,7 +327,9 @@ class Followed:
         return self._last
 
     def take(self, step: Array) -> Array:
-        """Update the light and return the step of the relief's change for a step of the key relief."""
+        """Update the estimate of the light, and return the step of the relief's change that belongs to a step of the
+        key relief.
+        """
         own = self._last.own_step(step)
         self._light += float(own[-1])
         return own[:-1]
@@ -361,7 +365,7 @@ class Glints:
         return self._last
 
     def take(self, step: Array) -> None:
-        """Update the frequency of highlights for a step of the relief."""
+        """Update the estimated frequency of highlights after a step of the relief."""
         self._own = self._own + np.clip(self._last.own_step(step), -1, 1)
 
 
@@ -419,8 +423,8 @@ def _finer(grid: Grid) -> Array:
 
 
 def _width(scaled: Array, undecided: Array, usual: float, count: float, limits: tuple[float, float]) -> float:
-    """Return the prior's standard deviation that maximises the evidence. `undecided` is the ratio
-    of posterior to prior variance of each coefficient.
+    """Return the prior standard deviation of coefficients that maximises the evidence. `undecided` is the ratio of
+    posterior to prior variance of each coefficient.
     """
     decided = float(np.sum(1 - undecided))
     variance = (float(scaled @ scaled) + count * usual**2) / (decided + count)

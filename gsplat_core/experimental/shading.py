@@ -57,7 +57,7 @@ BESIDE_TOOL_EDGE = 0.0125
 
 @dataclass(frozen=True)
 class Cells:
-    """Brightness of a picture's cells."""
+    """Brightness of a picture, averaged over cells of a coarse grid."""
 
     brightness: NDArray[np.float64]
     """Log brightness without pigment up to an offset, [h, w]; meaningless where `share` is too small."""
@@ -212,10 +212,10 @@ RETURN_PX = 1.0
 MOST = 0.5
 """Largest accepted change of a pixel's log brightness; larger changes are errors or shadows."""
 LEAST_FOUND = 0.6
-"""Share of the key picture's tissue that must be found again for a view to count as tracked."""
+"""Smallest share of the key picture's tissue that must be found again for a picture to count as tracked."""
 WIDEST = 0.15
-"""Largest standard deviation of the change of log brightness for a view to count as tracked; a
-moving scope changes the light more.
+"""Largest standard deviation of the change of log brightness for a picture to count as tracked; a moving scope changes
+the light more.
 """
 
 

@@ -136,7 +136,7 @@ def load_bundle(folder: str | Path) -> Model:
 
 
 def _manifest_for(folder: Path, size: int) -> Manifest:
-    """Return the manifest, or the pending next one if only that fits the tensors."""
+    """Return the bundle's manifest, or the one of an interrupted replacement if only that fits the size of the tensors."""
     if not (folder / MANIFEST).exists() and (folder / NEXT_MANIFEST).exists():
         return _read_manifest(folder, NEXT_MANIFEST)
     manifest = _read_manifest(folder, MANIFEST)

@@ -123,7 +123,7 @@ def _all(element: Element, kind: str) -> bool:
 
 
 def _between(bounds: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Interpolate between minima (first three columns) and maxima."""
+    """Interpolate between minima (first three columns) and maxima of each chunk."""
     return np.asarray(bounds[:, :3] * (1 - share) + bounds[:, 3:] * share, np.float32)
 
 

@@ -220,7 +220,7 @@ class PartialFolder:
 
 
 def beside(target: Path, suffix: str) -> Path:
-    """Return an unguessable name in the folder of `target`.
+    """Return an unguessable name for a temporary file or folder next to `target`.
 
     It does not contain the target's name, which may already have the maximum length.
     """

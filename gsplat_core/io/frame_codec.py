@@ -54,7 +54,7 @@ class ArrayFormat(NamedTuple):
     bit: int
     """Bit in the header; 0 for the image, which every frame has."""
     kind: str
-    """Data type, little-endian."""
+    """Data type of the values, little-endian."""
     values: int
     """Values per pixel; 0 for a matrix [4, 4]."""
 
@@ -147,7 +147,7 @@ class FrameFields(Record):
     """None if the frame has no depth, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
     exposure: tuple[Positive, Positive, Positive] | None = None
-    """None for the default, 1 for each colour."""
+    """Gain of red, green and blue; None for 1 each."""
     withheld: Text | None = None
     new_scene: Text | None = None
 
@@ -333,7 +333,7 @@ def _packed(
 
 
 _Announced = list[tuple[str, tuple[int, ...], int]]
-"""Name, shape and bytes of each array."""
+"""Name, shape and size in bytes of each array that a header announces."""
 
 
 def _announced(data: memoryview, names: Iterable[str], max_pixels: int) -> tuple[int, int, int, _Announced]:

@@ -51,7 +51,7 @@ EXTRA_SIDE = IntegerIn(1, 1024)
 EXTRA_SIDES = 3
 """Largest number of dimensions of an extra tensor after the first."""
 RENDERER_VALUE = NumberIn(0.0, 1e30)
-"""Range of a renderer's value for the whole scene."""
+"""Range of a value that a renderer has for the whole scene."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 

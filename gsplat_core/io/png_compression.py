@@ -32,11 +32,11 @@ CLUSTERS = 1 << 16
 CENTROID_BITS = 6
 KMEANS_STEPS = 5
 COARSE = 256
-"""Number of clusters that are divided again."""
+"""Number of clusters of the first k-means step, each of which is divided further."""
 KMEANS_ROWS = 1 << 24
-"""Bound of the distances computed at a time."""
+"""Bound of the number of distances computed at a time."""
 _PICTURES = {"means": 16, "scales": 8, "quats": 8, "opacities": 8, "sh0": 8}
-"""Bits of the values that are stored as pictures."""
+"""Bits per value of the tensors that are stored as pictures."""
 _CLUSTERED = "shN"
 
 

@@ -29,19 +29,21 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAGIC = b"NGSP"
 VERSIONS = (2, 3)
-"""Versions in a gzip stream."""
+"""Versions of the format that are stored in a gzip stream."""
 ZSTD_VERSION = 4
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 """Magic, version, count, degree of the harmonics, fractional bits, flags, number of streams, offset of their table."""
 MOST_ZSTD = 20_000
-"""Largest plausible ratio of sizes of a stream. Equal bytes are compressed by more than 1,000."""
+"""Largest plausible ratio of decompressed to compressed size of a Zstandard stream. Equal bytes are compressed by more
+than 1,000.
+"""
 MOST_STREAMS = 16
 MARK = b"written by IntraSplat"
 """Comment in the header of the gzip stream that identifies a file written by this program."""
 GZIP_START = b"\x1f\x8b\x08\x10" + bytes(4) + b"\x00\xff" + MARK + b"\0"
 """Header of a gzip stream with a comment and without a time, so that equal models give equal bytes."""
 MOST_DEFLATED = 1032
-"""Largest ratio of sizes of the deflate algorithm."""
+"""Largest ratio of decompressed to compressed size of the deflate algorithm."""
 MOST_EXTENSIONS = 1 << 24
 """Largest size in bytes of data after the arrays that is checked."""
 COLOUR_SCALE = 0.15
@@ -204,7 +206,7 @@ def _smallest_three(stored: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 class _Inflated:
-    """Reader of a gzip stream that never holds more than is asked for."""
+    """Reader of a gzip stream that never decompresses more than is requested."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path = file, path
@@ -271,7 +273,7 @@ class _Streams:
         return b"".join(pieces)
 
     def check_end(self) -> None:
-        """Check that the streams hold nothing else.
+        """Raise an error if the streams contain more data than was read.
 
         Raises:
             BundleCorrupt: otherwise, or if the last one is damaged.

@@ -36,7 +36,7 @@ def read_ahead(items: Generator[T, None, None], name: str, ahead: int = ITEMS_AH
 
 
 class _Made(Generic[T]):
-    """Bounded queue between the producing thread and the consumer."""
+    """Bounded queue between the thread that produces items and the consumer."""
 
     def __init__(self, ahead: int) -> None:
         self._ahead = ahead

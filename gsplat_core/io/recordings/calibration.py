@@ -298,7 +298,7 @@ _STEREO_ADVICE = "docs/recordings.md has the layouts; correct the file, or remov
 
 
 class _Unusable(Exception):
-    """Reason why calibration values cannot be determined."""
+    """Exception with the reason why calibration values cannot be determined."""
 
 
 def read_stereo_calibration(folder: Path, findings: Findings) -> tuple[StereoCalibration, tuple[Path, ...]] | None:

@@ -125,13 +125,14 @@ class Contents:
                 yield self._frame(index, picture, found)
 
     def _beside(self) -> Generator[_Beside, None, None]:
-        """Return an iterator over the sidecar data of each image."""
+        """Return an iterator over the sidecar data of each image (mask, depth, right eye, labels, scan)."""
         if not any((self.right, self.masks, self.depth, self.labels, self.scans)):
             return (_Beside() for _ in range(self.images.frame_count))
         return read_ahead(self._read_beside(), f"read what lies beside the images of {printable(self.root.name)}")
 
     def _read_beside(self) -> Generator[_Beside, None, None]:
-        # Collect the findings of each frame separately, because the thread reads frames before it is their turn.
+        # Collect the findings of each frame separately, because the read-ahead thread reads frames before they are
+        # yielded.
         found = Findings()
         rights = self.right.frames(found) if self.right else None
         for index in range(self.images.frame_count):

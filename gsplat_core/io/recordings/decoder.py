@@ -30,7 +30,7 @@ _H265_PICTURES = range(32)
 
 
 class Ticket:
-    """Packet number that FFmpeg passes on to the decoded picture.
+    """Packet number that FFmpeg attaches to the picture decoded from the packet.
 
     PyAV identifies opaque values by object identity, so each packet needs its own object.
     Equal integers of two packets in flight would be confused.
@@ -41,7 +41,9 @@ class Ticket:
 
 
 class OverrunProbe:
-    """Second decoder, fed with differently padded packets."""
+    """Second decoder, fed with differently padded packets. A different picture reveals that the decoder read beyond the
+    end of damaged data.
+    """
 
     def __init__(self, context: av.VideoCodecContext, length_bytes: int) -> None:
         self._context = context
@@ -146,7 +148,7 @@ class PictureDecoder:
         known = stream.codec_context
         name = known.codec.canonical_name
         self.doubts: dict[int, str] = {}
-        """Reason for suspecting a packet, by packet number; consumers remove handled entries."""
+        """Reason for suspecting damage of a packet, by packet number; consumers remove handled entries."""
         self._check = packet_check(name, known.extradata)
         self._at_once = name in _WITHOUT_DELAY
         self._context = _context(known, _DECODERS.get(name))

@@ -159,7 +159,7 @@ _ISO_FIRST_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wid
 
 
 class UnusableContainer(Exception):
-    """Reason why a container cannot be used; callers convert it to a finding."""
+    """Exception with the reason why a container cannot be used; callers convert it to a finding."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ _H265_PICTURES = frozenset(range(32))
 # Inside a unit an encoder puts 3 after two zeros, so that none of these can occur (H.264 7.4.1, H.265 7.4.2.1).
 _FORBIDDEN = (b"\0\0\0", b"\0\0\1", b"\0\0\2")
 _HOLE_BYTES = 64
-"""Length of a run of zero bytes that counts as lost data.
+"""Length of a run of zero bytes in coded video that counts as lost data.
 
 An arithmetic coder emits such a run only for a large picture without any change.
 """

@@ -31,7 +31,7 @@ from gsplat_core.io.recordings.findings import Findings
 
 
 class UnreadableFile(Exception):
-    """Reason why a file cannot be read; callers convert it to a finding."""
+    """Exception with the reason why a file cannot be read; callers convert it to a finding."""
 
 
 def open_plain(path: Path) -> BinaryIO:
@@ -270,7 +270,7 @@ _JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 
 class UnreadableImage(UnreadableFile):
-    """Reason why an image cannot be decoded; callers convert it to a finding."""
+    """Exception with the reason why an image cannot be decoded; callers convert it to a finding."""
 
 
 class _QuietDecoders:

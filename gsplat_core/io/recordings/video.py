@@ -125,7 +125,7 @@ def _positions(
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN -c:v libx264 OUT.mp4)"
 _MOST_LATE = 64
-"""Maximum delay of a decoder in packets."""
+"""Maximum number of packets by which a decoder delays a picture."""
 
 
 class VideoFrames:
@@ -229,7 +229,7 @@ class DamageSpread:
         self._next = 0
 
     def follow(self, doubts: dict[int, str], last: int) -> None:
-        """Merge the decoder's doubts about packets up to number `last`."""
+        """Merge the decoder's reasons for suspecting damage of packets, up to packet number `last`."""
         self._own = doubts | self._own  # the first reason is usually the most specific
         begin = min([self._next, *doubts])  # reclassify pictures from a late doubt on
         doubts.clear()
@@ -264,7 +264,7 @@ def _opened(path: Path, container: Container) -> Iterator[tuple[av.container.Inp
 
 
 def _numbered(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[int, av.Packet | None]]:
-    """Yield the packets with data, numbered as in the index, then None."""
+    """Yield the packets with data, numbered as in the index, then None to flush the decoder."""
     number = 0
     packets = iter(container.demux(stream))
     while True:

@@ -133,7 +133,9 @@ class SessionReader:
                 yield line
 
     def late_depths(self) -> Iterator[dict[str, Any] | None]:
-        """Yield the fields of each `take_depth` line by name; None if its pictures are unreadable."""
+        """Yield the fields of each `take_depth` line (depth that arrived after its frame) by name; None if its pictures
+        are unreadable.
+        """
         for segment in self.segments:
             with segment.open() as pictures:
                 for line in segment.lines():
@@ -210,7 +212,7 @@ def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -
 
 
 def late_depth_of(line: DepthTaken, pictures: SegmentPictures) -> dict[str, Any] | None:
-    """Return the late fields of a frame; None if they cannot be decoded completely."""
+    """Return the depth fields of a line that arrived after their frame; None if they cannot be decoded completely."""
     planes, damage = pictures.of(line)
     if damage is not None or "depth" not in planes:
         return None

@@ -43,7 +43,9 @@ class SegmentBegins(Record):
     event: Literal["segment"] = "segment"
     number: Count
     why: Text
-    """Reason for ending the previous segment: "begin", "bytes" or "seconds"."""
+    """Reason for starting a new segment: "begin" of the recording, or the limit of the previous one, "bytes" or
+    "seconds".
+    """
     utc: Text
     """Wall-clock date and time in ISO 8601."""
     monotonic_ns: Nanoseconds
@@ -59,7 +61,7 @@ class _PictureLine(Record):
     height_px: Side
     tracks: Tracks
     pose: Pose | None = None
-    """World-to-camera pose of the frame."""
+    """World-to-camera pose [4, 4] of the frame in row-major order."""
 
 
 class FrameLine(FrameFields, _PictureLine):
@@ -94,10 +96,10 @@ class ShownLine(Record):
     """
     shown_ns: Nanoseconds | None = None
     age_ns: Nanoseconds | None = None
-    """Time from the arrival of the newest frame in the picture until its display."""
+    """Time from the arrival of the newest frame in the picture until the picture's display, in nanoseconds."""
     state: Text | None = None
     tracks: Tracks
-    """Track `shown` with the picture as displayed."""
+    """Timestamp of the picture as displayed, in the track `shown`."""
 
 
 class LostLine(Record):
@@ -184,7 +186,7 @@ class DepthTaken(Record):
     width_px: Side
     height_px: Side
     tracks: Tracks
-    """`depth`, and `depth_confidence` if available."""
+    """Timestamps of the late depth in the track `depth`, and in `depth_confidence` if available."""
 
 
 class Grown(Record):

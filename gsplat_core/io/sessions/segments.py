@@ -32,7 +32,7 @@ from gsplat_core.io.sessions.records import (
 from gsplat_core.io.sessions.tracks import CODINGS, TrackIndex, TrackReader, TrackWriter
 
 Stage = Literal["", "prepared_", "late_"]
-"""Name prefix of track files.
+"""Name prefix of track files: frames as received, as prepared for training, or fields that arrived late.
 
 "" marks received and displayed pictures, "prepared_" those passed to training, and "late_" depth
 passed to training later.
@@ -121,7 +121,7 @@ class SegmentWriter:
 
 
 PictureLine = FrameLine | PreparedLine | ShownLine | DepthTaken
-"""Log lines with pictures."""
+"""Log lines that refer to pictures in tracks."""
 FIELDS = ("right_image", "mask", "depth", "pose")
 MOST_OPEN = 128
 """Maximum number of files of a segment; a log that names more is invalid."""
@@ -137,7 +137,7 @@ class SegmentReader:
         self.ends: SegmentEnds | None = None
         """Last line of the log; None if the log is truncated or still being written."""
         self.named = 0
-        """Number of frames named by the log."""
+        """Number of frames that the log mentions, readable or not."""
         self.seqs = array("q")
         """Sequence numbers of the readable frames, in order."""
         self.first: FrameLine | None = None

@@ -43,7 +43,7 @@ _NAMED_AFTER_ITS_TIME = re.compile(r"\d{8}T\d{6}Z(-\d+)?")
 
 @dataclass(frozen=True)
 class KeptPart:
-    """Complete segment, or an earlier session."""
+    """Part that retention deletes as a whole: a complete segment, or an earlier session."""
 
     folder: Path
     bytes: int
@@ -316,7 +316,7 @@ class SessionWriter:
         }
 
     def _go_on(self) -> None:
-        """Sync, start the next segment and delete old segments, each when due. Called before each line."""
+        """Sync the files, start the next segment and delete old segments, each when due. Called before each line."""
         now = self.options.clock()
         if now - self._synced_ns >= SYNC_S * 1e9:
             self._segment.sync()
@@ -365,7 +365,7 @@ class SessionWriter:
 
 
 def _said(frame: Frame) -> dict[str, Any]:
-    """Return the fields of a frame for its log line, without the tracks."""
+    """Return the fields of a frame other than its arrays, for its log line."""
     return {
         **fields_of(frame),
         "seq": frame.seq,
