@@ -119,7 +119,7 @@ class Fragment:
         return self._run_claimed(self._scheduler)
 
     def run_on(self, scheduler: Scheduler) -> RunResult:
-        """Run once with another scheduler; otherwise as `run`."""
+        """Run once with another scheduler instead of the one set by `scheduler`; otherwise as `run`."""
         self._claim()
         return self._run_claimed(scheduler)
 

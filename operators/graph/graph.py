@@ -282,7 +282,7 @@ class OperatorTask:
         return next((edge.capacity - most for _, gating, most in self._rooms if gating is edge), 0)
 
     def has_messages(self) -> bool:
-        """Return True if every gating input has its messages."""
+        """Return True if every gating input holds as many messages as its port requires."""
         for queue, _, need in self._needs:  # noqa: SIM110 - all() of a generator costs more than the rest of a poll
             if len(queue) < need:
                 return False
@@ -441,7 +441,9 @@ class OperatorTask:
                 self.start()
 
     def _seq(self) -> int | None:
-        """Return the number of the frame in work, from the metadata or a received message; None if unknown."""
+        """Return the number of the frame that the operator is processing, from the metadata or a received message; None
+        if unknown.
+        """
         found = [self.operator.metadata.get("seq")]
         found += [getattr(message.value, "seq", None) for message in self.received]
         return next((seq for seq in found if isinstance(seq, int)), None)

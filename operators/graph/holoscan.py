@@ -76,7 +76,7 @@ class Gate(_Condition):
         return _STATUS[status], None
 
     def _finishes(self, status: SchedulingStatus) -> bool:
-        """Finish the task if it can do no more, and return True if so."""
+        """Finish the task if its operator can never compute again, and return True if so."""
         with self._turn:  # a computing operator has taken its last message but may not have emitted its result
             if self.computing or not (status is SchedulingStatus.NEVER or self.task.exhausted()):
                 return False

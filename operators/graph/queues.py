@@ -110,7 +110,7 @@ class LockedEdge(Edge):
         self.wake_consumer: Callable[[], None] = _do_nothing
 
     def push(self, message: Message) -> None:
-        """See `Edge.push`."""
+        """Append a message under the scheduler's lock, and wake the consumer; see `Edge.push`."""
         with self._lock:
             super().push(message)
             self.wake_consumer()
@@ -137,7 +137,7 @@ class CarriedEdge(LockedEdge):
     receiver: Any = None
 
     def push(self, message: Message) -> None:
-        """See `Edge.push`."""
+        """Append a message to the mirrored queue, and send it through the engine if the queue has grown."""
         with self._lock:
             length = len(self.queue)
             super().push(message)

@@ -203,8 +203,7 @@ class MultiThreadScheduler:
 
     def _rouse(self, task: OperatorTask) -> None:
         """Wake the thread of an operator if it sleeps. Requires the lock."""
-        # Removed before the operator's thread wakes up, because `_check_deadlock` would still count the operator as
-        # asleep.
+        # Remove the operator before its thread wakes up, because `_check_deadlock` would still count it as asleep.
         if self._asleep.pop(task, None) is not None:
             self._wakers[task].notify()
 

@@ -69,7 +69,7 @@ class OutputVideosOp(Operator):
             video.write(picture if picture.shape[:2] == size else fitted(picture, *size), rendered.frame.time_s)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the names of the written videos to the outcome of the run."""
         for name in self.names:
             if (path := self.folder / video_name(name)).exists():
                 outcome.output(f"video_{name}", path)

@@ -102,7 +102,7 @@ class _Part:
 
     write: Callable[[SessionWriter], None]
     what: What | None = None
-    """Kind of picture data; None for a line without pictures."""
+    """Kind of picture data that the item holds; None for a line without pictures."""
     seq: int = 0
     bytes: int = 0
     """Size of the pictures in bytes."""
@@ -314,7 +314,7 @@ class SessionRecorder:
         try:
             part.write(writer)
         except (InvalidInput, ValidationError) as error:
-            # A frame that the format cannot store, for example with NaN in its pose.
+            # The frame cannot be stored in the format, for example because of NaN in its pose.
             wrong = " ".join(str(error).split())[:200]
         if wrong is not None and (line := part.lost(wrong)) is not None:
             writer.line(line)
@@ -395,7 +395,7 @@ class RecordFramesOp(Operator):
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the counts of the recording to the outcome of the run."""
         recorded = self.recorder.recorded
         outcome.add(RecordingResult(recorded))
         if recorded.frames:

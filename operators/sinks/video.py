@@ -73,7 +73,7 @@ class VideoSinkOp(Operator):
         self.displayed += 1
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the video to the outcome of the run."""
         outcome.add(DisplayResult(self.displayed))
         if self.displayed and self.path.exists():
             outcome.output("video", self.path)

@@ -186,12 +186,14 @@ PROTOCOLS = {
     "http": "http,https,httpproxy,tcp,tls,crypto",
     "https": "https,http,httpproxy,tcp,tls,crypto",
 }
-"""Protocols that FFmpeg may open for each scheme. Files are excluded, even if a server or playlist names one."""
+"""Protocols that FFmpeg may open for each URL scheme. Files are excluded, even if a server or playlist names one."""
 FORMATS = (
     "rtsp,rtp,sdp,mpegts,flv,live_flv,mov,mp4,matroska,webm,avi,asf,ogg,nut,mpjpeg,mjpeg,h264,hevc,mpeg,mpegvideo,m4v,ivf,"
     "yuv4mpegpipe,hls,jpeg_pipe,png_pipe"
 )
-"""Permitted demuxers. None opens other files by name except HLS, whose segments are restricted by `PROTOCOLS`."""
+"""Demuxers that FFmpeg may use. None opens other files by name except HLS, whose segments are restricted by
+`PROTOCOLS`.
+"""
 _LABEL = re.compile(r"(?![-])[\w-]{1,63}(?<!-)")
 
 

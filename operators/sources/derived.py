@@ -35,29 +35,29 @@ class DerivedSource:
 
     @property
     def state(self) -> SourceState:
-        """See `FrameSource`."""
+        """State of the wrapped source."""
         return self._source.state
 
     @property
     def state_sentence(self) -> str:
-        """See `ReportingSource`."""
+        """State of the wrapped source as a sentence."""
         return self._source.state_sentence if isinstance(self._source, ReportingSource) else ""
 
     def counts(self) -> Mapping[str, int]:
-        """See `ReportingSource`."""
+        """Return the wrapped source's numbers of dropped or repaired items, by reason."""
         return self._source.counts() if isinstance(self._source, ReportingSource) else {}
 
     def open(self) -> None:
-        """See `FrameSource`."""
+        """Open the wrapped source."""
         self._source.open()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """See `FrameSource`."""
+        """Return the next frame of the wrapped source, changed; None if none arrived within `timeout_s`."""
         frame = self._source.read(timeout_s)
         return None if frame is None else self._derived(frame)
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Close the wrapped source."""
         self._source.close()
 
     def _derived(self, frame: Frame) -> Frame:
@@ -65,7 +65,7 @@ class DerivedSource:
 
 
 def scaled_description(about: SourceDescription, scale: float) -> SourceDescription:
-    """Return the description of a source whose frames are resized by `scale`."""
+    """Return the description of the same source with frames resized by `scale`."""
     camera = about.camera.scaled(scale)
     return replace(about, width_px=camera.width_px, height_px=camera.height_px, camera=camera)
 
@@ -103,7 +103,7 @@ class SplitSource(DerivedSource):
     """
 
     def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
-        """Raises InvalidSetting if the source already has right pictures, or its camera is not that of one eye."""
+        """Wrap a source. Raises InvalidSetting if it already has right pictures, or its camera is not that of one eye."""
         self._layout = layout
         super().__init__(source, self._described(source.description))
 
@@ -231,7 +231,7 @@ class JoinedSource(LiveSource):
             yield self._paired(frame, kept)
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Stop reading and close both sources."""
         super().close()
         self._left.close()
         self._right.close()

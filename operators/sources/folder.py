@@ -136,7 +136,7 @@ class FolderSource(StreamSource):
         self.describe(self._name, (picture.image.shape[1], picture.image.shape[0]), fps)
 
     def pictures(self) -> Iterator[Frame]:
-        """See `StreamSource`."""
+        """Yield each image once it is complete; see `StreamSource.pictures`."""
         clock = SteadyClock(self._rate or DEFAULT_FPS)
         first, self._first = self._first, None
         if first is None:

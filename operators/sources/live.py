@@ -27,7 +27,7 @@ from operators.sources.source import SourceDescription, SourceState, ThreadedSou
 
 FIRST_S = 0.25
 MOST_S = 2.0
-"""Delay between attempts in seconds: doubled after each failure, from `FIRST_S` to `MOST_S`."""
+"""Longest delay between connection attempts in seconds. The delay is doubled after each failure, from `FIRST_S` on."""
 
 
 class Backoff:
@@ -66,7 +66,9 @@ class FrameOrder:
     """
 
     def __init__(self, *, trusted: bool = False) -> None:
-        """trusted: the sender repeats no frame and keeps the order; only `restart` is handled."""
+        """Create the state of a new stream. trusted: the sender repeats no frame and keeps the order, so that only
+        `restart` is handled.
+        """
         self._trusted = trusted
         self._counts: Counter[str] = Counter()
         self.begin()
@@ -79,7 +81,7 @@ class FrameOrder:
         return self._counts
 
     def begin(self) -> None:
-        """Reset everything; the next frame gets number 0 and time 0."""
+        """Forget the previous stream; the next frame gets number 0 and time 0."""
         self._counts.clear()
         self._out: Frame | None = None  # last frame, as passed on
         self._in: Frame | None = None  # last frame, as received
@@ -205,7 +207,7 @@ class LiveSource(ThreadedSource):
         self._lost: str | None = None
         self._ending: str | None = None
 
-    # Methods for `frames()`, in the reader's thread.
+    # Methods that subclasses call in `frames()`, in the reader's thread.
 
     def wait(self, seconds: float) -> bool:
         """Wait for `seconds`. Return True immediately when the source is being closed."""
@@ -243,7 +245,9 @@ class LiveSource(ThreadedSource):
 
     @property
     def state(self) -> SourceState:
-        """See `FrameSource`."""
+        """Current state of the source: `RECONNECTING` from a call of `lost` to the next frame, otherwise by the time
+        since the last frame.
+        """
         with self._changed:
             lost = self._lost is not None and not self._ready and not self._done
             return SourceState.RECONNECTING if lost else super().state
@@ -279,7 +283,7 @@ class LiveSource(ThreadedSource):
         super().open()
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Stop reading and release all resources. Idempotent."""
         super().close()
         self._ending = None
 
@@ -300,7 +304,7 @@ class LiveSource(ThreadedSource):
             if ordered is None:
                 return not stop.is_set()
             frame = ordered
-        # A single copy of the dataclass, whichever fields change.
+        # Change both fields in one copy of the dataclass.
         if (arrived_ns, status) != (frame.arrived_ns, frame.status):
             frame = replace(frame, arrived_ns=arrived_ns, status=status)
         with self._changed:
@@ -321,13 +325,14 @@ class LiveSource(ThreadedSource):
 
 
 PULL = 0.05
-"""Share of the lag behind the clock that each frame corrects."""
+"""Share of the lag behind the arrival clock that each frame's timestamp corrects."""
 PAUSE_S = 1.0
 """Lag in seconds that counts as a pause of the sender and is corrected at once."""
 
 
 class SteadyClock:
-    """Advances the timestamp by one period per frame, plus a correction if it lags behind the clock.
+    """Clock for frames without timestamps. It advances by one period per frame, plus a correction if it lags behind the
+    arrival times.
 
     Arrival times jitter, which would disturb a deformation learned over time. Frames that arrive faster than the
     nominal rate, for example from a piped file, keep that rate.
@@ -358,7 +363,7 @@ class StreamSource(LiveSource):
     """`LiveSource` for an external sender. A subclass calls `describe` and implements `pictures()`."""
 
     def __init__(self, options: SourceOptions, *, stalled_after_s: float = STALLED_AFTER_S) -> None:
-        """Set the options.
+        """Store the options; `describe` must follow.
 
         Args:
             options: `scale`, `max_frames` and `waiting` apply. An infinite `speed` makes the sender
@@ -422,7 +427,7 @@ class StreamSource(LiveSource):
         raise NotImplementedError(f"{type(self).__name__} has no pictures method")
 
     def frames(self) -> Iterator[Frame]:
-        """See `LiveSource`."""
+        """Yield the frames of `pictures()`, resized and with empty tissue masks for damaged ones."""
         for given, frame in enumerate(self.pictures(), start=1):
             if frame.status is FrameStatus.DAMAGED:
                 # As in recordings, no pixel of a damaged picture counts as tissue.

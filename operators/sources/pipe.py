@@ -49,7 +49,7 @@ class RawFormat:
     """Format of contiguous pictures of one size, as written by `ffmpeg -f rawvideo` and GStreamer's `fdsink`."""
 
     def __init__(self, name: str, width_px: int, height_px: int) -> None:
-        """Raises InvalidSetting for an unknown format or an unusable size."""
+        """Prepare the conversion. Raises InvalidSetting for an unknown format or an unusable size."""
         if name not in PLANES:
             raise InvalidSetting(f"format is {name!r:.60}; known are {', '.join(PLANES)}")
         check_size("raw frames", width_px, height_px)
@@ -187,18 +187,18 @@ class PipeSource(StreamSource):
         self.describe(self._name, (self._raw.width_px, self._raw.height_px), self._fps)
 
     def open(self) -> None:
-        """See `FrameSource`."""
+        """Start reading from the pipe. Idempotent."""
         if self._fd < 0:
             self._fd = self._opened()
         super().open()
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Stop reading and close the pipe. Idempotent."""
         super().close()
         self._let_go()
 
     def pictures(self) -> Iterator[Frame]:
-        """See `StreamSource`."""
+        """Yield the frames of one writer of the pipe after the other; see `StreamSource.pictures`."""
         seq = given = 0
         clock = SteadyClock(self.description.fps)
         while not self.wait(0):
@@ -275,7 +275,8 @@ class PipeSource(StreamSource):
                 data = os.read(self._fd, count)
                 if data:
                     return data
-                # A named pipe has no writer at the beginning.
+                # An empty read may mean that a named pipe has no writer yet. Try again if there is time to wait for
+                # one.
                 if until_s is None or not self._again or self._pending or self.wait(LOOK_S):
                     raise Ended
 

@@ -172,7 +172,7 @@ _EXIT_WITHIN_S = 0.6
 
 
 class Served:
-    """One source and the connection to the parent process."""
+    """Source in the child process, and the child's connection to the parent process."""
 
     def __init__(self, connection: Connection, memory_fd: int) -> None:
         self._connection = connection
@@ -261,7 +261,7 @@ class ToParent(logging.Handler):
 
 
 def serve_source(connection_fd: int, memory_fd: int) -> None:
-    """Open one source and transfer its frames; the main function of the process.
+    """Open one source and transfer its frames to the parent process; the main function of the child process.
 
     The process ends when the parent closes the connection, even if the source blocks. It ignores signals sent to the
     process group, because the parent controls its lifetime.
@@ -472,7 +472,9 @@ class ProcessSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """State of the source. The state reported by the process applies while the process responds."""
+        """Current state of the source: the one that the child process reported, or stalled if the process does not
+        respond.
+        """
         state, reported, child = super().state, self._child_state, self._child
         if state is not SourceState.LIVE or self._ready:
             return state
@@ -498,14 +500,14 @@ class ProcessSource(LiveSource):
         return dict(counts)
 
     def open(self) -> None:
-        """See `FrameSource`."""
+        """Start reading, with counts from 0. Idempotent."""
         if self._thread is None:
             self._earlier_counts.clear()
             self._child_counts = {}
         super().open()
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """End the child process and release all resources. Idempotent."""
         super().close()
         self._end()
 

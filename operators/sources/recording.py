@@ -68,8 +68,7 @@ class RealtimeSource(LiveSource):
         with closing(read_ahead(self._numbered(), f"decode {self.description.name}", DECODED_AHEAD)) as decoded:
             for frame in decoded:
                 if math.isfinite(speed):
-                    # The clock starts with the first picture, so that opening the file does not
-                    # delay the second one.
+                    # Start the clock with the first picture, so that opening the file does not delay the second one.
                     start_ns = time.monotonic_ns() if start_ns is None else start_ns
                     due_ns = start_ns + round(frame.pts_ns / speed)
                     late_ns = time.monotonic_ns() - due_ns
@@ -213,6 +212,6 @@ class SessionSource(ThreadedSource):
         self.description = replace(RecordingSource(recording).description, fields=frozenset(), frame_count=self._most)
 
     def frames(self) -> Iterator[Frame]:
-        """See `ThreadedSource`."""
+        """Yield the session's frames as they were prepared for training, in order."""
         for _, frame in zip(range(self._most), self._reader.prepared(), strict=False):
             yield frame

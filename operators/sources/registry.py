@@ -52,7 +52,8 @@ STUCK_AFTER_S = {"v4l2": 5.0}
 _TWO_SOURCES = "stereo:"
 _STEREO = re.compile(r"(?P<before>[?&#])stereo=(?P<layout>[^&#]*)")
 
-# At least two letters, as a single letter is a drive. A Path collapses two slashes into one.
+# A scheme has at least two letters, because a single letter is a Windows drive. One slash suffices, because a Path
+# collapses two slashes into one.
 _ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):(?P<slashes>/{0,2})(?P<rest>.*)", re.DOTALL)
 
 

@@ -205,7 +205,7 @@ class ThreadedSource:
 
     @property
     def state(self) -> SourceState:
-        """See `FrameSource`."""
+        """Current state of the source. Thread-safe."""
         with self._changed:
             if self._ready:
                 return SourceState.LIVE
@@ -228,7 +228,7 @@ class ThreadedSource:
         self._thread.start()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """See `FrameSource`."""
+        """Return the next frame, waiting at most `timeout_s` seconds; None if there is none."""
         with self._changed:
             self._changed.wait_for(lambda: self._ready or self._done, timeout_s)
             if self._ready:
@@ -241,7 +241,7 @@ class ThreadedSource:
         return None
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Stop reading and release all resources. Idempotent."""
         thread, self._thread = self._thread, None
         if thread is None:
             return

@@ -39,7 +39,7 @@ class Place:
     """FFmpeg's name of the demuxer or device; None to detect it from the data."""
     open_s: float = 10.0
     read_s: float = 5.0
-    """Timeouts in seconds for opening the stream and for the next packet."""
+    """Timeout in seconds for the next packet; `open_s` limits opening the stream."""
 
 
 class Connection:
@@ -218,7 +218,7 @@ class ConnectedSource(StreamSource):
         self.describe(name, self._connection.size, self._connection.fps)
 
     def pictures(self) -> Iterator[Frame]:
-        """See `StreamSource`."""
+        """Yield the pictures of the stream, reconnecting after a loss; see `StreamSource.pictures`."""
         backoff = Backoff()
         connection, self._connection = self._connection, None
         if connection is not None and not connection.has_an_end and time.monotonic() - self._connected_s > FRESH_S:
@@ -249,7 +249,7 @@ class ConnectedSource(StreamSource):
                 return
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Stop reading and close the connection. Idempotent."""
         super().close()
         connection, self._connection = self._connection, None
         if connection is not None:

@@ -205,18 +205,18 @@ class ZeroMqSource(StreamSource):
             raise
 
     def open(self) -> None:
-        """See `FrameSource`."""
+        """Connect the socket and start reading. Idempotent."""
         if self._socket is None:
             self._connect()
         super().open()
 
     def close(self) -> None:
-        """See `FrameSource`."""
+        """Stop reading and close the socket. Idempotent."""
         super().close()
         self._disconnect()
 
     def pictures(self) -> Iterator[Frame]:
-        """See `StreamSource`."""
+        """Yield the received frames, replacing the socket if it stays unconnected; see `StreamSource.pictures`."""
         for _ in range(2 * self.options.waiting):  # discard frames queued since the source was created
             self._next(0)
         while not self.wait(0):
