@@ -51,7 +51,7 @@ MOST_MANIFEST_BYTES = 256 << 20
 
 
 class BackupFailed(UserError):
-    """A backup cannot be made or restored. Nothing was changed."""
+    """Exception for a backup that cannot be made or restored. Nothing was changed."""
 
 
 @dataclass(frozen=True)

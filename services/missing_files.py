@@ -154,7 +154,7 @@ class StoredFilesWatch(Collector):
         return CheckResult(False, f"files are missing: {said}; the log names them; restore a backup", needed=False)
 
     def collect(self) -> Iterable[Metric]:
-        """See `Collector`."""
+        """Export the number of missing files at scrape time; see `Collector`."""
         family = GaugeMetricFamily(
             "intrasplat_files_missing", "Rows of the database without their file.", labels=["kind"]
         )

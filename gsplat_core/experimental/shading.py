@@ -262,8 +262,8 @@ def look_at(frame: Frame, camera: Camera) -> Look:
 
 
 class Follower:
-    """Tracks the tissue of one key picture to other pictures of the same size. Pictures are best
-    passed in temporal order away from the key, since each flow starts from the previous one.
+    """Tracker of the tissue of one key picture in other pictures of the same size. Pictures are best passed in temporal
+    order away from the key, since each flow starts from the previous one.
     """
 
     def __init__(self, key: Look) -> None:

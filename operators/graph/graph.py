@@ -246,7 +246,9 @@ class OperatorTask:
         self._began_ns = 0
 
     def connect(self) -> None:
-        """Derive the gating edges from the ports; called once when all edges exist."""
+        """Determine from the ports which edges gate the operator, that is, keep it from computing while they are empty
+        or full. Called once when all edges exist.
+        """
         spec = self.operator.spec
         self.in_edges = [edge for edges in self.inputs.values() for edge in edges]
         self.out_edges = [edge for edges in self.outputs.values() for edge in edges]

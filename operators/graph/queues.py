@@ -116,7 +116,7 @@ class LockedEdge(Edge):
             self.wake_consumer()
 
     def pop(self) -> Message | None:
-        """See `Edge.pop`."""
+        """Remove the oldest message under the scheduler's lock, and wake the producer."""
         with self._lock:
             message = super().pop()
             self.wake_producer()

@@ -222,7 +222,7 @@ class ConnectedSource(StreamSource):
         backoff = Backoff()
         connection, self._connection = self._connection, None
         if connection is not None and not connection.has_an_end and time.monotonic() - self._connected_s > FRESH_S:
-            # Data buffered since then would appear as if new.
+            # Replace an idle connection, because data buffered since then would appear as if new.
             connection.close()
             connection = None
         while True:

@@ -85,7 +85,7 @@ def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) 
 
 @dataclass
 class Ending:
-    """Reason for the end of a display, set when the block of `until_ended` ends."""
+    """Reason for the end of a display, readable once the block of `until_ended` has ended."""
 
     refused: bool = False
     """True if the display ended because the viewer's key was revoked or has expired."""
@@ -95,7 +95,8 @@ class Ending:
 async def until_ended(
     connection: HTTPConnection, left: Coroutine[Any, Any, None], caller: Caller
 ) -> AsyncIterator[Ending]:
-    """Run a block, and cancel it when the display has to end.
+    """Run a block that sends pictures, and cancel it when the viewer leaves, its key becomes invalid, or the server
+    drains.
 
     The block is cancelled when the server drains, `left` returns, the connection breaks, or the caller's key becomes
     invalid.

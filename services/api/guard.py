@@ -35,7 +35,7 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Rule:
-    """Access rule of a route."""
+    """Access rule of a route: the least role of the caller, accepted credentials, body type and size limit."""
 
     role: Role
     ticket: bool = False
@@ -290,7 +290,7 @@ async def _write(request: Request, caller: Caller, event: str, subject: str, out
             request_id=request.state.request_id, detail=detail,
         )  # fmt: skip
 
-    # The entry is written even if the caller disconnects now.
+    # Write the entry even if the caller disconnects now.
     await asyncio.shield(asyncio.to_thread(append))
 
 

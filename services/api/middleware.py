@@ -295,11 +295,13 @@ def network_of_address(host: str) -> str:
 log = logging.getLogger("intrasplat.requests")
 METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 QUIET = {"/livez", "/readyz", "/metrics"}
-"""Routes polled by machines; logged only on failure."""
+"""Routes polled by monitoring systems; their requests are logged only on failure."""
 
 
 class Observed:
-    """Outermost middleware except for the security headers."""
+    """Middleware that numbers, logs and measures each request, and answers 500 after a bug. Outermost except for the
+    security headers.
+    """
 
     def __init__(self, app: ASGIApp, measures: Measures) -> None:
         self._app = app

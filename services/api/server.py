@@ -66,7 +66,7 @@ log = logging.getLogger(__name__)
 SAY_AGAIN_S = 10.0
 """Seconds between log lines about refused connections."""
 MOST_REFUSED = 64
-"""Connections that one `accept` call closes before the event loop runs other work."""
+"""Largest number of connections that one `accept` call closes before the event loop runs other work."""
 
 
 class AddressBound:

@@ -15,7 +15,9 @@ from typing import Any, BinaryIO, Literal
 from services.audit.files import Entry, Outcome, closed_segments, lines_backwards, parse_line
 
 MOST_LOOKED_AT = 50_000
-"""Entries read per search, which bounds its time to about a second. The next page continues at that position."""
+"""Largest number of entries read per search, which bounds its time to about a second. The next page continues at that
+position.
+"""
 PIECE_BYTES = 1 << 16
 CSV_FIELDS = ("seq", "at", "event", "actor", "role", "subject", "outcome", "request_id", "detail", "digest")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")

@@ -32,10 +32,10 @@ from services.auth.roles import Role
 log = logging.getLogger(__name__)
 PREFIX = "intrasplat"
 MOST_LIVE = 2
-"""Valid keys per name: old and new key during a change-over."""
+"""Largest number of valid keys per name: old and new key during a change-over."""
 MOST_KEYS = 1000
 MOST_STREAMS = 100
-"""Most streams that one key may be limited to."""
+"""Largest number of streams that one key may be limited to."""
 SAVE_USED_S = 60.0
 """Minimum seconds between two writes of the last-use file."""
 _NO_DIGEST = 64 * "0"

@@ -24,7 +24,7 @@ drain the queue and use the newest picture. A smaller value would lose pictures 
 because ZeroMQ updates its count of delivered messages with a delay."""
 MAX_PARTS = 1 + MAX_PIECES
 MAX_PART_BYTES = max(np.dtype(array.kind).itemsize * array.values for array in ARRAYS.values()) * MAX_PIXELS
-"""Limits of a message: number of parts, and bytes of each."""
+"""Largest number of parts of a message, and largest size of a part in bytes."""
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,9 @@ def _checked(options: Mapping[str, Any]) -> JobOptions:
 
 
 class _Asked:
-    """Stop flag that signals set and the pool polls. Unlike `InterruptRequest` it starts no thread, because the
-    pool forks."""
+    """Stop flag that signals set and the job pool polls. Unlike `InterruptRequest` it starts no thread, because the
+    pool forks.
+    """
 
     def __init__(self) -> None:
         self._number = 0

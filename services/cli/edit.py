@@ -28,7 +28,7 @@ _SELECTIONS: dict[str, tuple[str, int, Callable[[GaussianCollection, list[float]
     "sphere": ("X,Y,Z,RADIUS", 4, lambda scene, v: scene.in_sphere(v[:3], v[3])),
     "label": ("NUMBER", 1, lambda scene, v: scene.labelled(_whole(v[0]))),
 }
-"""Kinds of `--select`: form, number of values, and function."""
+"""Kinds of `--select`: format of the text, number of values, and function that returns the selection."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Edit:
     select: Sequence[str] = ()
     """Selections `kind:values`; a Gaussian must be in all of them."""
     outside: bool = False
-    """Select the other Gaussians."""
+    """Change the Gaussians outside of the selection instead."""
     delete: bool = False
     recolour: str | None = None
     rotate: str | None = None
-    """Axis and degrees."""
+    """Axis and angle of the rotation as `X,Y,Z,DEGREES`."""
     scale: float | None = None
     translate: str | None = None
     merge: Path | None = None

@@ -229,7 +229,7 @@ MOST_SIZE_RATIO = 20.0
 MOST_SCALE = 1.25
 """Largest ratio of point pair distances between the mesh and a metric model."""
 LEAST_INLIERS = 0.05
-"""Share of inliers below which two surfaces do not match."""
+"""Smallest share of inliers at which two surfaces count as matching."""
 
 
 def compare_command(

@@ -24,7 +24,7 @@ from typing import Any, TextIO
 OUTPUT_CLOSED = 141
 """Exit code that a shell reports after a broken pipe: 128 plus the number of SIGPIPE."""
 _READER_GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ECONNRESET)
-"""Errors of a closed pipe, terminal or descriptor."""
+"""Errno values that mean that the reader of the output has closed the pipe, terminal or descriptor."""
 _NAMES = "intrasplat-names"
 
 

@@ -31,7 +31,7 @@ class Picture:
     """Picture of a stream that the client received, as JPEG with its header."""
 
     header: dict[str, Any]
-    """Sequence number, timestamps, age and state (docs/design/processes.md)."""
+    """Entries for sequence number, timestamps, age and state of the picture (docs/design/processes.md)."""
     jpeg: bytes
 
 

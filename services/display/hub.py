@@ -204,7 +204,9 @@ class DisplayHub:
 
 
 class _Channel:
-    """Viewers of one kind of picture. Subscribes only while there are viewers."""
+    """Distributor of one kind of a stream's pictures to its viewers. Subscribes to the stream process only while there
+    are viewers.
+    """
 
     def __init__(self, endpoint: str, kind: PictureKind, encoders: ThreadPoolExecutor) -> None:
         self._endpoint, self._kind, self._encoders = endpoint, kind, encoders

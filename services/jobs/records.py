@@ -85,7 +85,7 @@ class NewJob:
 
 @dataclass(frozen=True)
 class Submission:
-    """Result of a submission: one job per recording, in order."""
+    """Result of a submission: its jobs, one per recording, in order."""
 
     batch: str
     ids: Sequence[str]

@@ -201,7 +201,7 @@ class ReplayRetention:
 
 
 async def again_and_again(enforce: Callable[[], Awaitable[None]]) -> None:
-    """Call `enforce` periodically until cancelled. Failures of the database are logged, and the next call retries."""
+    """Call `enforce` periodically until cancelled. A failure of the database is logged, and the next call tries again."""
     while True:
         try:
             await enforce()

@@ -61,7 +61,7 @@ class Forks:
         """Job id per process."""
 
     def start(self, task: Task) -> None:
-        """See `Runner`."""
+        """Start an attempt in a forked process."""
         pid = os.fork()
         if pid == 0:
             os.close(self._life_write)
@@ -69,7 +69,7 @@ class Forks:
         self._pids[pid] = task.id
 
     def ended(self) -> Mapping[str, str]:
-        """See `Runner`."""
+        """Return the processes that ended since the last call: job id and description of the end."""
         found = {}
         for pid in list(self._pids):
             ended, status = os.waitpid(pid, os.WNOHANG)
@@ -78,13 +78,13 @@ class Forks:
         return found
 
     def kill(self, job_id: str) -> None:
-        """See `Runner`."""
+        """Kill the process of an attempt."""
         for pid, job in self._pids.items():
             if job == job_id:
                 os.kill(pid, signal.SIGKILL)  # the child was not reaped, so its process id cannot have been reused
 
     def close(self) -> None:
-        """See `Runner`."""
+        """Kill the processes of all attempts."""
         for pid in self._pids:
             os.kill(pid, signal.SIGKILL)
         for pid in self._pids:
@@ -95,7 +95,7 @@ class Forks:
 
 
 def _become(task: Task, life: int) -> NoReturn:
-    """Run an attempt in a forked process; never returns."""
+    """Run an attempt in the forked process, which exits at its end; never returns."""
     code = 1
     try:
         os.setsid()
@@ -172,7 +172,7 @@ class OnRay:
         """Job id per attempt."""
 
     def start(self, task: Task) -> None:
-        """See `Runner`."""
+        """Start an attempt as a Ray task."""
         # Ray's own retries are off. The pool retries a failed attempt if it still holds the claim.
         remote = self._ray.remote(
             max_retries=0, max_calls=ATTEMPTS_OF_A_PROCESS,
@@ -181,20 +181,20 @@ class OnRay:
         self._attempts[remote.remote(asdict(replace(task, niceness=0)))] = task.id
 
     def ended(self) -> Mapping[str, str]:
-        """See `Runner`."""
+        """Return the Ray tasks that ended since the last call: job id and description of the end."""
         if not self._attempts:
             return {}
         done, _ = self._ray.wait(list(self._attempts), num_returns=len(self._attempts), timeout=0)
         return {self._attempts.pop(attempt): self._how(attempt) for attempt in done}
 
     def kill(self, job_id: str) -> None:
-        """See `Runner`."""
+        """Cancel the Ray task of an attempt by force."""
         for attempt, job in self._attempts.items():
             if job == job_id:
                 self._ray.cancel(attempt, force=True)
 
     def close(self) -> None:
-        """See `Runner`."""
+        """Cancel all Ray tasks and disconnect from the cluster."""
         for attempt in self._attempts:
             self._ray.cancel(attempt, force=True)
         self._attempts.clear()

@@ -255,7 +255,7 @@ class Heard:
 
 
 class Claims:
-    """Jobs that one owner, a pool, has claimed in the database."""
+    """Claims of one owner, a pool, on jobs in the database. A claim lasts as long as its lease is renewed."""
 
     def __init__(
         self, database: Database, owner: str, lease_s: float, most_attempts: int, is_published: Callable[[str], bool]

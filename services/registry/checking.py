@@ -254,7 +254,8 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
 
 
 def _raise_for_the_end(code: int, late: bool, passed_s: float, said: Any) -> NoReturn:
-    """Raise the error for a check that ended with a non-zero code.
+    """Raise the error for a check process that ended with a non-zero exit code. It depends on whether the checked model
+    is the cause.
 
     Raises:
         BroughtDown: if the checked content is the cause.

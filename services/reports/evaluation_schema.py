@@ -176,7 +176,7 @@ class EndPointFacts(Part):
     median_px: float
     mean_px: float
     median_mm: float | None
-    """Null if the recording has no scene flow."""
+    """Median end-point error of the scene flow in mm. Null if the recording has no scene flow."""
     mean_mm: float | None
 
 

@@ -33,7 +33,7 @@ class RecordingFacts(Part):
 
     name: str
     frames: Count | None
-    """Null for an endless stream."""
+    """Number of frames of the recording; null for an endless stream."""
     width_px: Annotated[int, Field(ge=1)]
     height_px: Annotated[int, Field(ge=1)]
     fps: Annotated[float, Field(gt=0)]
@@ -164,7 +164,7 @@ class QualityReport(Part):
     """Scores of frames without training; null without `--heldout`."""
     baselines: BaselineQuality
     truth: TruthFacts | None = None
-    """Null if the recording has no ground truth behind its tools."""
+    """Scores of content hidden from the camera. Null if the recording has no ground truth behind its tools."""
     training: Quality | None = None
     """Training error of an offline reconstruction: training frames after all training. Null for a replay."""
 
@@ -256,7 +256,7 @@ class RunReport(Part):
     operators: dict[str, OperatorTimes]
     quality: QualityReport
     model: ModelFacts | None
-    """Null if the run ended before the first snapshot."""
+    """Facts about the final model. Null if the run ended before the first snapshot."""
     live: LiveFacts | None = None
     """Throughput and picture ages of a live run; null for other runs."""
     frames_sha256: Sha256

@@ -226,7 +226,9 @@ def _sentence(location: Location, error: Any, document: YamlFile, flags: Mapping
 
 
 def _place(location: Location, document: YamlFile, flags: Mapping[str, str]) -> str:
-    """Return the origin of a value as a prefix for an error message: flag, environment variable or line of the file."""
+    """Return the origin of an invalid value as a prefix for the error message: flag, environment variable or line of
+    the file.
+    """
     dotted = _dotted(location)
     for name in flags:
         if dotted == name or dotted.startswith(f"{name}.") or name.startswith(f"{dotted}."):

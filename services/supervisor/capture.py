@@ -77,7 +77,7 @@ class CapturedSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """See `FrameSource`."""
+        """Current state of the source: the one that the capture process reported while no frame is pending."""
         state, reported = super().state, self._reported
         if state is SourceState.LIVE and reported is not None and not self._ready:
             return reported[0]
@@ -85,12 +85,12 @@ class CapturedSource(LiveSource):
 
     @property
     def state_sentence(self) -> str:
-        """See `LiveSource`."""
+        """State of the source as a sentence, with the reason from the capture process."""
         reported = self._reported
         return reported[1] if reported is not None and self.state is reported[0] else super().state_sentence
 
     def frames(self) -> Iterator[Frame]:
-        """See `LiveSource`."""
+        """Yield the frames of the capture process, also after its restarts."""
         context: zmq.Context = zmq.Context.instance()
         pictures = subscribe(context.socket(zmq.SUB), self._folder.pictures("capture"), waiting=WAITING)
         status = subscribe(context.socket(zmq.SUB), self._folder.status("capture"), waiting=8)
@@ -127,7 +127,7 @@ class CapturedSource(LiveSource):
                 socket.close(0)
 
     def _begin_anew(self) -> None:
-        """Prepare for a frame with new numbering, from another capture process or source connection."""
+        """Prepare for a frame whose numbering starts again, because the capture process or its source was restarted."""
         if self._order is not None:
             self._order.restart()
 

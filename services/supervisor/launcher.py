@@ -151,7 +151,7 @@ class Direct:
         *,
         fresh: bool = False,
     ) -> int:
-        """See `Start`."""
+        """Start a process in a new interpreter and return its process id."""
         flags = os.O_CREAT | os.O_WRONLY | os.O_APPEND
         return os.posix_spawn(
             sys.executable,
@@ -167,7 +167,7 @@ class Direct:
         )
 
     async def how_ended(self, pid: int) -> str | None:
-        """See `Start`."""
+        """Return a description of how the process ended, or None if unknown."""
         return status_of_child(pid)
 
 
@@ -225,7 +225,9 @@ class ByLauncher:
         *,
         fresh: bool = False,
     ) -> int:
-        """See `Start`."""
+        """Start a process by a fork of the launcher, or in a new interpreter if the launcher is not available. Return
+        its process id.
+        """
         if fresh or module not in FORKED or not await self._is_there(module):
             return await self._direct.start(module, arguments, output, environment)
         try:
@@ -242,7 +244,7 @@ class ByLauncher:
             return await self._direct.start(module, arguments, output, environment)
 
     async def how_ended(self, pid: int) -> str | None:
-        """See `Start`."""
+        """Return how the process ended, from the launcher if it is the parent; None if unknown."""
         how = status_of_child(pid)
         if how is None and self.ready.is_set():
             try:

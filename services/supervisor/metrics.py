@@ -134,7 +134,7 @@ class StreamMeasures(Collector):
         self._events[event.stream, event.role, event.kind] += 1
 
     def collect(self) -> Iterable[Metric]:
-        """See `Collector`."""
+        """Export the metrics of all streams at scrape time; see `Collector`."""
         state = GaugeMetricFamily(
             "intrasplat_stream_state", "1 for the state that a stream is in.", labels=["stream", "state"]
         )

@@ -79,7 +79,7 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.25
 PING_S = 1.0
 PAUSED_S = 1.0
-"""Delay of a periodic check, in seconds, beyond which the supervisor itself was suspended."""
+"""Delay of a periodic check, in seconds, beyond which the supervisor itself must have been suspended."""
 MOST_LOG_BYTES = 1 << 20
 FRESH_AFTER = 3
 """Consecutive failed starts after which a new interpreter is used, because the launcher's forked

@@ -149,7 +149,7 @@ def header_of(shown: ShownPicture) -> dict[str, Any]:
 
 
 Picture = tuple[NDArray[np.uint8], dict[str, Any]]
-"""RGB uint8 [H, W, 3], and header entries in addition to the scene's header."""
+"""Picture of a layer: RGB uint8 [H, W, 3], and header entries in addition to the scene's header."""
 
 
 @dataclass(frozen=True)
@@ -401,7 +401,7 @@ class Layers:
         self._drawn[layer] += 1
 
     def _state(self, screen: PictureState, age_ns: int) -> PictureState:
-        """Return the state for a picture of this age; never better than the state of the main picture."""
+        """Return the display state for a layer picture of this age; never better than the state of the main picture."""
         own = picture_state(age_ns, PERIOD_S[self._device] * 1e9, SourceState.LIVE)
         order = list(PictureState)
         return max(screen, own, key=order.index)

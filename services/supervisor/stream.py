@@ -438,8 +438,9 @@ class ShownModels:
         log.info("%s shows %s/%d", stream.name, name, active.version)
 
     async def _roll_back_if_given_up(self, stream: str, figures: Mapping[str, Any]) -> None:
-        """Roll back the active version in the registry if the engine reports that it stopped displaying this
-        version."""
+        """Roll back a stream's model in the registry if the engine reports that it stopped displaying the active
+        version.
+        """
         request, given_up = self._requests.get(stream), _given_up(figures)
         if request is None or given_up == request.given_up_before:
             return

@@ -64,7 +64,9 @@ class ColourCorrection(NamedTuple):
     """
 
     residuals: Tensor
-    """[H, W, 4]: tissue mask times (target - rendered) for red, green, blue; and the tissue mask."""
+    """Image residuals [H, W, 4]: tissue mask times (target - rendered) for red, green, blue; the fourth channel is the
+    tissue mask.
+    """
     relaxation: Tensor
     """Share of the mean residual by which colours are corrected, float32 [1]."""
 
