@@ -8,7 +8,7 @@ With --annotations, RECORDING is the folder of all recordings, and the frames in
 and threads that stay in the body are no tools. `unsure` regions are left out. `missed` are tools of more than 2 % of the picture of which less than 30 % is found;
 `false_share` is the share of tissue called tool. The frames before an annotated one are given to the detector first.
 
-Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|onnx:PATH] [--copies | --annotations]
+Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|classical|onnx:PATH] [--copies | --annotations]
 A picture file is a recording of one frame.
 """
 
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.endoscope.out_of_body import BodyGate
+from gsplat_core.endoscope.tool_network import NetworkToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.io.recordings import open_recording
 from operators.tool_mask import MaskFinder
@@ -46,7 +47,7 @@ def main() -> int:
     parser.add_argument("--annotations", action="store_true")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    finder: MaskFinder = ToolFinder()
+    finder: MaskFinder = ToolFinder() if arguments.method == "classical" else NetworkToolFinder()
     if arguments.method.startswith("onnx:"):
         finder = OnnxToolFinder(Path(arguments.method.removeprefix("onnx:")))
     if arguments.annotations:

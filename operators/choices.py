@@ -15,6 +15,7 @@ TOOL_MASKS: Registry[Callable[[Any, str, str], Operator]] = Registry(
     {
         "recorded": "operators.tool_mask:recorded_tool_mask",
         "builtin": "operators.tool_mask:builtin_tool_mask",
+        "classical": "operators.tool_mask:classical_tool_mask",
         "onnx": "operators.tool_mask:onnx_tool_mask",
         "none": "operators.tool_mask:no_tool_mask",
     },

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.mask_and_depth import LEAST_TISSUE
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.endoscope.tool_network import NetworkToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
@@ -191,10 +192,26 @@ class FoundToolMaskOp(Operator):
 
 
 class BuiltInToolMaskOp(FoundToolMaskOp):
+    """Detects tools with the trained network (`NetworkToolFinder`), or by colour if the network cannot be loaded."""
+
+    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+        super().__init__(fragment, *args, make_finder=built_in_finder, method="builtin", doubts=True, **kwargs)
+
+
+class ClassicalToolMaskOp(FoundToolMaskOp):
     """Detects tools by colour, edges and temporal consistency (`ToolFinder`)."""
 
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
-        super().__init__(fragment, *args, make_finder=ToolFinder, method="builtin", doubts=True, **kwargs)
+        super().__init__(fragment, *args, make_finder=ToolFinder, method="classical", doubts=True, **kwargs)
+
+
+def built_in_finder() -> MaskFinder:
+    """Return the default detector."""
+    try:
+        return NetworkToolFinder()
+    except cv2.error as error:
+        log.warning("the tool network cannot be loaded, so tools are found by colour: %s", error)
+        return ToolFinder()
 
 
 class NoToolMaskOp(Operator):
@@ -253,6 +270,7 @@ def _plain(kind: type[Operator], method: str) -> Callable[[Any, str, str], Opera
 
 recorded_tool_mask = _plain(RecordedToolMaskOp, "recorded")
 builtin_tool_mask = _plain(BuiltInToolMaskOp, "builtin")
+classical_tool_mask = _plain(ClassicalToolMaskOp, "classical")
 no_tool_mask = _plain(NoToolMaskOp, "none")
 
 

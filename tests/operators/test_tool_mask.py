@@ -101,20 +101,31 @@ def test_without_masks_every_pixel_is_tissue_whatever_was_recorded(frame, comput
     assert passed.mask.all()
 
 
-def test_the_built_in_mask_finds_a_grey_tool(frame, compute):
+@pytest.mark.parametrize("method", ["builtin", "classical"])
+def test_the_detectors_find_a_grey_tool(frame, compute, method):
     image = np.full((128, 160, 3), (190, 90, 70), np.uint8)
     image[50:90, 60:] = (120, 124, 128)
-    operator = new_tool_mask(None, "builtin")
+    operator = new_tool_mask(None, method)
     operator.start()
     (found,) = compute(operator, frame=frame(0, image=image))
     assert found.mask[55:85, 65:].max() == 0 and found.mask[:40].min() == 1
-    assert found_masks(operator).method == "builtin"
+    assert found_masks(operator).method == method
+
+
+def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute, monkeypatch, caplog):
+    monkeypatch.setattr("gsplat_core.endoscope.tool_network.NETWORK", Path("missing.onnx"))
+    operator = new_tool_mask(None, "builtin")
+    with caplog.at_level(logging.WARNING):
+        operator.start()
+    assert "the tool network cannot be loaded" in caplog.text
+    (found,) = compute(operator, frame=frame(0, image=np.full((64, 64, 3), (190, 90, 70), np.uint8)))
+    assert found.mask.all()
 
 
 @pytest.mark.parametrize(
     ("choice", "sentence"),
     [
-        ("magic", "unknown tool mask 'magic'; known are recorded, builtin, onnx, none"),
+        ("magic", "unknown tool mask 'magic'; known are recorded, builtin, classical, onnx, none"),
         ("", "unknown tool mask ''"),
         ("onnx", "tool mask 'onnx' needs the path of a model: onnx:PATH"),
         ("onnx:missing.onnx", "tool network missing.onnx cannot be read"),

@@ -1,0 +1,65 @@
+"""The trained network finds drawn instruments, in any size and on any of them, and nothing where there is none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.endoscope.tool_network import NetworkToolFinder
+from gsplat_core.errors import InvalidInput
+
+
+@pytest.fixture(scope="module")
+def finder():
+    return NetworkToolFinder()
+
+
+def tissue(height, width):
+    noise = cv2.resize(np.random.default_rng(0).normal(0, 1, (9, 11)), (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(np.array([170.0, 70.0, 60.0]) * (1 + 0.12 * noise[..., None]), 0, 255).astype(np.uint8)
+
+
+def with_rod(height, width):
+    """A grey rod with a bright line from the right border to the middle, and its mask (1 = rod)."""
+    image, mask = tissue(height, width), np.zeros((height, width), np.uint8)
+    y, x = np.mgrid[0:height, 0:width] / height
+    across = (y - 0.25 - 0.25 * x / (width / height)) / 0.12
+    rod = (np.abs(across) < 1) & (x > 0.5 * width / height)
+    shade = 40 + 120 * np.sqrt(np.clip(1 - across**2, 0, 1)) + 90 * np.exp(-(((across + 0.3) / 0.2) ** 2))
+    image[rod] = np.clip(shade[rod][:, None], 0, 255)
+    mask[rod] = 1
+    return image, mask
+
+
+@pytest.mark.parametrize("size", [(256, 320), (540, 540), (360, 640)])
+def test_an_instrument_is_found_in_pictures_of_any_size(finder, size):
+    image, rod = with_rod(*size)
+    found = finder.find(image)
+    assert found.shape == size and found.dtype == np.uint8 and set(np.unique(found)) <= {0, 1}
+    overlap = ((found == 0) & (rod == 1)).sum() / ((found == 0) | (rod == 1)).sum()
+    assert overlap > 0.7
+
+
+def test_nothing_is_found_on_plain_tissue(finder):
+    assert finder.find(tissue(256, 320)).all()
+
+
+def test_equal_pictures_get_equal_masks_from_any_finder(finder):
+    image, _ = with_rod(256, 320)
+    first = finder.find(image)
+    finder.find(tissue(256, 320))
+    np.testing.assert_array_equal(finder.find(image), first)
+    np.testing.assert_array_equal(NetworkToolFinder().find(image), first)
+
+
+def test_a_tiny_picture_is_all_tissue(finder):
+    assert finder.find(np.full((20, 300, 3), 128, np.uint8)).all()
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((64, 64), np.uint8), np.zeros((64, 64, 3), np.float32), np.zeros((64, 64, 4), np.uint8)]
+)
+def test_an_array_that_is_no_picture_is_refused(finder, image):
+    with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
+        finder.find(image)
