@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.out_of_body import (
-    COOL_BESIDE_LIGHT,
+    COLD_BESIDE_LIGHT,
     COOL_BESIDE_STRAIGHT,
     ROOM_LIGHT,
     STRAIGHT,
@@ -66,9 +66,13 @@ MEASURES: dict[str, Callable[[Evidence], float]] = {
     "straight": lambda evidence: evidence.straight,
     "light": lambda evidence: evidence.even + evidence.smooth,
     "cool": lambda evidence: evidence.cool,
+    "cold": lambda evidence: evidence.cold,
 }
-PAIRS = {"straight": (STRAIGHT, COOL_BESIDE_STRAIGHT), "light": (ROOM_LIGHT, COOL_BESIDE_LIGHT)}
-"""Thresholds of the gate's two kinds of evidence; both also require the threshold of `cool`."""
+PAIRS = {
+    "straight": (STRAIGHT, "cool", COOL_BESIDE_STRAIGHT),
+    "light": (ROOM_LIGHT, "cold", COLD_BESIDE_LIGHT),
+}
+"""Thresholds of the gate's two kinds of evidence, each with the colour that is required too."""
 
 
 def main() -> int:
@@ -156,9 +160,9 @@ def report_margins(folder: Path, names: list[str], count: int) -> None:
     pictures = [next(frames(folder / f"out_of_body/{number}.png"))[0] for number in FROM_OUTSIDE]
     pictures += [draw(np.random.default_rng(seed)) for draw in OUTSIDE.values() for seed in range(3)]
     outside = [measures for each in pictures if (measures := evidence_of(each)) is not None]
-    for name, (limit, cool_limit) in PAIRS.items():
-        for measure, its, other, others in ((name, limit, "cool", cool_limit), ("cool", cool_limit, name, limit)):
-            threshold = measure if measure == name else f"cool beside {name}"
+    for name, (limit, colour, colour_limit) in PAIRS.items():
+        for measure, its, other, others in ((name, limit, colour, colour_limit), (colour, colour_limit, name, limit)):
+            threshold = measure if measure == name else f"{colour} beside {name}"
             say({"threshold": threshold, "value": its, **margins(inside, outside, measure, its, other, others)})
 
 

@@ -3,17 +3,19 @@
 A picture is withheld only for positive evidence. Pale, yellow, blue-stained, dark, overexposed or
 narrow-band tissue is no evidence. Rooms differ from tissue in two ways together:
 
-- Much of the picture is *cool*: red hardly exceeds green and blue. Drapes, clothes, walls, paper
-and screens are cool; tissue hardly ever is.
+- Much of the picture is without red. It is *cool* if red hardly exceeds green and blue, and *cold* without a trace
+of red. Drapes, clothes, walls, paper and screens are cold or cool. White, fogged or smoky tissue is cool but rarely
+cold, since some of its red remains.
 - The light or the shapes are those of a room. Brightness under a scope's own lamp falls off with
 distance, while walls, cloth and paper in room light are evenly lit without relief. Furniture,
 screens and print have straight edges at right angles.
 
-People and objects are not recognised. docs/checks.md lists the pictures that are detected.
+Straight edges need cool pixels, even light needs cold ones. People and objects are not recognised. docs/checks.md lists the pictures that are detected.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -44,10 +46,12 @@ RATIOS = np.array([[1, -1, 0], [1, 0, -1]], np.float32)
 """Matrix from log red, green and blue to the logs of red over green and red over blue."""
 COOL = 0.12
 """Log ratio of red to both green and blue below which a pixel is cool."""
+COLD = 0.05
+"""Log ratio of red to both green and blue below which a pixel is cold."""
 STRAIGHT, COOL_BESIDE_STRAIGHT = 0.47, 0.4
 """Agreement of the edges' directions and share of cool pixels from which straight edges are evidence."""
-ROOM_LIGHT, COOL_BESIDE_LIGHT = 0.8, 0.6
-"""Sum of `Evidence.even` and `Evidence.smooth` and share of cool pixels from which even light is evidence."""
+ROOM_LIGHT, COLD_BESIDE_LIGHT = 0.84, 0.55
+"""Sum of `Evidence.even` and `Evidence.smooth` and share of cold pixels from which even light is evidence."""
 FLAT = 0.01
 """Relative brightness change from pixel to pixel below which a surface is smooth."""
 EDGE_SHARE, EDGE_CONTRAST = 0.2, 0.12
@@ -56,9 +60,13 @@ LITTLE_COOL, REDNESS = 0.3, 0.34
 """Share of cool pixels below which, and log of red over green that a quarter of the pixels must
 exceed, for a picture to be clear tissue.
 """
+RECENT_FRAMES, FRAMES_TO_CLOSE = 10, 3
+"""Number of recent pictures, and of those with evidence among them from which the gate closes. A gate that has been
+open for less than `RECENT_FRAMES` pictures closes at the first one.
+"""
 FRAMES_TO_RETURN = 10
 """Consecutive pictures of clear tissue that reopen the gate."""
-FRAMES_WITHOUT_EVIDENCE = 60
+FRAMES_WITHOUT_EVIDENCE = 30
 """Pictures without evidence of the outside that reopen the gate."""
 
 
@@ -68,6 +76,8 @@ class Evidence:
 
     cool: float
     """Share of pixels in which red hardly exceeds green and blue."""
+    cold: float
+    """Share of pixels in which red does not exceed green and blue."""
     redness: float
     """Upper quartile of the log of red over green."""
     even: float
@@ -84,8 +94,8 @@ class Evidence:
         """Kind of evidence of the outside as a short phrase, or None."""
         if self.straight >= STRAIGHT and self.cool >= COOL_BESIDE_STRAIGHT:
             return "straight edges, little red"
-        if self.even + self.smooth >= ROOM_LIGHT and self.cool >= COOL_BESIDE_LIGHT:
-            return "even light, little red"
+        if self.even + self.smooth >= ROOM_LIGHT and self.cold >= COLD_BESIDE_LIGHT:
+            return "even light, no red"
         return None
 
     @property
@@ -132,6 +142,7 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
     red_quarter = int(0.75 * (red_green.size - 1))
     return Evidence(
         cool=cool,
+        cold=float(np.count_nonzero(warmth < COLD) / warmth.size),
         redness=float(np.partition(red_green, red_quarter)[red_quarter]),
         even=quarter / high,
         smooth=_smooth(luma(small), judged),
@@ -140,10 +151,11 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
 
 
 class BodyGate:
-    """Gate of a stream that closes at once on evidence of the outside.
+    """Gate of a stream that withholds each picture with evidence of the outside, and closes if such pictures recur.
 
-    A picture passes unless it contains such evidence. After one that does, the gate stays closed until
-    `FRAMES_TO_RETURN` consecutive pictures show clear tissue, or `FRAMES_WITHOUT_EVIDENCE` contain no evidence.
+    The first evidence closes a gate that opened recently. Otherwise a single odd picture is withheld alone, and
+    `FRAMES_TO_CLOSE` of the last `RECENT_FRAMES` close the gate. A closed gate withholds all pictures until
+    `FRAMES_TO_RETURN` consecutive ones show clear tissue, or `FRAMES_WITHOUT_EVIDENCE` contain no evidence.
     Pictures that cannot be judged, such as dark ones, pass an open gate and are not counted by a closed one.
     """
 
@@ -152,8 +164,7 @@ class BodyGate:
 
     def reset(self) -> None:
         """Reset for another stream."""
-        self._inside = True
-        self._tissue = self._without = 0
+        self._open()
 
     @property
     def inside(self) -> bool:
@@ -173,18 +184,32 @@ class BodyGate:
             self.close()
             raise
         outside = None if evidence is None else evidence.outside
+        if self._inside:
+            if evidence is not None:
+                self._recent.append(outside is not None)
+            few = len(self._recent) < RECENT_FRAMES
+            if outside is not None and (few or sum(self._recent) >= FRAMES_TO_CLOSE):
+                self.close()
+            return outside
         if outside is not None:
             self.close()
             return outside
-        if not self._inside and evidence is not None:
+        if evidence is not None:
             self._without += 1
             self._tissue = self._tissue + 1 if evidence.tissue else 0
-            self._inside = self._tissue >= FRAMES_TO_RETURN or self._without >= FRAMES_WITHOUT_EVIDENCE
+            if self._tissue >= FRAMES_TO_RETURN or self._without >= FRAMES_WITHOUT_EVIDENCE:
+                self._open()
         return None if self._inside else "not yet certain again"
 
     def close(self) -> None:
         """Close the gate, as after a picture from outside."""
         self._inside = False
+        self._tissue = self._without = 0
+
+    def _open(self) -> None:
+        self._inside = True
+        self._recent: deque[bool] = deque(maxlen=RECENT_FRAMES)
+        """Evidence of the outside in recent pictures."""
         self._tissue = self._without = 0
 
 

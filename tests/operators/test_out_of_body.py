@@ -106,7 +106,7 @@ def test_by_default_it_withholds_what_holds_evidence_and_nothing_else(frame, com
     grey, pale = np.full((120, 160, 3), 120, np.uint8), np.full((120, 160, 3), (210, 180, 150), np.uint8)
     passed, outcome = run(None, [frame(0, image=pale), *(frame(k, image=grey) for k in range(1, 4))], compute)
     assert [one.withheld for one in passed] == [None] + [WITHHELD] * 3
-    assert outcome.find(OutOfBodyFrames).withheld == {"even light, little red": 3}
+    assert outcome.find(OutOfBodyFrames).withheld == {"even light, no red": 3}
 
 
 def test_a_start_forgets_the_stream_before(frame, compute):

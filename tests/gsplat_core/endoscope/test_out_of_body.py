@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 
 from gsplat_core.endoscope import out_of_body
 from gsplat_core.endoscope.out_of_body import (
-    COOL_BESIDE_LIGHT,
+    COLD_BESIDE_LIGHT,
     COOL_BESIDE_STRAIGHT,
+    FRAMES_TO_CLOSE,
     FRAMES_TO_RETURN,
     FRAMES_WITHOUT_EVIDENCE,
     LITTLE_COOL,
+    RECENT_FRAMES,
     REDNESS,
     ROOM_LIGHT,
     STRAIGHT,
@@ -146,16 +148,16 @@ def test_the_samples_from_outside_are_withheld(recordings_dir, name):
         assert BodyGate().judge(picture) is not None
 
 
-NOTHING = {"cool": 0.0, "redness": 0.0, "even": 0.0, "smooth": 0.0, "straight": 0.0}
+NOTHING = {"cool": 0.0, "cold": 0.0, "redness": 0.0, "even": 0.0, "smooth": 0.0, "straight": 0.0}
 
 
 @pytest.mark.parametrize(
     ("measures", "outside"),
     [
         ({"straight": STRAIGHT, "cool": COOL_BESIDE_STRAIGHT}, "straight edges, little red"),
-        ({"even": ROOM_LIGHT, "cool": COOL_BESIDE_LIGHT}, "even light, little red"),
-        ({"smooth": ROOM_LIGHT, "cool": COOL_BESIDE_LIGHT}, "even light, little red"),
-        ({"even": 0.5, "smooth": ROOM_LIGHT - 0.5 + 1e-9, "cool": COOL_BESIDE_LIGHT}, "even light, little red"),
+        ({"even": ROOM_LIGHT, "cold": COLD_BESIDE_LIGHT}, "even light, no red"),
+        ({"smooth": ROOM_LIGHT, "cold": COLD_BESIDE_LIGHT}, "even light, no red"),
+        ({"even": 0.5, "smooth": ROOM_LIGHT - 0.5 + 1e-9, "cold": COLD_BESIDE_LIGHT}, "even light, no red"),
     ],
 )
 def test_each_kind_of_evidence_needs_all_of_its_measures(measures, outside):
@@ -165,7 +167,7 @@ def test_each_kind_of_evidence_needs_all_of_its_measures(measures, outside):
 
 
 def test_no_light_and_no_shape_is_evidence_against_a_red_picture():
-    assert Evidence(cool=0.39, redness=1.0, even=1.0, smooth=1.0, straight=1.0).outside is None
+    assert Evidence(cool=0.39, cold=0.39, redness=1.0, even=1.0, smooth=1.0, straight=1.0).outside is None
 
 
 def test_clear_tissue_has_little_that_is_cool_and_enough_that_is_red():
@@ -177,7 +179,7 @@ def test_clear_tissue_has_little_that_is_cool_and_enough_that_is_red():
 
 def test_measures_of_pictures_whose_values_are_known():
     grey = evidence_of(plain(120, 120, 120))
-    assert (grey.cool, grey.even, grey.smooth, grey.redness) == (1.0, 1.0, 1.0, 0.0)
+    assert (grey.cool, grey.cold, grey.even, grey.smooth, grey.redness) == (1.0, 1.0, 1.0, 1.0, 0.0)
     warm = evidence_of(plain(180, 70, 60))
     assert warm.cool == 0.0 and warm.redness == pytest.approx(np.log(186 / 76), abs=0.01)
     halves = plain(100, 100, 100)
@@ -225,6 +227,21 @@ def test_one_picture_from_outside_is_enough_to_end_and_many_from_inside_are_need
     assert gate.judge(room(rng)) is not None
     answers = [gate.judge(inside) for _ in range(FRAMES_TO_RETURN + 1)]
     assert answers == ["not yet certain again"] * (FRAMES_TO_RETURN - 1) + [None, None]
+
+
+def test_single_odd_pictures_of_a_stream_are_withheld_alone_and_some_close_the_gate(rng):
+    gate, inside, outside = BodyGate(), cloth(rng, 215, 180, 150), room(rng)
+    for _ in range(RECENT_FRAMES):
+        assert gate.judge(inside) is None
+    for _ in range(FRAMES_TO_CLOSE - 1):
+        assert gate.judge(outside) is not None and gate.inside
+        assert gate.judge(inside) is None
+    for _ in range(RECENT_FRAMES):
+        assert gate.judge(inside) is None
+    for _ in range(FRAMES_TO_CLOSE):
+        assert gate.inside and gate.judge(inside) is None
+        assert gate.judge(outside) is not None
+    assert not gate.inside and gate.judge(inside) == "not yet certain again"
 
 
 def test_unusual_tissue_returns_later_than_clear_tissue(rng):
@@ -303,27 +320,35 @@ def test_other_arrays_are_refused_and_close_the_gate(rng, image):
     ("measures", "outside", "tissue"),
     [
         ({"straight": 0.47, "cool": 0.4}, "straight edges, little red", False), ({"straight": 0.469, "cool": 0.4}, None, False),
-        ({"straight": 0.47, "cool": 0.399}, None, False), ({"even": 0.5, "smooth": 0.3, "cool": 0.6}, "even light, little red", False),
-        ({"even": 0.5, "smooth": 0.299, "cool": 0.6}, None, False), ({"even": 0.5, "smooth": 0.3, "cool": 0.599}, None, False),
+        ({"straight": 0.47, "cool": 0.399}, None, False), ({"even": 0.5, "smooth": 0.341, "cold": 0.55}, "even light, no red", False),
+        ({"even": 0.5, "smooth": 0.339, "cold": 0.55}, None, False), ({"even": 0.5, "smooth": 0.341, "cold": 0.549}, None, False),
         ({"cool": 0.299, "redness": 0.34}, None, True), ({"cool": 0.3, "redness": 0.34}, None, False),
         ({"cool": 0.299, "redness": 0.339}, None, False),
     ],
 )  # fmt: skip
 def test_limits_of_evidence(measures, outside, tissue):
-    found = Evidence(**(dict.fromkeys(("cool", "redness", "even", "smooth", "straight"), 0.0) | measures))
+    found = Evidence(**(dict.fromkeys(("cool", "cold", "redness", "even", "smooth", "straight"), 0.0) | measures))
     assert (found.outside, found.tissue) == (outside, tissue)
 
 
-@pytest.mark.parametrize(("redness", "returns_after"), [(0.5, 10), (0.2, 60)])
-def test_after_the_outside_ten_pictures_of_tissue_or_sixty_without_evidence_open_the_gate(
+@pytest.mark.parametrize(("redness", "returns_after"), [(0.5, 10), (0.2, 30)])
+def test_after_the_outside_ten_pictures_of_tissue_or_thirty_without_evidence_open_the_gate(
     monkeypatch, redness, returns_after
 ):
     gate = BodyGate()
     gate.close()
-    seen = Evidence(cool=0.0, redness=redness, even=0.0, smooth=0.0, straight=0.0)
+    seen = Evidence(cool=0.0, cold=0.0, redness=redness, even=0.0, smooth=0.0, straight=0.0)
     monkeypatch.setattr(out_of_body, "evidence_of", lambda image: seen)
     said = [gate.judge(None) for _ in range(returns_after)]
     assert all(said[:-1]) and said[-1] is None
+
+
+@pytest.mark.parametrize(("red", "cold"), [(1.06, 0.0), (1.04, 1.0)])
+def test_cold_is_what_exceeds_green_and_blue_by_less_than_a_twentieth(red, cold):
+    """exp(0.05) = 1.051, of channels with 6 added."""
+    image = np.full((64, 80, 3), 100, np.uint8)
+    image[..., 0] = round(red * 106 - 6)
+    assert evidence_of(image).cold == cold and evidence_of(image).cool == 1.0
 
 
 @pytest.mark.parametrize(("level", "is_judged"), [(38, False), (42, True)])

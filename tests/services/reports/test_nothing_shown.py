@@ -61,10 +61,10 @@ def sentence(outcome):
 
 
 def test_withheld_frames_are_counted_by_reason_with_what_changes_it():
-    gate = OutOfBodyFrames("withhold", 10, {"even light, little red": 30, "not yet certain again": 10})
+    gate = OutOfBodyFrames("withhold", 10, {"even light, no red": 30, "not yet certain again": 10})
     said = sentence(ended("live", source(50), withheld(out_of_body=40, no_tissue=6, blur=4), gate))
     assert said == (
-        "nothing was shown: 50 frames came, 50 withheld (out of body, mostly for even light, little red: 40, no tissue: 6, blur: 4);"
+        "nothing was shown: 50 frames came, 50 withheld (out of body, mostly for even light, no red: 40, no tissue: 6, blur: 4);"
         " --out-of-body off lets these frames pass; --tool-mask none takes every pixel for tissue;"
         " a longer run shows such a stream after a second or two"
     )
