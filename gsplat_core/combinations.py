@@ -33,7 +33,7 @@ OWN_OPACITIES = ("weighted_sum",)
 WITH_OPACITIES_OF_ALPHA = ("adc", "mcmc")
 """Strategies that rely on alpha blending as the renderer that trains the scene."""
 OF_EVERY_STEP = ("photometric", "depth")
-"""Losses that every step computes by the trained renderer's picture."""
+"""Losses that every training step computes, by the picture of the renderer that trains the scene."""
 
 
 NEEDED_BY: Mapping[str, tuple[str, str]] = {"semantics": ("labels", "labels/"), "range": ("ranges", "scans/")}
@@ -71,7 +71,7 @@ def check_outputs(renderer: str, outputs: Iterable[str]) -> None:
 
 
 def check_compared(losses: Iterable[str], fields: Iterable[str], source: str) -> None:
-    """Check that frames have what losses compare with.
+    """Check that frames have the fields with which losses compare the scene.
 
     Args:
         losses: losses, each a name or `name:weight`.

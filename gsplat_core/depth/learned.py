@@ -26,7 +26,9 @@ from gsplat_core.scene.frames import Frame
 
 Plane = NDArray[np.float64]
 MOST_SPAN = 5.0
-"""Largest assumed ratio of the far end of a picture to its near end, when no reference depth fixes the offset."""
+"""Largest assumed ratio of the far end of a picture to its near end, used when no reference depth determines the offset
+of the network's output.
+"""
 ENDS = (2.0, 98.0)
 """Percentiles used as the near and far ends of a picture; values beyond them may be outliers."""
 ROUNDS = 10
@@ -97,7 +99,7 @@ def fitted(values: Plane, known: Plane) -> Affine | None:
 
 
 def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
-    """Return a start value for the fit from medians, which outliers hardly influence."""
+    """Return a start value of the affine fit from medians, on which outliers have little influence."""
     (x, dx), (y, dy) = _middle(values), _middle(known)
     factor = sign * dy / dx
     return Affine(factor, y - factor * x, 0.0)
@@ -134,7 +136,7 @@ EVERY_S = 0.3
 ALIKE = 0.6
 """Smallest correlation with the reference depth at which both count as showing the same scene."""
 LEAST_SEEN = 0.05
-"""Share of the picture that must be tissue."""
+"""Smallest share of the picture that must be tissue."""
 UNSEEN = "too little of the picture is tissue for a depth network"
 NOT_FINITE = "the depth network gave values that are not finite"
 FLAT = "the depth network returned the same depth for the whole picture"
@@ -216,7 +218,8 @@ class LearnedDepth(Estimator):
         self._pose: NDArray[np.float64] | None = None
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`.
+        """Return the depth of a frame from a new inference. Within `EVERY_S` of the last one, return its result while
+        the scope stands still, else None.
 
         Raises:
             InvalidSetting: if the network fails on a picture.

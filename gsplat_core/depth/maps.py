@@ -144,11 +144,11 @@ class OnDevice(Protocol):
 
 
 ALIKE = 0.1
-"""Largest relative depth difference of neighbours on one surface, as a share of the farther one."""
+"""Largest difference of neighbouring depths on one surface, as a share of the farther one."""
 NEAREST = 0.1
 """Share of the median depth below which a value is noise around zero."""
 STRIDE = 4
-"""Subsampling of rows and columns for the median."""
+"""Step between the rows and columns from which the median is computed."""
 PAIRS = (
     (np.s_[:, :-1], np.s_[:, 1:]),
     (np.s_[:-1, :], np.s_[1:, :]),

@@ -511,7 +511,7 @@ class ParallaxDepth(Estimator):
         """Depth map estimated at time `_found_s`."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`."""
+        """Estimate the depth of a frame by parallax against the key frames, at most every `EVERY_S` seconds."""
         if frame.new_scene is not None:
             self._kept, self._found_s, self._look = [], None, None
         if frame.pose is None or camera.model != "pinhole":
@@ -535,7 +535,7 @@ class ParallaxDepth(Estimator):
         return found
 
     def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
-        """See `OfRecording`. Key frames of a moving camera get depth, assuming static tissue."""
+        """Estimate depth for key frames of a moving camera, assuming static tissue."""
         moves = any(not np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
         if not moves or cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
             return RecordingDepth(list(frames), {})

@@ -23,7 +23,7 @@ class RecordedDepth(Estimator):
     """
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`."""
+        """Return the depth that is part of the frame, with its confidence; None without depth."""
         if frame.depth is None:
             return None
         confidence = frame.depth_confidence
@@ -37,7 +37,7 @@ class NoDepth(Estimator):
     """Depth source that ignores all depth, including the frame's own."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`."""
+        """Return None, because all depth is ignored."""
         return None
 
 

@@ -342,7 +342,7 @@ class StereoDepth(Estimator):
         self._forget((0, 0))
 
     def work_on(self, device: torch.device | str) -> None:
-        """See `OnDevice`. Matching runs on the device; the occasional check of the pair runs on the CPU."""
+        """Run the matching on `device` from now on. The occasional check of the pair runs on the CPU."""
         self._device = torch.device(device)
         self._stream = torch.cuda.Stream(self._device) if self._device.type == "cuda" else None
 
@@ -355,7 +355,7 @@ class StereoDepth(Estimator):
         self._look_in = 0
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`."""
+        """Estimate the depth of a stereo frame by matching its two pictures."""
         if frame.right_image is None:
             return None
         shape = frame.image.shape[:2]

@@ -136,7 +136,7 @@ def _middles(n: int) -> Array:
 
 
 TRIM = 0.8
-"""Share of the pairs used, closest first."""
+"""Share of the pairs of closest points that the registration uses, closest first."""
 MOST_ROUNDS = 60
 SETTLED = 1e-6
 """Largest displacement of a point in one round, as a share of the surface's extent, below which the iteration ends."""

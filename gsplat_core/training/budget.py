@@ -21,7 +21,7 @@ have missed the deadline, or `at_most` steps were made before it.
 MAX_IN_FLIGHT = 4
 """Largest number of unfinished steps queued on a GPU under a deadline; enough to keep the GPU busy."""
 TURNS, SECOND_EYE = 4, 2
-"""Length of the eye cycle in steps, and the index in it of the second eye's step.
+"""Length of the cycle in steps in which two eyes alternate, and the step in it that trains on the second eye.
 
 With two eyes, the third of every four steps trains the second eye. The first eye is the displayed one, and the host
 prepares the second eye's picture while the GPU works on the first steps.

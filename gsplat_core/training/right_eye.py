@@ -32,9 +32,9 @@ from gsplat_core.transfers import tensor_of
 LOOKED_AT_PX = 80
 """Width in pixels of the reduced pictures that are compared."""
 LOOK_EVERY = 10
-"""Number of frames between comparisons."""
+"""Number of frames between two comparisons of the eyes' colours."""
 FOLLOWS = 0.2
-"""Weight of a new comparison in the moving average."""
+"""Weight of a new comparison of the eyes' colours in the moving average."""
 SHIFT_STAYS = 4
 """Search range around the last shift, in pixels of the compared pictures."""
 LEAST_OVERLAP = 0.4
@@ -168,7 +168,7 @@ def line_between(left: NDArray[np.float32], right: NDArray[np.float32]) -> tuple
 CELL_PX = 4
 """Side of the cells in which tools are mapped to the right picture, in pixels."""
 TYPICAL_OF = 500
-"""Number of cells (up to twice as many) whose median is the typical disparity."""
+"""Number of disparities (up to twice as many) whose median is the typical disparity."""
 NEAREST, FARTHEST = 2.0, 0.75
 """Range of a tool's disparity without depth, as multiples of the typical one; tools are nearer than tissue."""
 

@@ -85,7 +85,7 @@ def grid_of(height_px: int, width_px: int, spacing: float) -> tuple[NDArray[np.f
 
 @dataclass(frozen=True)
 class Uncovered:
-    """Uncovered tissue of one frame, being copied to the host."""
+    """Tissue of one frame that the scene does not cover, as tensors that are being copied to the host."""
 
     pixels: HostCopy
     """Uncovered pixels, bool [H, W]."""
@@ -185,7 +185,7 @@ def gaussians_beside(
 
 
 class Covering:
-    """Search for uncovered tissue in consecutive frames.
+    """Search for uncovered tissue in consecutive frames, and creation of Gaussians for it in another thread.
 
     With `beside`, a host thread creates the Gaussians, because creation takes longer than a live frame interval. The
     next search adds them whenever it happens, so the same sequence of searches gives the same scene.

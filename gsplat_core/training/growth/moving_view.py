@@ -40,7 +40,7 @@ REACH_PX = 5
 
 
 class OutOfView:
-    """Visibility times and archive of one scene."""
+    """Visibility times of a scene's Gaussians, and the archive of those that left the camera's view."""
 
     def __init__(self, capacity: int, device: torch.device) -> None:
         self._capacity = capacity
@@ -134,8 +134,8 @@ class OutOfView:
 USUAL_DENSITY = 0.3
 """Ratio to the usual Gaussian density below which a cell counts as empty."""
 LOOKS_AFTER = 0.02
-"""Motion of the picture, as a share of its width, after which new tissue is searched again; each
-search takes some milliseconds.
+"""Motion of the picture, as a share of its width, after which the picture is searched again for new tissue; each search
+takes some milliseconds.
 """
 EDGE_CELLS = 1.0
 """Margin in cells at the previous picture's edge that counts as new, so that slow motion leaves no gap."""

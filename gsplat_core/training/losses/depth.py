@@ -24,7 +24,7 @@ class Depth:
     default_weight: ClassVar[float] = 1.0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean difference of inverse depths; None for an observation without depth."""
         if observation.depth is None:
             return None
         output = render(scene, observation.camera)

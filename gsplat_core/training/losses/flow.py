@@ -45,7 +45,9 @@ class FlowLoss:
         self._calls = 0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`. Raises InvalidSetting for a camera other than a pinhole."""
+        """Return the mean flow error between the observation and the frame before or after it; None without a pair.
+        Raises InvalidSetting for a camera other than a pinhole.
+        """
         if observation.camera.model != "pinhole":
             raise InvalidSetting(
                 f"the loss 'flow' is for pinhole cameras, this one is {observation.camera.model}; remove it from the losses"
@@ -86,7 +88,7 @@ class FlowLoss:
             flow = consistent_flow(*images, *masks)
             size = _compared_size(first.camera)
             if (size.height_px, size.width_px) != flow.shape[:2]:
-                # The nearest value, because a mean with an unreliable one would be unreliable.
+                # Take the nearest value, because a mean that includes an unreliable one would be unreliable.
                 rows, columns = (np.arange(n) * 2 for n in (size.height_px, size.width_px))
                 flow = flow[np.ix_(rows, columns)] * np.float32(size.width_px / first.camera.width_px)
             known = self._flows[key] = tensor_of(np.ascontiguousarray(flow, np.float32), first.image.device)
@@ -100,7 +102,7 @@ def _picture(observation: Observation) -> tuple[Tensor, Tensor]:
 
 
 def _compared_size(camera: Camera) -> Camera:
-    """Return the camera at the size of the comparison."""
+    """Return the camera at the reduced size at which flow is compared."""
     if camera.width_px * camera.height_px <= SMALL_PIXELS:
         return camera
     return camera.resized(camera.width_px // 2, camera.height_px // 2)

@@ -28,7 +28,9 @@ class NormalConsistency:
         self._turns = Turns()
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean difference of both kinds of normals over the observation's tissue; None in steps that render
+        no rays.
+        """
         if not self._turns.is_due():
             return None
         rays = rays_of(scene, observation, context)

@@ -24,6 +24,6 @@ class Photometric:
     default_weight: ClassVar[float] = 1.0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean colour difference between the rendered picture and the observation."""
         output = render(scene, observation.camera, depth=False)
         return image_loss(output.image, observation.image, observation.mask).loss

@@ -58,7 +58,9 @@ class RangeLoss:
         self._kept: OrderedDict[tuple[int, bool], tuple[RangeScan, Tensor, Tensor | None]] = OrderedDict()
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`. Raises InvalidInput for a scan with another number of columns than the picture."""
+        """Return the loss of the observation's scan; None without a scan. Raises InvalidInput for a scan with another
+        number of columns than the picture.
+        """
         scan = observation.ranges
         if scan is None:
             return None

@@ -28,7 +28,9 @@ class RayDepth:
         self._turns = Turns()
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean difference of inverse ray depths; None in steps that render no rays, and for an observation
+        without depth.
+        """
         if not self._turns.is_due() or observation.depth is None:
             return None
         rays = rays_of(scene, observation, context)

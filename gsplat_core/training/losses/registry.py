@@ -64,7 +64,7 @@ class WeightedLosses:
     """Weighted sum of the chosen losses for one scene."""
 
     def __init__(self, weights: dict[str, float]) -> None:
-        """weights: result of `loss_weights`."""
+        """Create the losses with these weights by name, the result of `loss_weights`."""
         self._terms = [(LOSSES[name](), weight) for name, weight in weights.items()]
 
     def __bool__(self) -> bool:

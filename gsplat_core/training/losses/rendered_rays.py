@@ -17,11 +17,13 @@ SMALL_PIXELS = 24_000
 
 
 EVERY = 4
-"""Number of steps of which one renders rays; its loss has this factor. All losses of rays use the same steps."""
+"""Interval in steps at which the losses of rays render; the loss of such a step is multiplied by this number. All
+losses of rays use the same steps.
+"""
 
 
 class Turns:
-    """Counter of a loss's evaluations."""
+    """Counter of a loss's evaluations, of which one in `EVERY` is computed."""
 
     def __init__(self) -> None:
         self._calls = 0

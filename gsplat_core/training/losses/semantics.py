@@ -20,7 +20,7 @@ CLASSES = 4
 
 
 class Semantics:
-    """Mean cross-entropy over labelled pixels, of frames with `Frame.labels` alone.
+    """Mean cross-entropy of the rendered classes over labelled pixels. Only frames with `Frame.labels` are compared.
 
     A scene that is trained with this loss has the logits `Gaussians.extra["semantics"]` [N, 4]. They move with the
     Gaussians, so labels on a few frames classify all frames. Colours and geometry receive no gradient. Pixels of tools are
@@ -39,7 +39,7 @@ class Semantics:
         return replace(gaussians, extra={**gaussians.extra, SEMANTICS: logits})
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean cross-entropy over the observation's labelled pixels; None without labels."""
         if observation.labels is None:
             return None
         geometry = replace(scene.detach(), extra={SEMANTICS: scene.extra[SEMANTICS]})

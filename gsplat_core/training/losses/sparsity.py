@@ -13,18 +13,20 @@ from gsplat_core.training.observations import Observation
 
 
 class MeanOpacity:
-    """Mean opacity."""
+    """Mean opacity of all Gaussians."""
 
     name: ClassVar[str] = "opacity"
     default_weight: ClassVar[float] = 0.01
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean opacity of the scene's Gaussians; the observation is not read."""
         return scene.opacities.mean() if scene.count else None
 
 
 class MeanScale:
-    """Mean standard deviation, relative to the scene's distance from the camera of the first observation."""
+    """Mean standard deviation of all Gaussians, relative to the scene's distance from the camera of the first
+    observation.
+    """
 
     name: ClassVar[str] = "scale"
     default_weight: ClassVar[float] = 0.01
@@ -33,7 +35,7 @@ class MeanScale:
         self._distance: Tensor | None = None
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`."""
+        """Return the mean standard deviation of the scene's Gaussians, relative to the first observation's distance."""
         if not scene.count:
             return None
         if self._distance is None:

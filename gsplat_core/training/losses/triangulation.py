@@ -31,7 +31,7 @@ LARGEST_ANGLE_DEG = 15.0
 """Largest angle of views that are chosen; beyond it optical flow finds few matches."""
 MOST_VIEWS = 8
 LEAST_VIEWS = 2
-"""Numbers of other views that a point is matched in."""
+"""Smallest and largest number of other views in which a point is matched."""
 SIGMA = 0.01
 """Scale of the robust loss relative to a point's depth."""
 FAR = 0.25
@@ -68,11 +68,15 @@ class TriangulationLoss:
         self._points: OrderedDict[tuple[int, bool], Triangulated] = OrderedDict()
         """Points by the number and eye of their frame."""
         self._missed: dict[tuple[int, bool], int] = {}
-        """Numbers of other frames that gave no points for a frame; more frames may."""
+        """Number of other frames with which triangulation gave no points for a frame. It is tried again once there are
+        more.
+        """
         self._has_parallax = False
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """See `Loss`. Raises InvalidSetting for a single camera at rest, and for other cameras than pinholes."""
+        """Return the mean distance of the rendered surface from the observation's points; None without points. Raises
+        InvalidSetting for a single camera at rest, and for other cameras than pinholes.
+        """
         if observation.camera.model != "pinhole":
             raise InvalidSetting(
                 f"the loss 'triangulation' is for pinhole cameras, this one is {observation.camera.model}; remove it from"

@@ -28,7 +28,7 @@ RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0
 MEANS_DECAY = 0.01
 """Factor by which the rate of the means falls exponentially over a training."""
 SH_EVERY = 1000
-"""Steps after which another degree of the spherical harmonics is used, of `FULL_STEPS`."""
+"""Number of steps, of a training with `FULL_STEPS`, after which another degree of the spherical harmonics is used."""
 EPSILON = 1e-15
 NEIGHBOURS = 3
 """Number of neighbours whose root mean squared distance is the initial scale of a Gaussian."""
@@ -56,7 +56,7 @@ ABSGRAD_THRESHOLD = 0.0008
 """Gradient above which Gaussians multiply with `absgrad` (Ye et al. 2024)."""
 REFINE_EVERY = 100
 RESETS_AT_LEAST = 10
-"""Minimum interval between resets of the opacities, in refinements, for short trainings."""
+"""Smallest interval between resets of the opacities, in refinements; keeps short trainings from resetting too often."""
 
 
 @dataclass(frozen=True)

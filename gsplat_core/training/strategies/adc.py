@@ -141,7 +141,7 @@ class DefaultStrategy(Strategy):
             state["grad2d"].index_put_((rows,), norms, accumulate=True)
             state["count"].index_put_((rows,), torch.ones_like(norms), accumulate=True)
         else:
-            # Sums over the cameras have a fixed order, unlike additions by index.
+            # A sum over cameras has a fixed order, unlike additions by index.
             visible = radii > 0 if radii.dim() == norms.dim() else (radii > 0).all(-1)
             visible, norms, extent = (each.reshape(-1, count) for each in (visible, norms, extent))
             state["grad2d"] += torch.where(visible, norms, 0).sum(0)
@@ -230,7 +230,9 @@ class SceneAdc:
         self._state = self._strategy.initialize_state(plan.step.distance(plan.observations[0].camera))
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """See `SceneStrategy`."""
+        """Multiply, remove and reset Gaussians before a step of an offline training if the schedule demands it; see
+        `SceneStrategy`.
+        """
         strategy, screen = self._strategy, self._step.screen
         if screen is None or number >= strategy.refine_stop_iter:
             return False

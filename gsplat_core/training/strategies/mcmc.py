@@ -35,7 +35,7 @@ class MCMCStrategy(Strategy):
     refine_start_iter: int = 500
     """Step after which Gaussians move and grow in number."""
     refine_stop_iter: int = 25_000
-    """Step at which that ends."""
+    """Step after which Gaussians no longer move and grow in number."""
     refine_every: int = 100
     """Steps between two refinements."""
     min_opacity: float = 0.005
@@ -140,7 +140,7 @@ class SceneMcmc:
         self._state = self._strategy.initialize_state()
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """See `SceneStrategy`."""
+        """Relocate, add and jitter Gaussians before a step of an offline training; see `SceneStrategy`."""
         if number == 0:
             return False
         strategy, rate = self._strategy, self._step.means_rate * rate_scale

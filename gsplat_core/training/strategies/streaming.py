@@ -21,7 +21,9 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.scene import Plan, StrategyKind
 
 UNSEEN_PX = 0.5
-"""Sum of blending weights in every picture, in pixels, below which a Gaussian counts as invisible."""
+"""Largest sum of blending weights over the pixels of any picture, in pixels, below which a Gaussian counts as
+invisible.
+"""
 SHRINK = 1.6
 """Factor by which the halves of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
 APART = 0.5
@@ -75,7 +77,7 @@ def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor
 
 
 DENSIFY_ROUNDS = 6
-"""Number of rounds, spread evenly."""
+"""Number of rounds of densification, spread evenly over the training."""
 DENSIFY_UNTIL = 0.7
 """Share of the steps after which the last round takes place."""
 DENSIFY_FRAMES = 12
@@ -102,7 +104,7 @@ class Rounds:
         self._rounds = densification_rounds(plan.steps)
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """See `SceneStrategy`."""
+        """Run a round of changes if one is due before this step; see `SceneStrategy`."""
         changed = False
         while self._rounds and number >= self._rounds[0] > 0:
             self._round(1 - (len(self._rounds) - 1) / DENSIFY_ROUNDS, rate_scale)
