@@ -181,7 +181,7 @@ class DisplayOp(Operator):
             self.clock.shown(rendered.published_ns, shown_ns)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the statistics of the display to the outcome of the run."""
         outcome.add(LiveDisplayResult(self.pictures, self._ages.summary(), dict(self.states), self._first_ms))
 
 

@@ -121,7 +121,7 @@ class SourceOp(Operator):
             self._end()
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the counts of read frames and the source's states to the outcome of the run."""
         counts = dict(self.source.counts()) if isinstance(self.source, ReportingSource) else {}
         outcome.add(
             SourceResult(

@@ -104,11 +104,13 @@ class RenderedFrame:
     steps: int = 0
     """Number of optimiser steps on this frame."""
     content: Frame | None = None
-    """See `Reconstruction.content`."""
+    """Newest frame that the model was trained on, in live runs; see `Reconstruction.content`. None means `frame`
+    itself.
+    """
     taken_ns: int | None = None
-    """See `Reconstruction.taken_ns`."""
+    """Time at which training dequeued the frame, by `time.monotonic_ns`; live runs only."""
     published_ns: int | None = None
-    """See `Reconstruction.published_ns`."""
+    """Time at which the model was published, by `time.monotonic_ns`; live runs only."""
     outputs: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     """Further outputs of the renderer by name, float32 [H, W] or [H, W, C]."""
 

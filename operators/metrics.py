@@ -462,7 +462,7 @@ class MetricsOp(Operator):
         return value
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the scores, their baselines and the digest of the pictures to the outcome of the run."""
         if self.report:
             entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
             if self.log is not None and self.frames:

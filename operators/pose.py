@@ -68,7 +68,7 @@ class PoseOp(Operator):
         op_output.emit(frame.with_fields(pose=self._odometry.place(frame)), "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the statistics of the pose estimation to the outcome of the run."""
         found = self._odometry
         outcome.add(
             EstimatedPoses(

@@ -210,7 +210,7 @@ class ReconstructOp(Operator):
             request.answer(model, frame, time.perf_counter_ns() - began_ns)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the final model and the statistics of its training to the outcome of the run."""
         counts = self.counts
         outcome.add(TrainedEyes(self._eyes))
         outcome.add(replace(counts, withheld=dict(counts.withheld), scenes=dict(counts.scenes)))

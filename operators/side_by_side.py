@@ -94,7 +94,7 @@ class SideBySideOp(Operator):
         op_output.emit(through(self.then, decided), "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the results of the operators of all chains to the outcome of the run."""
         for operator in self.parts:
             if isinstance(operator, Contributor):
                 operator.contribute(outcome)

@@ -216,7 +216,7 @@ class EveryFrame(Training):
         self._held_out = held_out
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """See `Training.learn`."""
+        """Train the configured number of steps on the frame, unless it is withheld or held out, and publish the model."""
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):
             return None
@@ -224,7 +224,7 @@ class EveryFrame(Training):
         return learner.observe(frame, train=train)
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
-        """See `Training.contribute`."""
+        """Add notes on frames without training to the outcome of the run."""
         if counts.withheld:
             reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(counts.withheld.items()))
             outcome.note(f"{sum(counts.withheld.values())} frames were neither trained on nor scored ({reasons})")
@@ -253,7 +253,7 @@ class UntilDisplay(Training):
         self.begin()
 
     def begin(self) -> None:
-        """See `Training.begin`."""
+        """Reset the clock and the growth counter for a new stream."""
         self._since_grown = 0
         """Frames trained on since the last growth step."""
         self._depth_ages = Histogram()
@@ -268,7 +268,7 @@ class UntilDisplay(Training):
         return frame
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """See `Training.learn`."""
+        """Train on the frame until its display deadline, and publish the model."""
         behind, taken_ns = frame_waits(), self._clock.now_ns()
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):
@@ -320,7 +320,7 @@ class UntilDisplay(Training):
             self._depth_ages.record(self._clock.now_ns() - frame.arrived_ns)
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
-        """See `Training.contribute`."""
+        """Add notes on dropped frames and late depth to the outcome of the run."""
         age_ms = self._depth_ages.summary().p50_ms
         outcome.add(TakenDepth(self._depths_taken, age_ms, self._depths_dropped))
         if self._depths_taken:
@@ -359,19 +359,21 @@ class RecordedCalls(Training):
         """The most recently observed frames, by sequence number."""
 
     def begin(self) -> None:
-        """See `Training.begin`."""
+        """Open the recorded schedule for a new stream."""
         self.missing, self._has_reconstructor = None, False
         self._observed.clear()
         self._lines, self._depths = self._schedule(), self._late_depths()
         self._due = next(self._lines, None)
 
     def end(self) -> None:
-        """See `Training.end`."""
+        """Close the recorded schedule."""
         self._observed.clear()
         self._lines, self._depths = iter(()), iter(())
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """See `Training.learn`."""
+        """Repeat the recorded calls up to those of this frame, and publish the model. None for a frame that the session
+        did not display.
+        """
         observed = self._follow_to(frame, learner)
         if observed is None or not self._has_reconstructor:
             return None
@@ -433,7 +435,7 @@ class RecordedCalls(Training):
         self.missing = seq if self.missing is None else self.missing
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
-        """See `Training.contribute`."""
+        """Add notes on missing parts of the recording to the outcome of the run."""
         if self.missing is not None:
             outcome.note(
                 f"frame {self.missing} was trained on in the session and is not in its recording, or its depth is not: later pictures may differ"

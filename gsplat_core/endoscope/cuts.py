@@ -36,13 +36,17 @@ class Likeness:
     """Similarity measures of two pictures."""
 
     difference: float
-    """0 for equal pictures; 0.3 and more between scenes."""
+    """Median difference of the pictures' log levels: 0 for equal pictures, 0.3 and more between scenes."""
     colours: float
-    """1 for equal colours, 0 for none in common."""
+    """Overlap of the hue histograms: 1 for equal colours, 0 for none in common."""
     structure: float
-    """1 if every block is found near its position; 0.3 to 0.65 for unrelated pictures."""
+    """Median correlation of blocks with the surroundings of their position in the other picture: 1 if every block is
+    found, 0.3 to 0.65 for unrelated pictures.
+    """
     moved: float
-    """1 if a quarter of one picture is found in the other; 0.4 to 0.8 for unrelated pictures."""
+    """Best correlation of a quarter of one picture anywhere in the other: 1 if it is found, 0.4 to 0.8 for unrelated
+    pictures.
+    """
 
 
 class View:

@@ -24,7 +24,7 @@ WIDTH_PX, HEIGHT_PX = 24, 20
 interpreter lock for larger arrays and must wait to reacquire it.
 """
 AGREEMENT = 0.05
-"""Largest difference of log ratios that agree."""
+"""Largest difference of two log brightness ratios that count as equal."""
 
 
 @dataclass(frozen=True)

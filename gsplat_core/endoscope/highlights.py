@@ -48,7 +48,7 @@ class HighlightFinder:
         self._planes: list[NDArray[np.uint8]] = []
 
     def without(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """See `without_highlights`."""
+        """Return a mask uint8 [H, W], 0 on highlights, for a picture RGB uint8 [H, W, 3]; None without highlights."""
         height, width = image.shape[:2]
         step = -(-max(height, width) // LONG_SIDE_PX)
         some = sampled(image, step)

@@ -85,7 +85,8 @@ class CameraCorrections(torch.nn.Module):
         return 0.5 * (chosen if ids is None else chosen[ids]).square().sum(-1).mean()
 
     def smoothness(self, step_sigma: float = 1.0) -> Tensor:
-        """Return the same for the difference of corrections of consecutive cameras of a video.
+        """Return the mean negative logarithm of the normal distribution of differences between corrections of
+        consecutive cameras of a video.
 
         Args:
             step_sigma: expected difference as a share of the expected errors.

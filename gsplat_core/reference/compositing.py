@@ -13,9 +13,11 @@ ALPHA_MAX = 0.99
 ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_STOP = 1e-4
 SPLATS_AT_A_TIME = 2048
-"""Bound of the splats of a tile that are blended together, for memory."""
+"""Largest number of a tile's splats that are blended together, which bounds memory."""
 FIRST_SPLATS = 64
-"""Splats that are blended first; each further part has twice as many, so that few are computed behind opaque ones."""
+"""Number of splats that are blended first; each further part of a list has twice as many, so that few splats are
+computed behind opaque ones.
+"""
 
 
 def rasterize_to_pixels(

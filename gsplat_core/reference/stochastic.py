@@ -24,22 +24,22 @@ class SampleMoments(NamedTuple):
     """Moments of one sample of each pixel: red, green, blue, hit and z."""
 
     mean: Tensor
-    """[H, W, 5]."""
+    """Mean of red, green, blue, hit and z of each pixel, [H, W, 5]."""
     variance: Tensor
-    """[H, W, 5]."""
+    """Variance of red, green, blue, hit and z of each pixel, [H, W, 5]."""
 
 
 class ProjectedSplats(NamedTuple):
     """Visible splats in order of depth, then row."""
 
     means2d: Tensor
-    """[M, 2], pixels."""
+    """Projected centres [M, 2] in pixels."""
     conics: Tensor
-    """[M, 3]."""
+    """Inverse 2D covariances as (xx, xy, yy), [M, 3]."""
     opacities: Tensor
     depths: Tensor
     colors: Tensor
-    """[M, 3], not negative."""
+    """Colours [M, 3], not negative."""
     rows: Tensor
 
 

@@ -29,7 +29,7 @@ PSNR_CAP_DB = 100.0
 
 
 _UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 255).numpy()
-"""Float value of each byte."""
+"""Lookup table from a byte to its float value in 0..1, float32 [256]."""
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ class WindowSchedule(Schedule):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """See `Schedule.train`."""
+        """Spend the budget of the newest frame on steps on it and on earlier frames of the window."""
         spending = Spending(budget, self.step_s)
         plan: list[Observation] = [observation]
         first_loss: HostCopy | None = None
@@ -186,7 +186,7 @@ class WindowSchedule(Schedule):
         return ObserveReport(observation.seq, made, HostCopy(loss), step.gaussians.count, spending.ending)
 
     def forget(self) -> None:
-        """See `Schedule.forget`."""
+        """Forget the usual loss of a new frame, for another scene."""
         self._usual_first_loss = math.inf
 
     def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:
@@ -226,7 +226,7 @@ class NewestFirstSchedule(Schedule):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """See `Schedule.train`."""
+        """Spend the budget of the newest frame on steps on this frame alone."""
         spending = Spending(budget, self.step_s)
         loss = None
         while spending.allows_step(by_turns=observation.right_eye is not None):
@@ -242,8 +242,8 @@ class NewestFirstSchedule(Schedule):
         return ObserveReport(observation.seq, spending.made, HostCopy(loss), step.gaussians.count, spending.ending)
 
     def rehearse(self, step: TrainingStep, window: ObservationWindow, steps: int) -> None:
-        """See `Schedule.rehearse`. On a GPU the steps are queued, and at most `REHEARSED_IN_FLIGHT`
-        are unfinished on return.
+        """Make `steps` training steps on frames drawn from the window. On a GPU the steps are queued, and at most
+        `REHEARSED_IN_FLIGHT` are unfinished on return.
         """
         for _ in range(steps):
             # Start with the right eye, since steps on the newest frame begin with the left one.
@@ -255,7 +255,7 @@ class NewestFirstSchedule(Schedule):
             self._rehearsing.queued()
 
     def forget(self) -> None:
-        """See `Schedule.forget`."""
+        """Restart the alternation of the eyes, for another scene."""
         self._rehearsed = 0
 
     def _learn_step_time(self, spending: Spending) -> None:

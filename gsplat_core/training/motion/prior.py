@@ -240,7 +240,7 @@ class FlowPrior:
         self.forget()
 
     def forget(self) -> None:
-        """See `MotionPrior.forget`."""
+        """Reset for a new scene."""
         self._image_motion.forget()
         self._depth = DepthFromMotion()
         self._damping = Damping()
@@ -253,11 +253,13 @@ class FlowPrior:
 
     @property
     def horizon_s(self) -> float:
-        """See `MotionPrior.horizon_s`."""
+        """Time in seconds after the newest frame for which the velocity applies: always `HORIZON_S`."""
         return HORIZON_S
 
     def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
-        """See `MotionPrior.observe`."""
+        """Measure the optical flow to the next frame, update the damping, and move the scene by the flow if training
+        starts from it.
+        """
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
         last, last_interval_s, self._motion = self._usable_motion(), self._interval_s, None
@@ -288,7 +290,9 @@ class FlowPrior:
                 motion_of(step).move_to(time_s, held)
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
-        """See `MotionPrior.velocity`."""
+        """Return the velocity of the raw parameters [N, 16] that continues the last motion, damped; None without a
+        usable motion.
+        """
         motion = self._usable_motion()
         if motion is None:
             return None
