@@ -5,11 +5,13 @@ one.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import interpolate
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
@@ -17,6 +19,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.transfers import HostCopy
 
 MOST_PLACES = 8
 """Largest number of stored left scenes. The one that the stream left first is dropped."""
@@ -32,6 +35,10 @@ LEAST_SHARE = 0.3
 """Smallest share of the picture that must be both tissue and covered by the left scene."""
 
 
+Look: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Small picture of a scene: colours [H, W, 3] in 0..1, and opacity or share of tissue [H, W]."""
+
+
 @dataclass
 class Place:
     """Scene left by a stream, in host memory."""
@@ -42,10 +49,10 @@ class Place:
     """Camera that last observed this scene."""
     left_s: float
     """Time in seconds when the stream left this scene."""
-    _looks: dict[Camera, tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=dict, repr=False)
+    _looks: dict[Camera, Look] = field(default_factory=dict, repr=False)
 
-    def look(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Render the left scene `COMPARED_PX` wide: colours [H, W, 3] and opacity [H, W]. The last result is cached."""
+    def look(self, camera: Camera) -> Look:
+        """Return the left scene `COMPARED_PX` wide. It is rendered unless the last look was from the same camera."""
         if camera not in self._looks:
             with torch.no_grad():
                 output = render(self.gaussians, camera.scaled(RENDERED_PX / camera.width_px), depth=False)
@@ -66,16 +73,24 @@ class Places:
     def __len__(self) -> int:
         return len(self._left)
 
-    def leave(self, gaussians: Gaussians, camera: Camera, time_s: float) -> None:
-        """Keep a copy of a scene in host memory."""
+    def leave(self, gaussians: Gaussians, camera: Camera, time_s: float, look: Look | None = None) -> None:
+        """Keep a copy of a scene in host memory.
+
+        Args:
+            gaussians: last state of the scene.
+            camera: camera that last observed the scene.
+            time_s: time of the copy in seconds.
+            look: small picture of the scene from that camera; None to render it when it is needed.
+        """
         kept = gaussians.map(lambda tensor: tensor.detach().to("cpu", torch.float32, copy=True))
-        self._left = [*self._left, Place(kept, camera, time_s)][-self._most :] if self._most else []
+        place = Place(kept, camera, time_s, {} if look is None else {camera: look})
+        self._left = [*self._left, place][-self._most :] if self._most else []
 
     def take(self, frame: Frame) -> Place | None:
         """Remove and return the left scene that a frame shows, or None if it shows none.
 
-        Each left scene is rendered from the frame's pose or, without a pose, from its last camera. The comparison
-        ignores the frame's exposure and white balance.
+        Each left scene is seen from the frame's pose or, without a pose, from its last camera. The comparison ignores
+        the frame's exposure and white balance.
         """
         likeness = [self._likeness(place, frame) for place in self._left]
         best = int(np.argmax(likeness)) if likeness else 0
@@ -113,9 +128,13 @@ class LeftScenes:
         """Discard all left scenes."""
         self.places, self._recognised = Places(), None
 
-    def leave(self, step: TrainingStep, camera: Camera, time_s: float) -> None:
-        """Keep the last state of a scene, seen by `camera` at `time_s`, to recognise it later."""
-        self.places.leave(step.at(time_s), camera, time_s)
+    def leave(self, step: TrainingStep, newest: Observation, time_s: float) -> None:
+        """Keep the last state of a scene at `time_s` to recognise it later.
+
+        The scene's newest observation stands for a rendering from its camera. Rendering would delay the first picture of
+        the next scene by more than half a frame interval.
+        """
+        self.places.leave(step.at(time_s), newest.camera, time_s, look_of(newest))
 
     def recognise(self, frame: Frame) -> bool:
         """Return True if the frame, which starts the next scene, shows a scene that the stream left before."""
@@ -141,6 +160,18 @@ class LeftScenes:
         if kept is None or not same_size:
             return None
         return kept if kept.restart(gaussians, observation.time_s, observation.camera) else None
+
+
+def look_of(observation: Observation) -> Look | None:
+    """Return the small picture of an observation; None if it shows too little tissue to be compared."""
+    camera = observation.camera
+    planes = torch.cat([observation.image.permute(2, 0, 1) / 255, (observation.mask != 0).float()[None]])
+    width, height = compared_size(camera.width_px, camera.height_px)
+    small = HostCopy(interpolate(planes[None], size=(height, width), mode="area")[0].permute(1, 2, 0)).numpy()
+    tissue = np.ascontiguousarray(small[..., 3])
+    if np.count_nonzero(tissue > 0.5) < LEAST_SHARE * tissue.size:
+        return None
+    return np.ascontiguousarray(small[..., :3]), tissue
 
 
 def compared_size(width_px: int, height_px: int) -> tuple[int, int]:

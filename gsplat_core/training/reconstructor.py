@@ -256,7 +256,7 @@ class Reconstructor:
             True if the frame shows a scene that was left before.
         """
         if self._step is not None:
-            self._left.leave(self._step, self._window.newest.camera, self._last_time_s)
+            self._left.leave(self._step, self._window.newest, self._last_time_s)
         self._end_scene()
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)

@@ -13,7 +13,8 @@ from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.places import MOST_PLACES, Places, likeness_of
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.places import MOST_PLACES, Places, likeness_of, look_of
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 
@@ -70,6 +71,17 @@ def test_only_tissue_is_compared():
 
 def test_a_picture_of_another_size_shows_the_same_place():
     assert left(1, 2).take(Frame(0, 0, tissue(2, 96, 72))).left_s == 2.0
+
+
+def test_the_last_picture_stands_for_the_scene_where_the_camera_is_the_same():
+    """Without a pose no scene is rendered: the picture decides, whatever the Gaussians are."""
+    gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
+    places = Places()
+    places.leave(gaussians, CAMERA, 1.0, look_of(Observation.of(frame_of(2), CAMERA)))
+    assert places.take(frame_of(1)) is None
+    assert places.take(frame_of(2)) is not None
+    hidden = frame_of(2, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert look_of(Observation.of(hidden, CAMERA)) is None
 
 
 def test_a_pose_that_looks_elsewhere_does_not_show_the_place():
