@@ -10,7 +10,7 @@ endif()
 if(CMAKE_CUDA_COMPILER MATCHES "^${CUDA_PACKAGES}/")
   set(ENV{LIBRARY_PATH} "${CUDA_PACKAGES}/lib:$ENV{LIBRARY_PATH}")  # CMake tests the compiler by linking a program
 endif()
-# portable: all supported architectures, for distributed libraries and CI. The front end runs once for compute capability 8.x and once
+# portable: all supported architectures, for distributed libraries. The front end runs once for compute capability 8.x and once
 # for 9.0 and later, because the kernels only distinguish GPUs with and without the instructions of 9.0.
 if(INTRASPLAT_CUDA_ARCHITECTURES STREQUAL "portable")
   set(CMAKE_CUDA_ARCHITECTURES OFF)

@@ -55,25 +55,31 @@ def test_make_cuda_builds_for_the_gpu_at_hand_unless_told():
 def test_ci_builds_the_cuda_kernels_and_requires_them():
     script = (ROOT / ".ci" / "run").read_text()
     assert "set -euo pipefail" in script and "INTRASPLAT_REQUIRE_CUDA_BUILD=1" in script
-    assert "cuda CUDA_ARCHITECTURES=portable" in script
+    assert "cuda CUDA_ARCHITECTURES='80-real;90-real'" in script, "GPUs without and with the instructions of 9.0"
+    assert '="80-real;90-real"' in dry_run("cuda", "CUDA_ARCHITECTURES=80-real;90-real")
 
 
 @pytest.mark.parametrize(("target", "selected"), [("test", True), ("test-all", False)])
 def test_slow_tests_are_left_out_by_the_fast_command_alone(target, selected):
     commands = [line for line in dry_run(target).splitlines() if "-m pytest " in line]
-    assert len(commands) == 6
+    assert len(commands) == 9
     assert all(('-m "not slow"' in line) == selected for line in commands)
 
 
 def test_ci_runs_all_tests():
-    script = (ROOT / ".ci" / "run").read_text().splitlines()
-    assert "make test-all" in script and "make test" not in script
+    commands = [line.split() for line in (ROOT / ".ci" / "run").read_text().splitlines() if line.startswith("make ")]
+    assert any("test-all" in words for words in commands) and not any("test" in words for words in commands)
 
 
-def test_the_groups_of_tests_are_all_of_them():
+def test_the_groups_of_tests_are_all_of_them_and_none_twice():
     commands = [line.partition("-m pytest ")[2] for line in dry_run("test-all").splitlines() if "-m pytest " in line]
     groups = [shlex.split(command) for command in commands]
-    (rest,) = (group for group in groups if group[0].startswith("--ignore="))
-    others = [path for group in groups if group is not rest for path in group]
-    assert others and all((ROOT / path).exists() for path in others)
-    assert sorted(rest) == sorted(f"--ignore={path}" for path in others)
+    ignored = [[word.removeprefix("--ignore=") for word in group if word.startswith("--")] for group in groups]
+    paths = [[word for word in group if not word.startswith("--")] or ["."] for group in groups]
+    every = {path for each in paths for path in each} - {"."}
+    assert paths.count(["."]) == 1 and all((ROOT / path).exists() for path in every)
+    for own, without in zip(paths, ignored, strict=True):
+        assert set(without) <= every, "what one group leaves out is in another one"
+        for path in every - set(own):
+            below = any(Path(path).is_relative_to(folder) for folder in own)
+            assert not below or any(Path(path).is_relative_to(folder) for folder in without), path
