@@ -143,8 +143,8 @@ class _Fit:
         self._error = np.full(count, np.inf)
 
     def run(self, rounds: int) -> PeriodicMotion:
-        for _ in range(rounds):
-            self._step()
+        for left in reversed(range(rounds)):
+            self._step(errors=left == 0)
         self._weights(in_cameras(self._points(), self._tracks.poses))
         return PeriodicMotion(self._frequencies, self._terms, self._error, self._cost)
 
@@ -163,8 +163,8 @@ class _Fit:
         self._cost = float(np.log1p(squared)[seen].mean())
         return off, seen / (1 + squared)
 
-    def _step(self) -> None:
-        """Do one Gauss-Newton step. Derivatives are taken at predicted positions. At observed
+    def _step(self, errors: bool) -> None:
+        """Do one Gauss-Newton step; `errors` also estimates the errors of the distances. Derivatives are taken at predicted positions. At observed
         positions their noise would correlate with the residual and bias distances to be too short.
         """
         tracks, focal = self._tracks, self._tracks.focal_px
@@ -182,9 +182,9 @@ class _Fit:
         pull = np.einsum("tnij,tni->tnj", weighted, off).reshape(len(weight), -1)
         g = (pull.T @ self._waves).reshape(count, 3, terms)
         g = np.einsum("njbkc,nkc->njb", H, self._terms) - g
-        self._solve(H, g)
+        self._solve(H, g, errors)
 
-    def _solve(self, H: Array, g: Array) -> None:
+    def _solve(self, H: Array, g: Array, errors: bool) -> None:
         """Minimise the quadratic form (H, g) plus the priors."""
         pose = self._tracks.poses[self._middle]
         axis, count = pose[2, :3], len(H)
@@ -206,21 +206,23 @@ class _Fit:
         S = W - U.transpose(0, 2, 1) @ gain
         s = g[:, :, 1:].reshape(count, -1) - np.einsum("nij,ni->nj", gain, v)
         nodes = self._nodes()
-        field, spread = self._field(S, s, nodes)
+        whole = self._system(S, nodes)
+        field = np.linalg.solve(whole, (s.T @ nodes).reshape(-1)).reshape(s.shape[1], nodes.shape[1]).T
         vectors = nodes @ field
         self._terms[:, :, 1:] = vectors.reshape(count, 3, moving)
         self._terms[:, :, 0] = self._limited(
             np.einsum("nij,nj->ni", inverse, v) - np.einsum("nij,nj->ni", gain, vectors)
         )
+        if not errors:
+            return
+        spread = np.linalg.inv(whole)
         along = np.einsum("i,nij->nj", axis, gain)
         lever = np.einsum("np,nc->npc", along, nodes).reshape(count, -1)
         variance = np.einsum("i,nij,j->n", axis, inverse, axis) + ((lever @ spread) * lever).sum(1)
         self._error = ALIKE * np.sqrt(variance) / self._distance
 
-    def _field(self, S: Array, s: Array, nodes: Array) -> tuple[Array, Array]:
-        """Return the motion vectors at the grid's nodes [nodes, 3 * 2 F], and their joint covariance in the order
-        (vector, node).
-        """
+    def _system(self, S: Array, nodes: Array) -> Array:
+        """Return the normal matrix of the motion vectors at the grid's nodes, in the order (vector, node), with their priors."""
         size, count = S.shape[1], nodes.shape[1]
         whole = np.zeros((size, count, size, count))
         for row in range(size):
@@ -232,9 +234,7 @@ class _Fit:
         )
         for row in range(size):
             whole[row, :, row] += known
-        covariance = np.linalg.inv(whole.reshape(size * count, -1))
-        field = covariance @ (s.T @ nodes).reshape(-1)
-        return np.asarray(field.reshape(size, count).T), np.asarray(covariance)
+        return whole.reshape(size * count, -1)
 
     def _nodes(self) -> Array:
         """Return the weight of each node at each point [N, nodes], by cubic B-splines over the

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +11,6 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
-from gsplat_core.ops.native import instruction_set
 from gsplat_core.reference import compositing as reference
 from tests.gsplat_core.ops.compositing_scenes import Scene, assert_close, scene
 
@@ -191,29 +186,6 @@ def test_the_reference_gradient_is_the_derivative() -> None:
         inputs,
         atol=1e-4,
     )
-
-
-@pytest.mark.parametrize("isa", ["baseline", "avx2"])
-@pytest.mark.slow
-def test_other_instruction_sets_agree(isa: str, tmp_path: Path) -> None:
-    s = scene(300, channels=4, backgrounds=torch.rand(1, 4, generator=torch.Generator().manual_seed(0)))
-    torch.save(s, tmp_path / "scene.pt")
-    here = Path(__file__)
-    code = (
-        "import importlib.util, sys, torch\n"
-        f"spec = importlib.util.spec_from_file_location('scene_of_the_test', {str(here)!r})\n"
-        "module = importlib.util.module_from_spec(spec); sys.modules[spec.name] = module; spec.loader.exec_module(module)\n"
-        "s = module.scene(300, channels=4, backgrounds=torch.rand(1, 4, generator=torch.Generator().manual_seed(0)))\n"
-        "results = s.run(module.rasterize_to_pixels, torch.float32, True)\n"
-        f"torch.save((module.instruction_set(), results), {str(tmp_path / 'results.pt')!r})\n"
-    )
-    environment = os.environ | {"INTRASPLAT_ISA": isa, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=300)
-    used, results = torch.load(tmp_path / "results.pt")
-    assert used == isa or instruction_set() == "baseline"
-    here_results = s.run(rasterize_to_pixels, torch.float32, True)
-    for name, value in here_results.items():
-        assert (results[name] - value).norm() <= 1e-4 * value.norm(), name
 
 
 def test_wrong_arguments_are_named() -> None:

@@ -92,7 +92,7 @@ def test_reference_gradcheck():
     camera = Camera.from_focal(60.0, 18, 17)
     offsets, ids = FlowScene(*(tensor.detach().float() for tensor in scene)).lists(camera)
     blend = lambda planes: reference.blend_flow(*scene[:4], planes, camera, AFTER, offsets, ids)
-    assert torch.autograd.gradcheck(blend, (scene.planes,))
+    assert torch.autograd.gradcheck(blend, (scene.planes,), fast_mode=True)
 
 
 # opcheck itself reads .grad of tensors that are not leaves.

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, rasterization, reference, render
+from gsplat_core.ops.native import instruction_set
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -70,9 +71,9 @@ def test_reference_gradcheck_end_to_end(make_scene):
     assert torch.autograd.gradcheck(function, tuple(scene.leaves()), fast_mode=True, eps=1e-7, atol=1e-4)
 
 
-@pytest.mark.parametrize("instructions", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.slow
-def test_every_instruction_set_gives_the_image(tmp_path, make_scene, assert_near, instructions):
+def test_other_instruction_sets_give_the_image(tmp_path, make_scene, assert_near, instructions):
     scene = make_scene(80, cameras=2)
     image, alpha, gradients, _ = run(reference.rasterization, scene.to(torch.float64), render_mode="RGB+ED")
     torch.save({name: getattr(scene, name) for name in scene.__dataclass_fields__}, tmp_path / "scene.pt")
@@ -80,16 +81,18 @@ def test_every_instruction_set_gives_the_image(tmp_path, make_scene, assert_near
         "import sys, torch\n"
         "from types import SimpleNamespace\n"
         "from gsplat_core import rasterization\n"
+        "from gsplat_core.ops.native import instruction_set\n"
         "s = SimpleNamespace(**torch.load(sys.argv[1] + '/scene.pt'))\n"
         "leaves = [t.float().requires_grad_() for t in (s.means, s.quats, s.scales, s.opacities, s.sh, s.viewmats)]\n"
         "image, alpha, _ = rasterization(*leaves, s.Ks.float(), s.width, s.height, sh_degree=3, render_mode='RGB+ED')\n"
         "g = torch.Generator().manual_seed(5)\n"
         "sum((t * torch.rand(t.shape, generator=g, dtype=torch.float64).float()).sum() for t in (image, alpha)).backward()\n"
-        "torch.save([image.detach(), alpha.detach(), [l.grad for l in leaves]], sys.argv[1] + '/out.pt')\n"
+        "torch.save([image.detach(), alpha.detach(), [l.grad for l in leaves], instruction_set()], sys.argv[1] + '/out.pt')\n"
     )
     environment = os.environ | {"INTRASPLAT_ISA": instructions, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", program, str(tmp_path)], env=environment, check=True)
     out = torch.load(tmp_path / "out.pt")
+    assert out[3] == instructions or instruction_set() == "baseline"
     assert_near(out[0], image, relative=1e-3, of_largest=1e-4)
     assert_near(out[1], alpha, relative=1e-3, of_largest=1e-4)
     for actual, wanted in zip(out[2], gradients, strict=True):
