@@ -41,10 +41,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "int height, float eps2d, float compensation_floor, float spread, float weight, float center_weight) -> (Tensor v_means, "
       "Tensor v_quats, Tensor v_scales)");
 
-  // Blending by the response of Gaussians [B, N, 12] (mean, whitening matrix) along rays [I, H, W, 6], without gradients.
+  // Blending by the response of Gaussians [B, N, 12] (mean, whitening matrix) along rays [I, H, W, 6]. `last` has the position
+  // in flatten_ids of each pixel's last blended Gaussian, or -1. The gradients of Gaussians have a row per image: [I, N, 12].
   m.def(
       "blend_world(Tensor gaussians, Tensor colors, Tensor opacities, Tensor rays, Tensor isect_offsets, Tensor flatten_ids, "
-      "Tensor? masks, int tile_size, float max_alpha) -> (Tensor colors, Tensor through)");
+      "Tensor? masks, int tile_size, float max_alpha) -> (Tensor colors, Tensor through, Tensor last)");
+  m.def(
+      "blend_world_backward(Tensor gaussians, Tensor colors, Tensor opacities, Tensor rays, Tensor isect_offsets, Tensor "
+      "flatten_ids, Tensor? masks, int tile_size, float max_alpha, Tensor through, Tensor last, Tensor v_colors, Tensor "
+      "v_through) -> (Tensor v_gaussians, Tensor v_colors, Tensor v_opacities, Tensor v_rays)");
 
   // Projection of visible pairs of camera and Gaussian only, in ascending order of their ids: (batch * cameras +
   // camera) * gaussians + gaussian (int64 [rows]). The gradients have one row per pair. The host waits for the number

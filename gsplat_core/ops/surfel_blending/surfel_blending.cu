@@ -4,6 +4,7 @@
 // a surfel over its pixels, the block adds the sums of its warps, and every instance (a surfel in a window) has its own row.
 // A surfel's rows are summed in list order. There are no atomics, so results are bitwise reproducible.
 #include "../compositing/gather_rows.cuh"
+#include "../compositing/row_sums.cuh"
 #include "../compositing/warp_sums.cuh"
 #include "surfel_blending_math.h"
 
@@ -294,18 +295,6 @@ __global__ void __launch_bounds__(kBlockThreads) blend_backward(Inputs in, Prepa
   }
 }
 
-// Sum the rows of each surfel in list order, one thread per surfel and value.
-__global__ void sum_rows(Inputs in, const uint32_t* positions, const uint2* ranges, const float* rows, int windows, int row_size,
-                         float* sums) {
-  const int64_t e = int64_t(blockIdx.x) * kThreads + threadIdx.x, surfel = e / row_size, value = e % row_size;
-  if (surfel >= in.splats.count) return;
-  const uint2 range = ranges[surfel];
-  float total = 0;
-  for (uint32_t i = range.x; i < range.y; ++i)
-    for (int part = 0; part < windows; ++part) total += rows[(int64_t(positions[i]) * windows + part) * row_size + value];
-  sums[e] = total;
-}
-
 __global__ void convert_sums(Inputs in, const Record* records, const float* sums, int row_size, InputGradients out) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.splats.count) return;
@@ -383,8 +372,8 @@ void blend_backward_on_device(const Inputs& in, const PixelGradients& from, cons
         kernel<<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, surfels, from, rows);
       });
     const Instances instances = compositing::by_splat(in.splats, scratch, stream);
-    sum_rows<<<blocks_for(count * row_size), kThreads, 0, stream>>>(in, instances.positions, instances.ranges, rows, int(windows),
-                                                                    row_size, sums);
+    compositing::sum_rows<<<blocks_for(count * row_size), kThreads, 0, stream>>>(count, instances.positions, instances.ranges,
+                                                                                 rows, int(windows), row_size, sums);
     convert_sums<<<blocks_for(count), kThreads, 0, stream>>>(in, surfels.records, sums, row_size, out);
   }
   if (out.backgrounds != nullptr && in.splats.images > 0)

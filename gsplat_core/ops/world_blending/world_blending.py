@@ -47,7 +47,8 @@ def rasterize_to_pixels_eval3d(
 
     alpha = min(max_alpha, opacity exp(-d²/2)), where d is the distance in standard deviations at which the ray passes the
     centre. Other rules are those of `rasterize_to_pixels`. Differentiable in all floating-point tensors, cameras and
-    coefficients included; compiled kernels blend float32 values that need no gradient. A pixel that the lens does not see shows the background.
+    coefficients included. Compiled kernels blend float32 values, plain torch other dtypes. A pixel that the lens does not
+    see shows the background.
 
     Args:
         means: [..., N, 3].
@@ -125,9 +126,8 @@ def rasterize_to_pixels_eval3d(
     batches, images = math.prod(batch_dims), math.prod(image_dims)
     # Whitening matrices: rows are the axes divided by the scales.
     whitening = sigma_offsets(quats, torch.ones_like(scales)) / scales[..., None]
-    inputs = (means, quats, scales, colors, opacities, rays)
     blend = blend_world
-    if means.dtype == torch.float32 and not (torch.is_grad_enabled() and any(each.requires_grad for each in inputs)):
+    if means.dtype == torch.float32:
         # Loaded when it is first needed, so that float64 works without the compiled library.
         from gsplat_core.ops.world_blending.compiled import blend_compiled
 

@@ -144,30 +144,87 @@ def test_pixels_that_the_lens_does_not_see_show_the_background():
     assert (alphas[0, 0, 0] == 0) and alphas[0, 7, 10] > 0 and image.isfinite().all()
 
 
-@pytest.mark.parametrize("channels", [1, 3, 11])
-@pytest.mark.parametrize("masked", [False, True])
-def test_compiled_blending_is_that_of_plain_torch(channels, masked):
+def two_pictures(channels, masked):
+    """Return inputs of two pictures with long lists, values that are not finite, and pixels without a ray."""
     given, _ = small_scene(60, size=0.15)
-    given["opacities"][:20] = 0.97
+    given["opacities"][:20] = 0.995
     colors = torch.rand(2, 60, channels, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     move = exp(torch.tensor([[[0.0] * 6], [[0.1, 0.0, 0.0, 0.02, 0.0, 0.1]]], dtype=torch.float64)[:, 0])
     given |= {"viewmats": move @ given["viewmats"], "Ks": KS.expand(2, 3, 3)}
     _, offsets, ids = lists(given)
     radial = RADIAL.expand(2, 6) * 0
     radial[1, 0] = -1.2  # the corners of the second picture have no ray
+    masks = torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1)) > (0.4 if masked else -1.0)
+    return given, colors, offsets, ids, {"masks": masks, "radial_coeffs": radial}
+
+
+def cast(values, dtype):
+    return {name: each.to(dtype) if each.is_floating_point() else each for name, each in values.items()}
+
+
+@pytest.mark.parametrize("channels", [1, 3, 11])
+@pytest.mark.parametrize("masked", [False, True])
+def test_compiled_blending_is_that_of_plain_torch(channels, masked):
+    given, colors, offsets, ids, more = two_pictures(channels, masked)
     colors[0, 5, 0], given["means"][7, 1] = math.nan, math.inf
     given["quats"][9] = math.nan
-    masks = torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1)) > (0.4 if masked else -1.0)
     results = []
     for dtype in (torch.float64, torch.float32):
-        cast = {name: value.to(dtype) for name, value in given.items()}
-        image, alphas = blend(cast, colors.to(dtype), offsets, ids, masks=masks, radial_coeffs=radial.to(dtype))
+        image, alphas = blend(cast(given, dtype), colors.to(dtype), offsets, ids, **cast(more, dtype))
         results.append((image.double(), alphas.double()))
     (expected, expected_alphas), (found, alphas) = results
     assert expected_alphas.max() > 0.99 and (expected_alphas == 0).any()
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-3)
     torch.testing.assert_close(alphas, expected_alphas, rtol=0, atol=2e-3)
     assert (found - expected).abs().mean() < 2e-5
+
+
+def gradients(given, colors, offsets, ids, more, dtype, device="cpu"):
+    """Return the gradients by name of a function of both results, in float64 on the CPU."""
+    values = {name: each.to(device) for name, each in cast({**given, "colors": colors, **more}, dtype).items()}
+    leaves = {name: each.clone().requires_grad_() for name, each in values.items() if each.is_floating_point()}
+    values |= leaves
+    own = {name: values[name] for name in given}
+    more = {name: values[name] for name in more}
+    image, alphas = blend(own, values["colors"], offsets.to(device), ids.to(device), **more)
+    weights = torch.cos(torch.arange(image.numel(), dtype=torch.float64)).view(image.shape).to(image)
+    ((image * weights).sum() + alphas[..., 0].square().sum()).backward()
+    return {name: leaf.grad.double().cpu() for name, leaf in leaves.items()}
+
+
+@pytest.mark.parametrize(("channels", "masked"), [(1, False), (3, True), (19, False)])
+def test_compiled_gradients_are_those_of_plain_torch(channels, masked):
+    inputs = two_pictures(channels, masked)
+    expected, found = gradients(*inputs, torch.float64), gradients(*inputs, torch.float32)
+    for name, wanted in expected.items():
+        # A pixel at the cut-off of alpha or transmittance may change sides between the precisions.
+        scale = wanted.abs().max()
+        assert scale > 0 and (found[name] - wanted).abs().mean() < 2e-4 * scale, name
+        assert (found[name] - wanted).abs().max() < 0.05 * scale, name
+
+
+def test_gaussians_without_a_finite_value_have_no_gradient_and_leave_that_of_others():
+    given, colors, offsets, ids, more = two_pictures(3, False)
+    hidden = {**given, "opacities": given["opacities"].clone()}
+    hidden["opacities"][3] = 0
+    expected = gradients(hidden, colors, offsets, ids, more, torch.float32)
+    colors[:, 3, 1] = math.nan
+    found = gradients(given, colors, offsets, ids, more, torch.float32)
+    assert torch.equal(found["means"], expected["means"]) and (found["opacities"][3] == 0)
+    assert (found["colors"][:, 3] == 0).all() and (expected["means"][3] == 0).all()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_gradients_do_not_depend_on_the_number_of_threads(threads):
+    inputs = two_pictures(3, False)
+    before = torch.get_num_threads()
+    expected = gradients(*inputs, torch.float32)
+    try:
+        torch.set_num_threads(threads)
+        found = gradients(*inputs, torch.float32)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(found[name], expected[name]) for name in ("means", "quats", "scales", "colors", "opacities"))
 
 
 def test_the_compiled_op_refuses_lists_out_of_range():
@@ -181,12 +238,19 @@ def test_the_compiled_op_refuses_lists_out_of_range():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # read by opcheck itself
 def test_opcheck():
+    from gsplat_core.ops.world_blending import compiled  # noqa: F401  registers the gradients
+
     given, colors = small_scene(5)
     _, offsets, ids = lists(given)
-    rays, gaussians = torch.rand(1, H, W, 6), torch.rand(1, 5, 12)
-    arguments = (gaussians, colors.float(), given["opacities"].float()[None], rays, offsets, ids, None, TILE, 0.99)
-    torch.library.opcheck(torch.ops.gsplat_core.blend_world.default, arguments)
+    floats = (torch.rand(1, 5, 12), colors.float(), given["opacities"].float()[None], torch.rand(1, H, W, 6))
+    rest = (offsets, ids, None, TILE, 0.99)
+    op = torch.ops.gsplat_core
+    torch.library.opcheck(op.blend_world.default, (*(each.clone().requires_grad_() for each in floats), *rest))
+    image, through, last = op.blend_world(*floats, *rest)
+    results = (through, last, torch.rand_like(image), torch.rand_like(through))
+    torch.library.opcheck(op.blend_world_backward.default, (*floats, *rest, *results))
 
 
 def test_nothing_to_blend():
