@@ -277,8 +277,27 @@ class OfflineSection(Section):
     """Offline training."""
 
     steps: Annotated[
-        int, Option("Optimiser steps over all training frames", ("reconstruct",), ge=1, le=100_000_000)
-    ] = 2000
+        int | None,
+        Option(
+            "Optimiser steps over all training frames",
+            ("reconstruct",),
+            null="the number that is best for frames kept for validation, within the time limit",
+            word="auto",
+            ge=1,
+            le=100_000_000,
+        ),
+    ] = None
+    minutes: Annotated[
+        float | None,
+        Option(
+            "Time limit of the training if its steps are chosen automatically",
+            ("reconstruct",),
+            unit="min",
+            null="1 on a GPU, 10 on a CPU",
+            gt=0,
+            le=100_000,
+        ),
+    ] = None
     strategy: Annotated[
         str,
         Option(

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training.motion.surface_tracks import SurfaceTracks
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.scene import Plan
@@ -94,8 +96,9 @@ def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observat
     return [observation_of(frame) for frame in frames]
 
 
-class ToFit(NamedTuple):
-    """Frames and observations prepared for offline training."""
+@dataclass(frozen=True)
+class ToFit:
+    """Frames and observations prepared for offline training. Several trainings can share it."""
 
     frames: list[Frame]
     """Frames from which the scene is created and grown."""
@@ -104,6 +107,11 @@ class ToFit(NamedTuple):
     doubts: Mapping[str, int]
     """Reasons for frames without depth, with numbers of frames (`RecordingDepth.doubts`)."""
     at_rest: bool = False
+
+    @cached_property
+    def tracks(self) -> SurfaceTracks:
+        """Trajectories of the surface through the frames."""
+        return SurfaceTracks(self.frames, self.seen, self.at_rest)
 
 
 def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], depth: str | None) -> ToFit:

@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.continuation import NewestState
@@ -25,9 +27,8 @@ from gsplat_core.training.growth.covering import Covering
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.growth.start_on_device import StartOnDevice
 from gsplat_core.training.motion.prior import Following, continued, newest_state
-from gsplat_core.training.motion.surface_tracks import SurfaceTracks
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.offline import OfflineTraining, to_fit
+from gsplat_core.training.offline import OfflineTraining, ToFit, to_fit
 from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
 from gsplat_core.training.places import LeftScenes
 from gsplat_core.training.right_eye import BothEyes, for_eyes
@@ -280,16 +281,25 @@ class Reconstructor:
         self.eyes.forget()
         self._window = ObservationWindow(self.config.window_frames, self._seed)
 
+    def prepared(self, frames: Iterable[Frame]) -> ToFit:
+        """Return frames prepared for `fit`, with depth that needs all frames. Several trainings can share it.
+
+        Raises:
+            InvalidInput: for no frames, or frames out of order.
+        """
+        observation_of = partial(self.eyes.observation, camera=self.camera)
+        return to_fit(list(frames), observation_of, self.config.depth_of_recording)
+
     def fit(
         self,
-        frames: Iterable[Frame],
+        frames: Iterable[Frame] | ToFit,
         steps: int,
         progress: Callable[[int, Tensor], None] | None = None,
     ) -> ObserveReport:
         """Train offline on all frames. `ReconstructorConfig.offline` is a suitable configuration.
 
         Args:
-            frames: frames in temporal order; all are kept in memory.
+            frames: frames in temporal order, or the result of `prepared`; all are kept in memory.
             steps: number of training steps.
             progress: called as `progress(step, loss)` after each step; reading the loss, [] on the
                 device, waits for it.
@@ -299,23 +309,37 @@ class Reconstructor:
         """
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
-        given = to_fit(list(frames), partial(self.eyes.observation, camera=self.camera), self.config.depth_of_recording)
+        given = frames if isinstance(frames, ToFit) else self.prepared(frames)
         frames, seen, self.depth_doubts = given.frames, given.seen, given.doubts
         self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
         self._step.frames = lambda: seen
-        tracks = SurfaceTracks(frames, seen, given.at_rest)
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
             first_new = self.gaussians if number else 0
             self._covering.cover(self._step, frame, observation, first=number == 0)
-            tracks.apply(self._step, number, first_new)
+            given.tracks.apply(self._step, number, first_new)
         training = OfflineTraining(
             self._step, seen, most_gaussians=self.config.max_gaussians, seed=self._seed, strategy=self.config.strategy
         )
         loss = training(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
+
+    def picture(self, frame: Frame) -> NDArray[np.float32]:
+        """Return the scene at the time, pose and exposure of a frame, float32 [H, W, 3] in 0..1. Synchronises.
+
+        Raises:
+            InvalidInput: before the first frame.
+        """
+        if self._step is None:
+            raise InvalidInput("there is no model yet: observe a frame first")
+        self._schedule.settle(self._step)
+        camera = self.camera if frame.pose is None else self.camera.with_pose(frame.pose)
+        with torch.no_grad():
+            shown = self._step.picture(self._step.at(frame.time_s), camera, depth=False).image
+        image = np.asarray(HostCopy(shown).numpy(), np.float32) * np.array(frame.exposure, np.float32)
+        return np.asarray(image.clip(0, 1), np.float32)
 
     def snapshot(self) -> Model:
         """Return an immutable copy of the current model with the next version number.

@@ -5,9 +5,11 @@ The protocol's held-out frames are excluded from training. The evaluation uses t
 
 from __future__ import annotations
 
-import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -17,7 +19,18 @@ from gsplat_core.io.recordings import is_heldout
 from gsplat_core.models.model import Model
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget, ObserveReport
+from gsplat_core.training.offline import ToFit
+from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes
+from gsplat_core.training.validation import (
+    LEAST_FRAMES,
+    USUAL_STEPS,
+    ChosenSteps,
+    Clock,
+    choose_steps,
+    split,
+    validation_psnr_db,
+)
 from operators.applications.device import seeded
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplaySettings, new_reconstructor, prepare, replay_graph
@@ -34,6 +47,9 @@ from operators.applications.session import (
 from operators.errors import NothingShown
 from operators.settings import OfflineSection, check_option
 from operators.sources.source import FrameSource
+
+MINUTES_ON_GPU, MINUTES_ON_CPU = 1.0, 10.0
+"""Time limits of a training with an automatic number of steps, in minutes."""
 
 
 @dataclass(frozen=True)
@@ -71,21 +87,23 @@ class _StopFitting(Exception):
 
 def reconstruct(
     settings: ReplaySettings,
-    steps: int,
+    steps: int | None = None,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
     report: Report | None = None,
+    clock: Clock = perf_counter,
 ) -> RunOutcome:
     """Train offline, then evaluate, and write the same files as a replay.
 
     Args:
         settings: settings of the run, `ReconstructSettings` for options of offline training; held-out frames are always
             excluded.
-        steps: number of optimiser steps.
+        steps: number of optimiser steps; None chooses it by validation (`gsplat_core.training.validation`).
         progress: called after each step or frame.
         stop_requested: polled. True during training saves the model without evaluation; True during
             evaluation acts as in a replay.
         report: writes the report files; None for no report.
+        clock: source of the time for the time limit, in seconds.
 
     Raises:
         InvalidSetting: `steps` is out of range. Also as `replay`.
@@ -99,13 +117,12 @@ def reconstruct(
             )
         source = prepare(inside, notes, offline=True)
         start = Start.now()
-        model, eyes, done = _fit(source, inside, steps, progress, stop_requested, notes)
-        if done < steps:
-            notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
+        fitted = _Fitting(source, inside, progress, stop_requested, notes, clock).done(steps)
+        model = fitted.model
         graph = replay_graph(
             source,
             inside,
-            make_reconstructor=lambda: FittedModel(model, eyes),
+            make_reconstructor=lambda: FittedModel(model, fitted.eyes),
             stage="evaluate",
             learns=False,
             progress=progress,
@@ -116,7 +133,11 @@ def reconstruct(
             inside.stated(online=False),
             command="reconstruct",
             engine=inside.engine,
-            finish=[saves_model(inside.out, model), measures_baselines(source)],
+            finish=[
+                lambda session: session.reached.add(fitted.steps),
+                saves_model(inside.out, model),
+                measures_baselines(source),
+            ],
             notes=notes,
             stop_requested=stop_requested,
             started=start,
@@ -129,45 +150,107 @@ def _trains(frame: Frame) -> bool:
     return not is_heldout(frame.seq) and frame.unusable is None
 
 
-def _fit(
-    source: FrameSource,
-    settings: ReplaySettings,
-    steps: int,
-    progress: ProgressCallback | None,
-    stop_requested: Callable[[], bool],
-    notes: list[str],
-) -> tuple[Model, BothEyes, int]:
-    """Train the model and add notes on its depth to `notes`.
+class Fitted(NamedTuple):
+    """Result of offline training."""
 
-    Returns:
-        The model, the eyes it was trained on, and the number of completed steps.
-    """
-    description = source.description
-    if description.digest is None or description.frame_count is None:
-        raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
-    learning = new_reconstructor(settings, source, offline=True)
-    done = 0
+    model: Model
+    eyes: BothEyes
+    """Eyes that were trained on."""
+    steps: ChosenSteps
 
-    def after_step(step: int, loss: Tensor) -> None:
-        nonlocal done
-        done = step
-        if progress is not None:
-            progress(Progress("train", step, steps, unit="steps"))
-        if stop_requested():
-            raise _StopFitting
 
-    frames = FirstFrames(source, description.frame_count)
-    # `fit` estimates depth that needs all frames at once.
-    choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
-    finder = DepthFinder(choice, description.camera, device=settings.device)
-    with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
+class _Fitting:
+    """Training of one model on the training frames of a source. Notes for the report are added to `notes`."""
+
+    def __init__(
+        self,
+        source: FrameSource,
+        settings: ReplaySettings,
+        progress: ProgressCallback | None,
+        stop_requested: Callable[[], bool],
+        notes: list[str],
+        clock: Clock,
+    ) -> None:
+        self._source, self._settings, self._progress = source, settings, progress
+        self._stop_requested, self._notes, self._clock = stop_requested, notes, clock
+        self._begin_s = clock()
+        self._learning = self._new()
+        self._eyes = self._learning.eyes
+        self._is_stopped = False
+
+    def done(self, steps: int | None) -> Fitted:
+        """Train with a number of steps; None chooses the number first."""
+        settings = self._settings
+        with seeded(settings.seed, settings.device):
+            given = self._learning.prepared(self._frames())
+            chosen = ChosenSteps(steps, (), "given") if steps is not None else self._chosen(given)
+            if not self._is_stopped:
+                self._learning = self._new()
+                self._train(given, chosen.steps, "train")
+        if chosen.reason != "given" and not self._is_stopped:
+            self._notes.append(chosen.sentence)
+        for doubt, count in sorted(self._learning.depth_doubts.items()):
+            self._notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
+        return Fitted(self._learning.snapshot(), self._eyes, chosen)
+
+    def _chosen(self, given: ToFit) -> ChosenSteps:
+        part, validation = split(given)
+        if len(validation) < LEAST_FRAMES:
+            return ChosenSteps(USUAL_STEPS, (), "few frames")
+
+        def train(steps: int) -> float:
+            if self._is_stopped:
+                return -math.inf  # ends the search
+            self._learning = self._new()
+            self._train(part, steps, "validate")
+            return validation_psnr_db(self._learning, validation)
+
+        return choose_steps(train, 60 * self._minutes, self._clock, self._clock() - self._begin_s)
+
+    @property
+    def _minutes(self) -> float:
+        settings = self._settings
+        if isinstance(settings, ReconstructSettings) and settings.minutes is not None:
+            return settings.minutes
+        return MINUTES_ON_CPU if settings.device == "cpu" else MINUTES_ON_GPU
+
+    def _new(self) -> Reconstructor:
+        return new_reconstructor(self._settings, self._source, offline=True)
+
+    def _frames(self) -> list[Frame]:
+        """Return the training frames with their depth."""
+        description, settings = self._source.description, self._settings
+        if description.digest is None or description.frame_count is None:
+            raise InvalidSetting(
+                f"{description.name} can be read only once; reconstruct needs a recording, or use replay"
+            )
+        # `fit` estimates depth that needs all frames at once.
+        choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
+        finder = DepthFinder(choice, description.camera, device=settings.device)
+        frames = FirstFrames(self._source, description.frame_count)
         chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
         if not chosen:
             raise NothingShown(
                 f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on, since they are damaged,"
                 " withheld or held out; give a recording with other frames"
             )
-        learning.fit(chosen, steps, after_step)
-    for doubt, count in sorted(learning.depth_doubts.items()):
-        notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
-    return learning.snapshot(), learning.eyes, done
+        return chosen
+
+    def _train(self, given: ToFit, steps: int, stage: str) -> None:
+        """Train the present reconstructor until its last step or a stop request."""
+        done = 0
+
+        def after_step(step: int, loss: Tensor) -> None:
+            nonlocal done
+            done = step
+            if self._progress is not None:
+                self._progress(Progress(stage, step, steps, unit="steps"))
+            if self._stop_requested():
+                raise _StopFitting
+
+        try:
+            self._learning.fit(given, steps, after_step)
+        except _StopFitting:
+            self._is_stopped = done < steps or stage != "train"
+        if self._is_stopped:
+            self._notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")

@@ -10,7 +10,9 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.evaluation.depth import DepthShare
+from gsplat_core.evaluation.scores import finite
 from gsplat_core.training.metrics import QualityTracker
+from gsplat_core.training.validation import ChosenSteps
 from operators.applications.session import RunOutcome
 from operators.checks import StageCounts
 from operators.display import LiveDisplayResult
@@ -45,6 +47,8 @@ from services.reports.schema import (
     RecordingFacts,
     RunFacts,
     RunReport,
+    TrainingSteps,
+    TrialFacts,
     TruthFacts,
 )
 from services.version import product_version
@@ -167,7 +171,7 @@ def _recording(description: SourceDescription) -> RecordingFacts:
 
 
 def _run(outcome: RunOutcome) -> RunFacts:
-    settings, eyes = outcome.settings, outcome.find(TrainedEyes)
+    settings, eyes, steps = outcome.settings, outcome.find(TrainedEyes), outcome.find(ChosenSteps)
     return RunFacts(
         device=settings.device,
         engine=settings.engine,
@@ -179,6 +183,7 @@ def _run(outcome: RunOutcome) -> RunFacts:
         field=settings.field,
         renderer=settings.renderer,
         steps_per_frame=settings.steps_per_frame,
+        training_steps=None if steps is None else _training_steps(steps),
         eyes="left" if eyes is None else eyes.eyes,
         scale=settings.scale,
         started_at=outcome.started_at.isoformat(timespec="seconds"),
@@ -187,6 +192,11 @@ def _run(outcome: RunOutcome) -> RunFacts:
         peak_memory_bytes=outcome.peak_memory_bytes,
         machine=machine_facts(),
     )
+
+
+def _training_steps(chosen: ChosenSteps) -> TrainingSteps:
+    trials = [TrialFacts(steps=one.steps, psnr_tissue_db=finite(one.psnr_db)) for one in chosen.trials]
+    return TrainingSteps(steps=chosen.steps, reason=chosen.reason, trials=trials)
 
 
 def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:

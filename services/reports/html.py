@@ -14,7 +14,7 @@ from urllib.parse import quote
 from operators.storage import write_whole
 from services.reports.charts import NARROW, Chart, Line
 from services.reports.pictures import HiddenPictures, KeyframePictures
-from services.reports.schema import DepthErrors, FrameEntry, LiveFacts, RunReport, TruthFacts
+from services.reports.schema import DepthErrors, FrameEntry, LiveFacts, RunFacts, RunReport, TruthFacts
 
 
 def _decibels(value: float | None) -> str:
@@ -324,6 +324,12 @@ def operators_section(report: RunReport) -> str:
     )
 
 
+def _steps(run: RunFacts) -> dict[str, str]:
+    if run.training_steps is not None:
+        return {"Training steps": f"{run.training_steps.steps} ({run.training_steps.reason})"}
+    return {"Steps per frame": "default" if run.steps_per_frame is None else str(run.steps_per_frame)}
+
+
 def facts_section(report: RunReport) -> str:
     """Return the facts about recording, settings, model and machine."""
     recording, run, model = report.recording, report.run, report.model
@@ -334,7 +340,7 @@ def facts_section(report: RunReport) -> str:
         "Threads": str(run.threads),
         "Seed": str(run.seed),
         "Field, renderer": f"{run.field}, {run.renderer}",
-        "Steps per frame": "default" if run.steps_per_frame is None else str(run.steps_per_frame),
+        **_steps(run),
         "Eyes trained on": run.eyes,
         "Peak memory": "–" if run.peak_memory_bytes is None else f"{run.peak_memory_bytes / 2**30:.2f} GiB",
         "Ended by": run.stop_reason,

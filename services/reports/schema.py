@@ -41,6 +41,23 @@ class RecordingFacts(Part):
     """SHA-256 over the recording's files."""
 
 
+class TrialFacts(Part):
+    """Training that was scored by frames kept from it."""
+
+    steps: Annotated[int, Field(ge=1)]
+    psnr_tissue_db: float | None
+
+
+class TrainingSteps(Part):
+    """Number of steps of an offline training."""
+
+    steps: Annotated[int, Field(ge=1)]
+    reason: str
+    """`given`, or the reason of the automatic choice: `best` of the trials, `limit` (the time limit ended the search),
+    `most` (the largest number tried) or `few frames`."""
+    trials: list[TrialFacts] = []
+
+
 class RunFacts(Part):
     """Settings and outcome of the run."""
 
@@ -56,6 +73,8 @@ class RunFacts(Part):
     """Name of the deformation field in use, never `auto`."""
     renderer: str = "alpha"
     steps_per_frame: int | None = None
+    training_steps: TrainingSteps | None = None
+    """Steps of an offline training; null for other runs."""
     eyes: Eyes = "left"
     """Pictures of a stereo endoscope used for training."""
     scale: float = 1.0

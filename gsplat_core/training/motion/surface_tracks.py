@@ -1,7 +1,9 @@
-"""Trajectories of Gaussians over a recording with depth in all frames, estimated before training.
+"""Trajectories of Gaussians over a recording, estimated before training.
 
-One eye's pictures hardly show motion along the line of sight, so the loss alone would leave each Gaussian near its
-initial distance. Optical flow tracks each surface point from frame to frame, and the depth is read at its position.
+Optical flow tracks each surface point from frame to frame. Frames with depth give the distance at its position, because
+one eye's pictures hardly show motion along the line of sight, and the loss alone would leave each Gaussian near its
+initial distance. Without depth the points move across the picture only. Training from static Gaussians would explain
+large motion by changing colours, which are wrong between the frames.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ ROWS_AT_ONCE = 1 << 14
 
 
 class SurfaceTracks:
-    """Trajectories of surface points through the frames of a recording, if depth and pictures show the motion."""
+    """Trajectories of surface points through the frames of a recording, if pictures show the motion."""
 
     def __init__(
         self,
@@ -55,7 +57,7 @@ class SurfaceTracks:
 
     def apply(self, step: TrainingStep, number: int, first_row: int) -> None:
         """Set the trajectories of the Gaussians from `first_row` on, which are on the surface shown by frame `number`.
-        Nothing changes if the field does not support it or the frames do not show the motion.
+        Nothing changes if the field does not support it or the pictures have no optical flow.
         """
         follow = step.capabilities.follow
         if follow is None or not self._show_motion:
@@ -69,7 +71,7 @@ class SurfaceTracks:
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
         """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by frame `number`."""
-        if self._at_rest:
+        if self._at_rest or not self._have_depth:
             return self._across(points, number)
         pixels = self._pixels(points, number)
         nothing = points.new_zeros(len(points))
@@ -96,13 +98,14 @@ class SurfaceTracks:
 
     @cached_property
     def _show_motion(self) -> bool:
-        """True if at least half of the frames have depth that shows motion, the camera is a
-        pinhole, and pictures are large enough for flow.
-        """
+        """True if the camera is a pinhole, and pictures are large enough for flow."""
         sizes = {frame.image.shape[:2] for frame in self._frames}
         pinhole = all(one.camera.model == "pinhole" for one in self._seen)
-        if not pinhole or len(self._frames) < 2 or len(sizes) > 1 or min(min(sizes)) < SMALLEST_PX:
-            return False
+        return pinhole and len(self._frames) > 1 and len(sizes) == 1 and min(min(sizes)) >= SMALLEST_PX
+
+    @cached_property
+    def _have_depth(self) -> bool:
+        """True if at least half of the frames have depth that shows motion."""
         return 2 * sum(depth is not None for depth in self._depths) >= len(self._frames)
 
     @cached_property

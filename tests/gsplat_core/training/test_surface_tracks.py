@@ -105,9 +105,12 @@ def covered(mask: np.ndarray) -> np.ndarray:
     ],
     ids=["none", "light", "learned", "not believed"],
 )
-def test_frames_that_do_not_tell_the_motion_of_a_surface_leave_the_field_alone(fixed, fields):
+def test_without_depth_of_a_surface_points_move_across_the_picture_only(fixed, fields):
     frames = [frame.with_fields(**fields) for frame in fixed]
-    assert not moves_before_the_first_step(fixed.camera, frames)
+    points = torch.tensor([[0.0, 0.0, 60.0], [10.0, -8.0, 60.0]])
+    moved = SurfaceTracks(frames, [Observation.of(frame, fixed.camera) for frame in frames]).trajectories(points, 0)
+    assert torch.equal(moved[..., 2], torch.full_like(moved[..., 2], 60.0))
+    assert moves_before_the_first_step(fixed.camera, frames)
 
 
 def test_one_frame_tells_no_motion(fixed):

@@ -1,0 +1,120 @@
+"""Choice of the number of offline training steps by frames that are kept from training.
+
+The training frames themselves are split. The frames of the held-out protocol are never read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.offline import ToFit
+from gsplat_core.training.reconstructor import Reconstructor
+
+VALIDATE_EVERY = 9
+"""One of this many training frames validates."""
+LEAST_FRAMES = 2
+"""Smallest number of validation frames from which steps are chosen."""
+FIRST_STEPS = 500
+"""Steps of the first trial. Each further trial has twice as many."""
+MOST_STEPS = 64_000
+"""Largest number of steps that is tried."""
+LEAST_GAIN_DB = 0.05
+"""Smallest gain of a trial, in dB, for which longer trainings are tried."""
+USUAL_STEPS = 2000
+"""Steps for recordings with too few frames to validate."""
+
+Clock = Callable[[], float]
+"""Returns a time in seconds."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training that was validated."""
+
+    steps: int
+    psnr_db: float
+    """Mean tissue PSNR of the validation frames, in dB."""
+
+
+@dataclass(frozen=True)
+class ChosenSteps:
+    """Number of steps for the training on all frames, with the trials that led to it."""
+
+    steps: int
+    trials: tuple[Trial, ...]
+    reason: str
+    """`best`, `limit` (the time limit ended the search), `most` (largest number tried) or `few frames`."""
+
+    @property
+    def sentence(self) -> str:
+        """Return the choice and its reason as a sentence for reports."""
+        tried = ", ".join(f"{one.steps} steps {one.psnr_db:.2f} dB" for one in self.trials)
+        reasons = {
+            "best": "longer training does not improve them",
+            "limit": "the time limit ended the search, so another machine may choose otherwise; --minutes raises it",
+            "most": f"{MOST_STEPS} steps are the most that are tried",
+        }
+        if self.reason == "few frames":
+            return f"{self.steps} training steps, the usual number: too few frames to keep some for validation"
+        found = f" (validation frames: {tried})" if tried else ""
+        return f"{self.steps} training steps were chosen{found}: {reasons[self.reason]}"
+
+
+def validating(count: int) -> list[int]:
+    """Return the indices of the frames that validate among `count` training frames; never the first or last one."""
+    return list(range(VALIDATE_EVERY // 2, count - 1, VALIDATE_EVERY))
+
+
+def split(given: ToFit) -> tuple[ToFit, list[Frame]]:
+    """Return the frames to train on, and the validation frames."""
+    apart = set(validating(len(given.frames)))
+    kept = [number for number in range(len(given.frames)) if number not in apart]
+    chosen = lambda items: [items[number] for number in kept]
+    return replace(given, frames=chosen(given.frames), seen=chosen(given.seen)), [
+        given.frames[n] for n in sorted(apart)
+    ]
+
+
+def validation_psnr_db(learned: Reconstructor, frames: Sequence[Frame]) -> float:
+    """Return the mean tissue PSNR of frames in dB."""
+    scores = [psnr_tissue_db(learned.picture(frame), frame.image, frame.mask) for frame in frames]
+    # A frame without tissue has no score.
+    return fmean([each for each in scores if math.isfinite(each)] or [0.0])
+
+
+def choose_steps(train: Callable[[int], float], limit_s: float, clock: Clock, spent_s: float = 0.0) -> ChosenSteps:
+    """Find the number of steps with the best validation score, by trials of doubling length.
+
+    The search leaves enough of the time limit for the training on all frames.
+
+    Args:
+        train: trains from the start with a number of steps and returns the validation PSNR in dB.
+        limit_s: time for the search and the training on all frames, in seconds.
+        clock: source of the time.
+        spent_s: part of the limit that is already spent, in seconds.
+    """
+    begin, trials, steps = clock() - spent_s, [], FIRST_STEPS
+    best: Trial | None = None
+    step_s = 0.0
+    while True:
+        left_s = limit_s - (clock() - begin)
+        # A trial is followed by a training of the same length on all frames.
+        if best is not None and 2 * steps * step_s > left_s:
+            longest = int(left_s / step_s) if step_s else steps
+            return ChosenSteps(max(1, min(steps, longest)), tuple(trials), "limit")
+        began = clock()
+        trial = Trial(steps, train(steps))
+        trials.append(trial)
+        step_s = (clock() - began) / steps
+        if best is not None and trial.psnr_db < best.psnr_db + LEAST_GAIN_DB:
+            chosen = trial if trial.psnr_db > best.psnr_db else best
+            return ChosenSteps(chosen.steps, tuple(trials), "best")
+        best = trial
+        if 2 * steps > MOST_STEPS:
+            return ChosenSteps(steps, tuple(trials), "most")
+        steps *= 2

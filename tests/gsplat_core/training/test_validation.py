@@ -1,0 +1,56 @@
+"""Choice of the number of offline training steps, with scores and a clock of the test."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsplat_core.training.validation import choose_steps, validating
+
+
+class Training:
+    """Trainings whose scores are given, at a fixed time per step."""
+
+    def __init__(self, scores, step_s=0.0):
+        self.scores, self.step_s, self.now_s, self.steps = scores, step_s, 0.0, []
+
+    def __call__(self, steps):
+        self.steps.append(steps)
+        self.now_s += steps * self.step_s
+        return self.scores[len(self.steps) - 1]
+
+    def clock(self):
+        return self.now_s
+
+
+def test_steps_double_until_validation_frames_stop_improving():
+    training = Training([30.0, 32.0, 33.0, 33.01, 40.0])
+    chosen = choose_steps(training, 60, training.clock)
+    assert training.steps == [500, 1000, 2000, 4000]
+    assert (chosen.steps, chosen.reason) == (4000, "best")
+    assert "4000 steps 33.01 dB" in chosen.sentence
+
+
+def test_a_worse_trial_is_not_chosen():
+    training = Training([30.0, 32.0, 31.0])
+    assert choose_steps(training, 60, training.clock).steps == 1000
+
+
+@pytest.mark.parametrize("limit_s", [20.0, 60.0, 300.0])
+def test_search_and_training_stay_within_the_time_limit(limit_s):
+    training = Training([30.0 + k for k in range(20)], step_s=0.01)
+    chosen = choose_steps(training, limit_s, training.clock)
+    assert chosen.reason == "limit" and "--minutes" in chosen.sentence
+    assert training.now_s + chosen.steps * training.step_s <= limit_s
+    assert chosen.steps >= training.steps[-1]
+
+
+def test_time_that_was_spent_before_counts():
+    training = Training([30.0 + k for k in range(20)], step_s=0.01)
+    late = choose_steps(training, 60, training.clock, spent_s=40.0)
+    assert training.now_s + 40 + late.steps * training.step_s <= 60
+
+
+def test_the_ends_of_a_recording_never_validate():
+    assert validating(5) == []
+    for count in range(6, 60):
+        assert min(validating(count)) > 0 and max(validating(count)) < count - 1

@@ -1,0 +1,39 @@
+"""Offline reconstruction with an automatic number of steps."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gsplat_core.training import validation
+from operators.applications.reconstruct import ReconstructSettings, reconstruct
+from services.reports.build import write_reports
+from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
+
+
+@pytest.fixture
+def settings(tmp_path):
+    import cv2
+
+    folder = tmp_path / "take"
+    folder.mkdir()
+    for number, frame in enumerate(video(24, SIDEWAYS)[0]):
+        cv2.imwrite(str(folder / f"{number:03}.png"), cv2.resize(frame.image[..., ::-1], (64, 48)))
+    return ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=(), minutes=1.0)
+
+
+def test_the_chosen_steps_and_their_reason_are_reported(settings, monkeypatch):
+    monkeypatch.setattr(validation, "FIRST_STEPS", 2)
+    monkeypatch.setattr(validation, "MOST_STEPS", 4)
+    reconstruct(settings, clock=lambda: 0.0, report=write_reports)
+    run = json.loads((settings.out / "report.json").read_text())["run"]["training_steps"]
+    assert [trial["steps"] for trial in run["trials"]] == [2, 4]
+    assert run["steps"] in (2, 4) and run["reason"] in ("best", "most")
+
+
+def test_the_time_limit_ends_the_search(settings, monkeypatch):
+    monkeypatch.setattr(validation, "FIRST_STEPS", 2)
+    seconds = iter(range(0, 10_000, 25))
+    outcome = reconstruct(settings, clock=lambda: float(next(seconds)))
+    assert any("the time limit ended the search" in note for note in outcome.notes)
