@@ -150,6 +150,8 @@ COARSE_WIDTH_PX = 200
 COARSE_RANGE = (-0.3, 0.5)
 """Searched disparities as shares of the width. The negative part is implausible and reveals swapped eyes."""
 CORNERS, CORNER_QUALITY, CORNER_APART_PX = 400, 0.01, 7
+FLOW_WINDOW_PX = 21
+"""Side of the window in which a point is followed to the other eye, in pixels."""
 SATURATED = 250
 """Grey value from which a pixel counts as saturated."""
 BACK_PX = 0.5
@@ -233,8 +235,9 @@ def _points_in_both(
     """Return points [N, 2] (x, y) of the left picture, the same points in the right picture, and
     the number of corners tried.
     """
-    shown = (left < SATURATED).astype(np.uint8) if usable is None else usable * (left < SATURATED)
-    shown = np.asarray(cv2.erode(shown, np.ones((7, 7), np.uint8)), np.uint8)
+    shown = np.asarray(cv2.erode((left < SATURATED).astype(np.uint8), np.ones((7, 7), np.uint8)), np.uint8)
+    if usable is not None:  # a border of the picture that the window contains has no disparity
+        shown *= cv2.erode(usable, np.ones((FLOW_WINDOW_PX, FLOW_WINDOW_PX), np.uint8))
     corners = cv2.goodFeaturesToTrack(_levelled(left), CORNERS, CORNER_QUALITY, CORNER_APART_PX, mask=shown)
     none = np.zeros((0, 2), np.float32)
     if corners is None:
@@ -242,7 +245,7 @@ def _points_in_both(
     start = np.ascontiguousarray(corners[:, 0], np.float32)
     guess = start.copy()
     guess[:, 0] -= _coarse_disparity(left, right, start)
-    found, misses_px = followed(left, right, start, guess, window_px=21, levels=2)
+    found, misses_px = followed(left, right, start, guess, window_px=FLOW_WINDOW_PX, levels=2)
     kept = misses_px < BACK_PX
     return start[kept], found[kept], len(start)
 
@@ -305,6 +308,10 @@ MATCHED_WIDTH_PX = 800
 """Width above which pictures are matched at an integer fraction of their size. Endoscopes blur by
 more than one of their pixels, and the fit is sub-pixel.
 """
+COMPANY_PX = 15
+"""Side of the window in which half of the pixels must be confident, in pixels of the matched pictures."""
+MATCH_WINDOW_PX = 15
+"""Side of the window that two pixels are compared in, in pixels of the matched pictures."""
 MARGIN_SHARE, MARGIN_PX = 0.2, 4
 """Margin of the search range around the observed disparities, as a share of their span and in pixels."""
 HALF_BELIEVED_PX = 0.5
@@ -437,11 +444,24 @@ class StereoDepth(Estimator):
             found = enlarged(smoothed(find_disparity(here, there, span), guide), frame.width_px, frame.height_px)
             shift = found.px - parallel_px
             known = found.known & (shift > LEAST_DISPARITY_PX)
+            if frame.loss_mask is not None:
+                known &= self._inside_both(frame.loss_mask, found.px, shrink)
             off_px = _off_along_rows(rows, frame.height_px, frame.width_px, self._device)
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
             depth = torch.where(known, reach_of(frame, camera) / torch.where(known, shift, 1), 0)
-            planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
+            confidence = torch.where(known, 1 / (1 + variance), 0)
+            planes = HostCopy(torch.stack([depth, confidence * _has_company(confidence, shrink)]))
         return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is scarce
+
+    def _inside_both(self, usable: NDArray[np.uint8], disparity_px: Tensor, shrink: int) -> Tensor:
+        """Return the pixels, bool [H, W], whose windows are inside of the field of view of both eyes.
+
+        The field is that of the left eye. The right one of a stereo scope has the same outline.
+        """
+        window = np.ones((shrink * MATCH_WINDOW_PX, shrink * MATCH_WINDOW_PX), np.uint8)
+        inside = tensor_of(np.asarray(cv2.erode(usable, window), np.uint8), self._device) > 0
+        columns = torch.arange(usable.shape[1], device=self._device) - disparity_px.round().long()
+        return inside & inside.gather(1, columns.clamp(0, usable.shape[1] - 1)) & (columns >= 0)
 
     def _on_own_stream(self) -> AbstractContextManager[object]:
         return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
@@ -546,6 +566,17 @@ def reach_of(frame: Frame, camera: Camera) -> float:
     """Return depth times disparity in millimetres times pixels; in baselines times pixels without a right camera."""
     baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
     return float(camera.K[0, 0] * baseline)
+
+
+def _has_company(confidence: Tensor, shrink: int) -> Tensor:
+    """Return the pixels, bool [H, W], around which at least half of the pixels are confident.
+
+    Wrong matches in occluded areas form islands between pixels that do not match.
+    """
+    side = 2 * (shrink * COMPANY_PX // 2) + 1
+    confident = (confidence >= BELIEVED).float()[None, None]
+    share = torch.nn.functional.avg_pool2d(confident, side, 1, side // 2, count_include_pad=False)
+    return share[0, 0] >= 0.5
 
 
 def _tensors_of(pictures: list[NDArray[np.uint8]], device: torch.device) -> list[Tensor]:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -210,7 +211,7 @@ def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) 
         )
         extras = replace(extras, scope_path=options.scope_path if options.scope_path == "seeded" else CLEAR.scope_path)
     else:
-        given = {
+        given: dict[str, Any] = {
             "smoke": options.smoke,
             "exposure_changes": options.exposure_changes,
             "breathing_ratio": options.breathing_ratio,

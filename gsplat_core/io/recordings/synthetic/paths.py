@@ -92,10 +92,9 @@ class ScopePath:
             periods[2], phases[2] = rng.uniform(8, 16), -np.pi / 2
         amplitudes = shares * scale * np.array([distance_mm] * 3 + [1.0] * 3)
         tremor = rng.uniform(0, 1) ** 2 * rng.uniform(0.3, 1, 6) * np.array([0.15] * 3 + [0.002] * 3)
-        six = lambda values: tuple(float(each) for each in values)
         return cls(
-            kind, six(amplitudes), six(periods), six(phases), followed, distance_mm,
-            six(tremor), six(rng.uniform(3, 9, 6)), six(rng.uniform(0, 2 * np.pi, 6)),
+            kind, _six(amplitudes), _six(periods), _six(phases), followed, distance_mm,
+            _six(tremor), _six(rng.uniform(3, 9, 6)), _six(rng.uniform(0, 2 * np.pi, 6)),
         )  # fmt: skip
 
     def pose(self, time_s: float) -> NDArray[np.float64]:
@@ -109,6 +108,11 @@ class ScopePath:
         turned = np.array([[cos(pan), 0, -sin(pan)], [0, 1, 0], [sin(pan), 0, cos(pan)]])
         tilted = np.array([[1, 0, 0], [0, cos(tilt), -sin(tilt)], [0, sin(tilt), cos(tilt)]])
         return rigid(tilted @ turned @ looking(towards, float(roll)), centre)
+
+
+def _six(values: NDArray[np.float64]) -> Six:
+    x, y, z, pan, tilt, roll = (float(each) for each in values)
+    return x, y, z, pan, tilt, roll
 
 
 def _wave(turns: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:

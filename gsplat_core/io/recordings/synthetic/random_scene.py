@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.synthetic.lamp import LampPlan
@@ -161,10 +162,15 @@ def draw_scene(
     )
 
 
+def _colour(values: NDArray[np.float64]) -> Colour:
+    red, green, blue = (float(each) for each in values)
+    return red, green, blue
+
+
 def _look(rng: Random, organ: str, distance_mm: float) -> TissueLook:
     """Draw colours near those of an organ, texture, roughness and highlight lobes."""
     tint = np.exp(rng.normal(0, 0.10, 3) + rng.normal(0, 0.12))
-    coloured = lambda colour: tuple(float(each) for each in np.clip(np.array(colour) * tint, 0.008, 0.93))
+    coloured = lambda colour: _colour(np.clip(np.array(colour) * tint, 0.008, 0.93))
     base, pale, deep, fat, fat_from, vessels = ORGANS[organ]
     gloss = float(np.sqrt(np.mean(base) / 0.30))  # pictures of dark tissue are exposed longer
     return TissueLook(
@@ -185,7 +191,7 @@ def _look(rng: Random, organ: str, distance_mm: float) -> TissueLook:
         glint_power=float(np.exp(rng.uniform(np.log(120), np.log(1500)))),
         sheen=gloss * float(rng.uniform(0.02, 0.30)),
         sheen_power=float(rng.uniform(12, 60)),
-        bleed=tuple(float(each) for each in rng.uniform(0.2, 1.2) * np.array([0.060, 0.014, 0.010]) * tint),
+        bleed=_colour(rng.uniform(0.2, 1.2) * np.array([0.060, 0.014, 0.010]) * tint),
         zoom=distance_mm / TISSUE_DISTANCE_MM * float(rng.uniform(0.55, 1.2)),
     )  # fmt: skip
 
@@ -246,7 +252,7 @@ def _tools(rng: Random, distance_mm: float) -> tuple[ToolPlan, ...]:
         grey = float(rng.uniform(0.14, 0.38))
         look = ToolLook(
             shaft=shaft,
-            ring=tuple(0.3 * each + 0.06 for each in shaft),  # type: ignore[arg-type]
+            ring=_colour(0.3 * np.array(shaft) + 0.06),
             steel=(grey, 1.01 * grey, 1.06 * grey),
             gloss=float(rng.uniform(20, 110)),
             glint=float(rng.uniform(0.8, 4.0)),
@@ -281,7 +287,7 @@ def _sensor(rng: Random, moving: bool, exposure: bool | None) -> tuple[Sensor, f
     )
     kind = int(rng.choice(3, p=[0.3, 0.35, 0.35])) if exposure is None else (int(rng.choice([1, 2])) if exposure else 0)
     changes = Exposure(
-        kind=("constant", "drift", "automatic")[kind],  # type: ignore[arg-type]
+        kind=("constant", "drift", "automatic")[kind],
         stops=(float(rng.uniform(0.05, 0.35)), float(rng.uniform(0.0, 0.15))),
         periods_s=(float(rng.uniform(2, 8)), float(rng.uniform(1, 3))),
         gain=float(rng.uniform(0.4, 1.0)) if moving else float(rng.uniform(0.2, 0.8)),

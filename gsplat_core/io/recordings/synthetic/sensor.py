@@ -150,5 +150,7 @@ class Sensor:
         if self.quality is not None:
             encoded, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.quality])
             assert encoded
-            image = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+            decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+            assert decoded is not None
+            image = np.ascontiguousarray(decoded[..., ::-1], np.uint8)
         return image
