@@ -62,7 +62,7 @@ class DepthCounts:
         return both
 
     def take(self, frame: Frame, given: Frame) -> None:
-        """Count one frame.
+        """Count the origin of one frame's depth.
 
         Args:
             frame: the frame as it arrived, with its recorded depth if any.

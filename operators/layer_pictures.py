@@ -54,7 +54,7 @@ class DepthColours:
         """
 
     def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
-        """Update the depth range.
+        """Adapt the range of displayed depths to a rendered picture.
 
         Args:
             depth: float32 [H, W], in the scene's unit.

@@ -68,7 +68,7 @@ class Names:
         return [*self.more, *(self.addresses.get(name, name) for name in self.registry)]
 
     def check(self, value: str) -> str:
-        """Return the value.
+        """Check a value given by the user, and return it unchanged.
 
         Raises:
             ValueError: for an unknown name, a missing address or a superfluous one. The message completes the sentence
@@ -370,7 +370,7 @@ class ServerFile:
     declared: Declared
 
     def check(self, value: str) -> str:
-        """Return the value.
+        """Check a value given by the user, and return it unchanged.
 
         Raises:
             ValueError: if the value names a file by a relative path, or a file that is not an existing `.onnx` file.

@@ -64,7 +64,7 @@ class Rasterizer:
     """
 
     def __init__(self, renderer: str, options: RendererOptions | None = None, outputs: Sequence[str] = ()) -> None:
-        """Select the renderer.
+        """Create the operator for one renderer.
 
         Args:
             renderer: name in `gsplat_core.rendering.registry.RENDERERS`.

@@ -128,7 +128,7 @@ class DeformNetwork(torch.nn.Module):
     """Network from features to changes of means, rotations and opacities. Its heads start at zero, the identity."""
 
     def __init__(self, feature_dim: int, hidden_dim: int = 64, num_layers: int = 3) -> None:
-        """Create the layers.
+        """Create the MLP's layers.
 
         Args:
             feature_dim: number of features, `HexPlaneField.feat_dim`.

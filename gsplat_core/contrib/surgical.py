@@ -175,7 +175,7 @@ class TwoStageScheduler:
     """Schedule of two stages: one frame first, then all frames in turn."""
 
     def __init__(self, coarse_steps: int, fine_steps: int, coarse_frame_index: int = 0) -> None:
-        """Store the schedule.
+        """Store the numbers of coarse and fine steps and the frame of the coarse steps.
 
         Args:
             coarse_steps: number of steps of the first stage.

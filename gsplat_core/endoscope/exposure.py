@@ -32,9 +32,9 @@ class Sample:
     """Reduced picture as log levels with validity."""
 
     logs: NDArray[np.float32]
-    """Log levels, [pixels, 3]."""
+    """Logarithms of the pixels' values, per colour channel [pixels, 3]."""
     valid: NDArray[np.bool_]
-    """Comparable values, [pixels, 3]."""
+    """True for tissue values that are neither too dark nor too bright to be compared, [pixels, 3]."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Reference:
 
 
 def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None) -> Sample:
-    """Reduce a picture.
+    """Sample a picture's values at a small resolution.
 
     Args:
         image: RGB uint8 [H, W, 3].

@@ -67,12 +67,12 @@ class OrdinaryPictures:
         self.reset()
 
     def reset(self) -> None:
-        """Reset for another stream."""
+        """Discard the previous picture, the reference and the usual values, at the start of a stream."""
         self._before: NDArray[np.uint8] | None = None
         self._shape: tuple[int, ...] = ()
         self._usual = np.zeros(BANDS)
         self._reference: tuple[NDArray[np.float64], float] | None = None
-        """Reference mean colour and sharpness."""
+        """Mean colour and sharpness of the reference picture."""
         self._referenced_ns = 0
         self._last_ns: int | None = None
         self._interval_ns = 0.0

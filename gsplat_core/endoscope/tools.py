@@ -227,7 +227,7 @@ RED_OVER_OTHERS = np.array([[1, -0.25, -0.25, -0.5]], np.float32)
 
 @dataclass(frozen=True)
 class View:
-    """Frame at working size."""
+    """Frame reduced to the size at which tools are found."""
 
     redness: Plane
     """Log of red over green and blue, [h, w]."""
@@ -251,7 +251,7 @@ class ToolFinder:
         self.reset()
 
     def reset(self) -> None:
-        """Reset for another stream."""
+        """Discard the previous masks and the brightness histogram, at the start of a stream."""
         self._histogram: NDArray[np.float64] | None = None
         self._stretch = 1.0
         self._previous: Bytes | None = None

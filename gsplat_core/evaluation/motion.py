@@ -157,7 +157,7 @@ class FollowedPoints:
         self._pixels, self._still = TrackSums(), TrackSums()
 
     def add(self, frame: Frame, own: Camera, shown: NDArray[Any]) -> None:
-        """Process the next frame.
+        """Follow the points to the next frame, and record their errors.
 
         Args:
             frame: frame of the recording.

@@ -306,13 +306,13 @@ class _Places:
     """Blocks of the normal equations for eliminating the rest positions."""
 
     inverse: Tensor
-    """Inverse blocks of the rest positions, [P, 3, 3]."""
+    """Inverses of the diagonal blocks of the rest positions, [P, 3, 3]."""
     slope: Tensor
-    """Gradients of the rest positions, [P, 3]."""
+    """Gradients of the cost by the rest positions, [P, 3]."""
     by_camera: Tensor
-    """Coupling to cameras, [C, P, 6, 3]."""
+    """Hessian blocks of camera poses and rest positions, [C, P, 6, 3]."""
     by_amplitude: Tensor
-    """Coupling to motion vectors, [P, 3, 3 B]."""
+    """Hessian blocks of rest positions and motion amplitudes, [P, 3, 3 B]."""
 
 
 def _step(bundle: MovingBundle, spread: float, damping: float, prior: TrajectoryPrior | None) -> MovingBundle:

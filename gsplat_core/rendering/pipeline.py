@@ -557,7 +557,7 @@ class Stepped(NamedTuple):
     """Colours and depth [..., C, H, W, X]."""
     splats: RenderedSplats
     extra: Tensor | None
-    """Blended `extra_signals`."""
+    """Images of `extra_signals`, blended like colours."""
     normals: Tensor | None
 
 

@@ -221,7 +221,7 @@ class FinishedFrame:
     _outputs: Mapping[str, Tensor]
 
     def outputs(self) -> Mapping[str, Tensor]:
-        """Outputs of the frame."""
+        """Return the rendered images of the frame by output name."""
         return self._outputs
 
     def result(self) -> RenderOutput:

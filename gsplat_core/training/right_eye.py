@@ -49,7 +49,7 @@ NOISE_LEVELS = 1.5
 
 
 class EyeColours:
-    """Colour matching of one stream."""
+    """Conversion of one stream's right pictures to the colours of its left ones."""
 
     def __init__(self) -> None:
         self._gain, self._offset = np.ones(3), np.zeros(3)
@@ -201,7 +201,7 @@ class BothEyes:
         self.forget()
 
     def forget(self) -> None:
-        """Reset for another stream."""
+        """Discard the colour matching of the right eye, at the start of a stream."""
         self._colours = EyeColours()
 
     def observation(self, frame: Frame, camera: Camera, *, trains: bool = True) -> Observation:

@@ -62,7 +62,7 @@ class Seen:
     now: Gaussians
     """Scene at the frame's time."""
     pixels: Tensor
-    """Projected centres, [N, 2]."""
+    """Pixel positions of the Gaussians' centres, [N, 2]."""
     inside: Tensor
     """Marks of centres in the picture, bool [N]."""
     shown: Tensor
@@ -213,7 +213,7 @@ class PostponedGrowth:
         self._upkeep = None if self._config.history_s is None else Upkeep(camera, self._config)
 
     def forget(self) -> None:
-        """Leave the scene."""
+        """Discard the previous camera when the stream leaves the scene."""
         self._camera_before = None
 
     def prepare(self, step: TrainingStep, frame: Frame, observation: Observation, motion: Following) -> None:

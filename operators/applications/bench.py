@@ -31,7 +31,7 @@ VIDEO_FPS = 30.0
 
 @dataclass(frozen=True)
 class BenchSettings:
-    """Settings of a measurement.
+    """Settings of a measurement of rendering speed.
 
     Raises:
         InvalidSetting: if a value is out of range.

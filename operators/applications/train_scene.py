@@ -35,7 +35,7 @@ MOST_STEPS = 10**7
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of a training.
+    """Settings of the training of a static scene.
 
     Raises:
         InvalidSetting: if a value is out of range.
@@ -76,13 +76,13 @@ class TrainSettings:
 
     @property
     def config(self) -> StaticConfig:
-        """Options of the trainer."""
+        """These settings as options of the trainer."""
         return StaticConfig(self.steps, self.strategy, self.max_gaussians, self.absgrad, self.sh_degree)
 
 
 @dataclass(frozen=True)
 class SceneTraining:
-    """Result of a training."""
+    """Result of the training of a static scene."""
 
     steps: int
     """Steps taken; fewer than requested if interrupted."""

@@ -10,13 +10,13 @@ class Clock(Protocol):
     """Time since the start of the run."""
 
     def timestamp(self) -> int:
-        """Return the time in nanoseconds."""
+        """Return the nanoseconds since the start of the run."""
 
     def time(self) -> float:
-        """Return the time in seconds."""
+        """Return the seconds since the start of the run."""
 
     def reset(self) -> None:
-        """Restart at 0."""
+        """Set the time to 0, at the start of a run."""
 
 
 class RealtimeClock:
@@ -34,7 +34,7 @@ class RealtimeClock:
         return self.timestamp() * 1e-9
 
     def reset(self) -> None:
-        """Restart at 0."""
+        """Set the time to 0, at the start of a run."""
         self._origin_ns = time.monotonic_ns()
 
 
@@ -56,7 +56,7 @@ class ManualClock:
         return self._now_ns * 1e-9
 
     def reset(self) -> None:
-        """Restart at 0."""
+        """Set the time to 0, at the start of a run."""
         self._now_ns = 0
 
     def advance_to(self, target_ns: int) -> None:

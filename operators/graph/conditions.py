@@ -68,7 +68,7 @@ class CountCondition(Condition):
         return _READY if self.count > 0 else _NEVER
 
     def on_execute(self, timestamp: int) -> None:
-        """Decrease the remaining count."""
+        """Count a compute as done."""
         self.count -= 1
 
 
@@ -219,7 +219,7 @@ class MessageOrTimeoutCondition(Condition):
         return SchedulingStatus.WAIT_TIME, self._due_ns
 
     def on_execute(self, timestamp: int) -> None:
-        """Restart the timeout."""
+        """Set the next timeout to `timeout_ns` after this compute."""
         self._due_ns = timestamp + self.timeout_ns
 
 

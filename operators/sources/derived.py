@@ -24,7 +24,7 @@ class DerivedSource:
     """`FrameSource` that changes each frame of another source. A subclass implements `_derived`."""
 
     def __init__(self, source: FrameSource, description: SourceDescription) -> None:
-        """Wrap a source.
+        """Create a source with the frames of `source` and another description.
 
         Args:
             source: opened and closed together with this one.
@@ -74,7 +74,7 @@ class ScaledSource(DerivedSource):
     """`FrameSource` that resizes the frames of another source."""
 
     def __init__(self, source: FrameSource, scale: float) -> None:
-        """Wrap a source.
+        """Create a source with the frames of `source`, resized.
 
         Args:
             source: opened and closed together with this one.
@@ -168,7 +168,7 @@ class JoinedSource(LiveSource):
     def __init__(
         self, left: FrameSource, right: FrameSource, *, waiting: int = 2, apart_s: float | None = None
     ) -> None:
-        """Join two sources.
+        """Create a source of stereo frames from a source per eye.
 
         Args:
             left: source of the left eye.

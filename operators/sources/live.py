@@ -187,7 +187,7 @@ class LiveSource(ThreadedSource):
         drops: bool = True,
         order: FrameOrder | None = None,
     ) -> None:
-        """Set the queue's parameters.
+        """Set the sizes of the queues of frames, and how lost frames are counted.
 
         Args:
             waiting: capacity of the queue for `read`, in frames.
@@ -387,7 +387,7 @@ class StreamSource(LiveSource):
         camera: Camera | None = None,
         fields: frozenset[str] = frozenset(),
     ) -> None:
-        """Set `description`.
+        """Describe the source and its frames.
 
         Args:
             name: name of the source for the user.

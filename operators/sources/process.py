@@ -142,12 +142,12 @@ MOST_BYTES = 1 << 20
 
 
 def message(kind: str, **content: Any) -> bytes:
-    """Encode a control message."""
+    """Encode a message between the source's process and its parent, as JSON."""
     return json.dumps({"kind": kind, **content}).encode()
 
 
 def parsed(data: bytes) -> dict[str, Any]:
-    """Decode a control message. Raises InvalidMessage."""
+    """Decode a message between the source's process and its parent. Raises InvalidMessage."""
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -357,7 +357,7 @@ class ChildProcess:
             self.connection.send_bytes(message(kind, **content))
 
     def receive(self, timeout_s: float) -> dict[str, Any] | None:
-        """Receive the next message.
+        """Wait for the next message of the child process.
 
         Args:
             timeout_s: maximum waiting time in seconds.
@@ -484,7 +484,7 @@ class ProcessSource(LiveSource):
 
     @property
     def state_sentence(self) -> str:
-        """See `ReportingSource`. A reason reported by the child process takes precedence."""
+        """Reason for the state, as a sentence: the child process's own if it reported one, else the usual one."""
         reported, state = self._child_state, self.state
         if reported is not None and state is reported[0] and reported[1]:
             return reported[1]

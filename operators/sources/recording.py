@@ -36,7 +36,7 @@ class RealtimeSource(LiveSource):
     """
 
     def __init__(self, recording: Recording, options: SourceOptions | None = None) -> None:
-        """Describe the playback.
+        """Create the source for a recording, and describe its frames.
 
         Args:
             recording: the recording.
@@ -198,7 +198,7 @@ class SessionSource(ThreadedSource):
     """Reads a session's prepared frames once, in order, as fast as they are consumed."""
 
     def __init__(self, reader: SessionReader, recording: Recording, *, max_frames: int | None = None) -> None:
-        """Describe the source.
+        """Create the source for a recorded session, and describe its frames.
 
         Args:
             reader: reader of the session.

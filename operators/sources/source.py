@@ -178,7 +178,7 @@ class ThreadedSource:
     """Maximum waiting time of `close` for a reader that blocks in a library, in seconds."""
 
     def __init__(self, *, ahead: int = 2, stalled_after_s: float = math.inf) -> None:
-        """Set the queue's parameters.
+        """Set the size of the queue of frames and the time after which the source counts as stalled.
 
         Args:
             ahead: capacity of the queue for `read`, in frames.

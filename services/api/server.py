@@ -79,7 +79,7 @@ class AddressBound:
         on_refused: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Set the limit.
+        """Set the largest number of connections per address.
 
         Args:
             most: connections allowed per address; 0 means no limit.
@@ -95,7 +95,7 @@ class AddressBound:
         self._said_s: float | None = None
 
     def enter(self, address: str) -> str | None:
-        """Count a new connection.
+        """Count a new connection of an address.
 
         Returns:
             The key to pass to `leave`, or None if the address is at its limit.

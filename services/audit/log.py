@@ -85,7 +85,7 @@ class AuditLog:
         self, event: str, *, actor: str, role: str = "", subject: str = "", outcome: Outcome = "done",
         request_id: str = "", detail: Detail | None = None,
     ) -> Entry:  # fmt: skip
-        """Write an entry.
+        """Append an entry to the audit log.
 
         Raises:
             AuditUnwritable: if the entry cannot be written to the disk.

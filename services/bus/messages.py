@@ -25,7 +25,7 @@ MOST_BYTES = 1 << 16
 
 
 def packed_json(content: Mapping[str, Any]) -> bytes:
-    """Encode an object.
+    """Encode a JSON object for a message.
 
     Raises:
         BadMessage: if it is too large or not representable in JSON.
@@ -40,7 +40,7 @@ def packed_json(content: Mapping[str, Any]) -> bytes:
 
 
 def parsed_json(data: bytes | memoryview) -> dict[str, Any]:
-    """Decode an object.
+    """Decode a message's JSON object.
 
     Raises:
         BadMessage: if the data is too large or is no JSON object.
@@ -170,7 +170,7 @@ def _refusal(why: str) -> bytes:
 
 
 def text_of(arguments: Mapping[str, Any], name: str) -> str:
-    """Return a text argument.
+    """Return a command's text argument.
 
     Raises:
         BadMessage: if the argument is missing, empty or no text.
@@ -195,7 +195,7 @@ class Durations:
         self._sum_s = 0.0
 
     def add(self, duration_s: float) -> None:
-        """Count one duration."""
+        """Add one duration to the histogram."""
         self._counts[bisect_left(BOUNDS_S, duration_s)] += 1
         self._sum_s += duration_s
 

@@ -60,7 +60,7 @@ class EncodedPicture:
 
 
 def check_quality(quality: int) -> int:
-    """Check a JPEG quality.
+    """Return a JPEG quality if it is in range.
 
     Raises:
         InvalidSetting: if it is out of range.
@@ -197,7 +197,7 @@ class DisplayHub:
         return {} if channel is None else channel.ages.as_json()
 
     async def close(self) -> None:
-        """Disconnect all viewers."""
+        """Disconnect all viewers and stop the encoders."""
         for channel in self._channels.values():
             await channel.close()
         self._encoders.shutdown(wait=False)

@@ -191,7 +191,7 @@ class ExportCache:
         return found
 
     def close(self) -> None:
-        """Abort running exports."""
+        """Kill the running export programs."""
         self._programs.end()
 
     @contextlib.contextmanager

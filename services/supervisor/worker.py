@@ -266,7 +266,7 @@ class Parent:
     """
 
     def __init__(self, identity: ProcessIdentity | None, patience_s: float) -> None:
-        """Watch a process.
+        """Start to watch the supervisor's process.
 
         Args:
             identity: the supervisor; None for a process that is run by hand.
@@ -310,7 +310,7 @@ class Worker:
     """
 
     def __init__(self, folder: StreamFolder, spec: ProcessSpec, handlers: Mapping[str, Handler] | None = None) -> None:
-        """Prepare the runtime.
+        """Prepare the runtime of a stream's process.
 
         Args:
             folder: runtime folder of the stream.

@@ -72,7 +72,7 @@ class Contents:
     """Mask uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue."""
     depth: DepthFiles | None = None
     labels: LabelFiles | None = None
-    """Classes of some frames."""
+    """Files with a class for each pixel of some frames."""
     scans: ScanFiles | None = None
     """Scans of a range sensor at some frames."""
     tool_share: float | None = None
@@ -82,7 +82,7 @@ class Contents:
     undistortion: Undistortion | None = None
     """Maps of a distorted lens; `calibration` is then that of the camera without distortion."""
     other_files: tuple[Path, ...] = ()
-    """Calibration and description files."""
+    """Further files of the recording, with its calibration and description."""
 
     @property
     def fields(self) -> frozenset[str]:

@@ -239,7 +239,7 @@ MOST_POINTS = 4096
 
 @dataclass(frozen=True)
 class Tracks:
-    """Trajectories of tissue points."""
+    """True positions of tracked tissue points in each frame."""
 
     points: NDArray[np.float64]
     """Positions of the points in the recording's world, [frames, points, 3]."""

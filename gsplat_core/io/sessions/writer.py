@@ -78,7 +78,7 @@ class Retention:
         return sum(part.bytes for part in self._parts if part.segment is not None)
 
     def add(self, part: KeptPart) -> None:
-        """Add the newest part."""
+        """Add the newest part of a recorded session."""
         self._parts.append(part)
 
     def give_up(self, now_ns: int) -> Iterator[tuple[KeptPart, str | None]]:
@@ -230,7 +230,7 @@ class SessionWriter:
         return self._kept.segment_bytes + self._segment.bytes
 
     def frame(self, frame: Frame) -> None:
-        """Record a received frame."""
+        """Write a received frame to the session."""
         self._go_on()
         tracks = self._pictures("", arrays_of(frame, _PLANES), frame.pts_ns)
         self._segment.line(FrameLine(**_said(frame), tracks=tracks))
@@ -271,7 +271,7 @@ class SessionWriter:
         )
 
     def shown(self, shown: Shown) -> None:
-        """Record a displayed picture."""
+        """Write a displayed picture to the session."""
         self._go_on()
         frame, rendered = shown.frame, np.ascontiguousarray(shown.rendered)
         tracks: dict[TrackName, int] = {}

@@ -31,7 +31,7 @@ struct Kernels {
   int64_t (*step)(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step);
 };
 
-// CUDA version; adds the number of skipped rows to `skipped`. All pointers are device memory.
+// Adam steps on CUDA. All pointers are device memory; the number of skipped rows is added to `skipped`.
 void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
                     cudaStream_t stream);
 void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamAt& at, int64_t* skipped,

@@ -59,7 +59,7 @@ struct Kernels {
   void (*add_colours)(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end);
 };
 
-// CUDA versions of the structs above; all pointers, including the scalars, are device memory.
+// Arguments of the CUDA kernels: the structs above, with pointers to device memory also for the scalars.
 struct DeviceBumps {
   const float *centers, *log_widths, *weights;
   const float* tau;  // [1]

@@ -101,7 +101,7 @@ struct Kernels {
                  const InputGradients& out);
 };
 
-// CUDA versions of the two passes; all pointers are device memory.
+// Alpha compositing on CUDA, forward and backward; all pointers are device memory.
 void composite_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream);
 void composite_backward_on_device(const Inputs& in, const PictureGradient& from, const InputGradients& out, CudaScratch& scratch,
                                   cudaStream_t stream);

@@ -18,7 +18,7 @@ struct Kernels {
                    float* v_quats, float* v_scales, int64_t begin, int64_t end);
 };
 
-// CUDA versions for all rows, in device memory.
+// Covariances of all rows and their gradients on CUDA; all pointers are device memory.
 void covariance_forward(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t count,
                         cudaStream_t stream);
 void covariance_backward(const float* quats, const float* scales, const float* v_covars, const float* v_precis, bool triu,

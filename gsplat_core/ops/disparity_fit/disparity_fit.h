@@ -58,7 +58,7 @@ struct Kernels {
   void (*move)(const Fit& fit, const Planes& planes, bool last, int64_t begin, int64_t end, float* scratch);
 };
 
-// CUDA version; all pointers are device memory.
+// Refine disparities on CUDA; all pointers are device memory.
 void fit_on_device(const Fit& fit, CudaScratch& scratch, cudaStream_t stream);
 
 }  // namespace gsplat::disparity_fit

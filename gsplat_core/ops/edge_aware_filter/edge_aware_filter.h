@@ -41,7 +41,8 @@ struct Kernels {
   int lanes;
 };
 
-// CUDA versions; all pointers are device memory. planes: [count, height, width].
+// Edge-aware filter on CUDA: weights between neighbours, then smoothing of planes [count, height, width]. All pointers
+// are device memory.
 void link_on_device(const Guide& guide, float* right, float* down, cudaStream_t stream);
 void smooth_on_device(const Lines& lines, int64_t planes, int64_t plane_size, cudaStream_t stream);
 

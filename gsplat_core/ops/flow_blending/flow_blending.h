@@ -47,7 +47,7 @@ struct Kernels {
   void (*tile_backward)(const Splats& splats, int64_t tile, const float* v_out, const GradientRows& rows);
 };
 
-// CUDA versions of the two passes; all pointers are device memory.
+// Blending of flow on CUDA, forward and backward; all pointers are device memory.
 void blend_on_device(const Inputs& in, float* out, CudaScratch& scratch, cudaStream_t stream);
 void blend_backward_on_device(const Inputs& in, const float* v_out, float* v_planes, CudaScratch& scratch, cudaStream_t stream);
 

@@ -76,8 +76,8 @@ struct Kernels {
   void (*decode)(const Decode& d, float* buffer, int64_t begin, int64_t end);
 };
 
-// CUDA versions; all pointers are device memory. plane_product computes the product of the planes first..last-1 at each
-// point: [N, C].
+// HexPlane features on CUDA; all pointers are device memory. plane_product computes the product of the planes
+// first..last-1 at each point: [N, C].
 void plane_product(const HexPlanes& level, int first, int last, float* features, int64_t count, cudaStream_t stream);
 // features = space times the three lines (given as planes of height 1) at the point's x, y, z.
 void modulate_lines(const HexPlanes& level, const float* space, float* features, int64_t count, cudaStream_t stream);

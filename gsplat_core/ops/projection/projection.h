@@ -81,7 +81,7 @@ struct Kernels {
                    int64_t end);
 };
 
-// CUDA versions for all Gaussians and cameras; all pointers are device memory.
+// Projection of all Gaussians to all cameras on CUDA; all pointers are device memory.
 void project_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutput& out, cudaStream_t stream);
 // `to.viewmat` is null or has memory for 12 sums of each of camera_sums(size) blocks. The sums are added to
 // `v_viewmats` [B, C, 4, 4], which must be zeroed. Sums over Gaussians and cameras are taken in a fixed order.

@@ -39,7 +39,7 @@ struct Kernels {
   void (*tile_backward)(const Inputs& in, const float* gradient, int64_t tile, float* rows);
 };
 
-// CUDA versions of the two passes; all pointers are device memory.
+// Range histogram on CUDA, forward and backward; all pointers are device memory.
 void histogram_on_device(const Inputs& in, float* out, CudaScratch& scratch, cudaStream_t stream);
 void histogram_backward_on_device(const Inputs& in, const float* gradient, const InputGradients& out, CudaScratch& scratch,
                                   cudaStream_t stream);

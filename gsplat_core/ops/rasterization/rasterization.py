@@ -34,7 +34,7 @@ class Options(NamedTuple):
     width: int
     height: int
     camera_model: int
-    """Index into CAMERA_MODELS."""
+    """Index of the camera model in CAMERA_MODELS."""
     degree: int
     """Degree of the spherical harmonics, 0 to 4; PLAIN_COLORS for colours without harmonics."""
     channels: int

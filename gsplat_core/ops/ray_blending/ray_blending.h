@@ -73,7 +73,7 @@ struct Kernels {
   void (*contributions)(const compositing::Splats& splats, int64_t tile, float* most);
 };
 
-// CUDA versions of the passes; all pointers are device memory.
+// Blending along rays, and its gradients, on CUDA; all pointers are device memory.
 void blend_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream);
 void contributions_on_device(const compositing::Inputs& in, float* most, CudaScratch& scratch, cudaStream_t stream);
 void blend_backward_on_device(const Inputs& in, const PixelGradients& from, const InputGradients& out, CudaScratch& scratch,

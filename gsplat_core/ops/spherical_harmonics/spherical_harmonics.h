@@ -28,8 +28,8 @@ struct Kernels {
                    int64_t begin, int64_t end);
 };
 
-// CUDA versions for `rows` rows of `sets` directions; the rows share the coefficients of their sets. All pointers are
-// device memory.
+// Colours from spherical harmonics on CUDA, for `rows` rows of `sets` directions; the rows share the coefficients of
+// their sets. All pointers are device memory.
 void harmonics_forward(const SphericalHarmonicsInput& in, int64_t rows, int64_t sets, float* colors, cudaStream_t stream);
 // Compute the gradients of directions and coefficients. `v_dirs` may be null. `v_coeffs` is overwritten completely with
 // the sum over the rows in order.

@@ -32,7 +32,7 @@ struct Kernels {
   void (*backward)(const Inputs& in, const Gradients& gradients, int64_t begin, int64_t end);
 };
 
-// CUDA versions for all rows, in device memory.
+// Ray coefficients and normals of all splats, and their gradients, on CUDA; all pointers are device memory.
 void forward_on_device(const Inputs& in, float* rays, float* normals, cudaStream_t stream);
 void backward_on_device(const Inputs& in, const Gradients& gradients, cudaStream_t stream);
 

@@ -33,7 +33,7 @@ class SplatRays(NamedTuple):
     """
 
     rays: Tensor
-    """Ray coefficients [N, 10]."""
+    """Coefficients of each Gaussian's depth and falloff along rays, [N, 10]; see `RAY_NUMBERS`."""
     normals: Tensor
     """Shortest principal axes [N, 3] in camera axes, towards the camera; constant with respect to scales and means."""
 

@@ -60,7 +60,7 @@ struct Kernels {
                    float* lanes, double* sums);
 };
 
-// CUDA versions of the two passes; all pointers are device memory.
+// Splat regression on CUDA, forward and backward; all pointers are device memory.
 void regress_on_device(const Inputs& in, float* out, CudaScratch& scratch, cudaStream_t stream);
 void regress_backward_on_device(const Inputs& in, const float* gradient, const Gradients& out, CudaScratch& scratch,
                                 cudaStream_t stream);

@@ -48,8 +48,8 @@ struct Kernels {
 // Fill in the taps, and run all strips and rows on torch's threads.
 void run_ssim(SsimTask& task);
 
-// CUDA version; all pointers are device memory. Pixels of `image` and `gradient` are `stride` floats apart; the first
-// `channels` floats are compared.
+// Arguments of SSIM on CUDA; all pointers are device memory. Pixels of `image` and `gradient` are `stride` floats
+// apart; the first `channels` floats are compared.
 struct DeviceSsim {
   const float* image;
   const float* target;          // [H, W, C]; null if target_bytes is set

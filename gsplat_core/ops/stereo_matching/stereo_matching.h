@@ -65,7 +65,7 @@ struct Kernels {
   void (*surfaces)(const Pair& pair, const Matched& matched, int64_t begin, int64_t end, int32_t* scratch);
 };
 
-// CUDA version; all pointers are device memory.
+// Stereo matching on CUDA; all pointers are device memory.
 void match_on_device(const Pair& pair, const Matched& matched, CudaScratch& scratch, cudaStream_t stream);
 
 }  // namespace gsplat::stereo_matching

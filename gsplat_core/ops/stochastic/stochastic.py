@@ -65,7 +65,7 @@ class SplatScene(NamedTuple):
 
     @property
     def splat_count(self) -> int:
-        """Number of rows."""
+        """Number of splats."""
         first = self.means if self.packed is None else self.packed
         return 0 if first is None else int(first.shape[0])
 
@@ -80,9 +80,9 @@ class SampleOptions(NamedTuple):
     width: int
     height: int
     camera_model: int
-    """Index into CAMERA_MODELS."""
+    """Index of the camera model in CAMERA_MODELS."""
     method: int
-    """Index into METHODS."""
+    """Index of the sampling method in METHODS."""
     pixel_order: int
     """1 to order fragments by the depth of the splat's plane, 0 by that of its centre."""
     first_sample: int
@@ -171,7 +171,7 @@ class SampledPicture(NamedTuple):
     """Mean picture of random samples."""
 
     image: Tensor
-    """Colours [H, W, 3]."""
+    """Mean colours [H, W, 3]."""
     alpha: Tensor
     """Share of samples with a splat [H, W]."""
     depth: Tensor

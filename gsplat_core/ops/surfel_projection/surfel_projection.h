@@ -66,7 +66,7 @@ GSPLAT_HOST_DEVICE Inputs of_camera(Inputs in, const Size& size, int64_t batch, 
   return in;
 }
 
-// CUDA versions; all pointers are device memory. `to.viewmat` has room for `camera_sums` blocks.
+// Projection of surfels on CUDA; all pointers are device memory. `to.viewmat` has room for `camera_sums` blocks.
 int64_t camera_sums(const Size& size);
 void project_on_device(const Inputs& in, const Size& size, const Outputs& out, cudaStream_t stream);
 void project_backward_on_device(const Inputs& in, const Size& size, const OutputGradients& from, const InputGradients& to,

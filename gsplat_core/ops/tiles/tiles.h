@@ -42,7 +42,7 @@ struct Kernels {
   void (*emit_one)(const SplatBoxes& in, const TileSpan& span, int64_t splat, int64_t at, int32_t* flatten_ids, int64_t* keys);
 };
 
-// CUDA versions; all pointers are device memory. Visible splats are first sorted by depth (32 bits, one item per
+// Tile lists on CUDA; all pointers are device memory. Visible splats are first sorted by depth (32 bits, one item per
 // splat). Then their tiles are written in that order and sorted by tile only (as few bits as the number of tiles
 // requires). Radix sorts are stable, so ties in depth stay in splat order.
 

@@ -74,7 +74,7 @@ struct Kernels {
   void (*backward)(const Inputs& in, const Gradients& gradients, int64_t batch, int64_t begin, int64_t end);
 };
 
-// CUDA versions for all Gaussians and cameras, in device memory.
+// Unscented projection of all Gaussians to all cameras on CUDA; all pointers are device memory.
 void project_on_device(const Inputs& in, const Outputs& out, cudaStream_t stream);
 void project_backward_on_device(const Inputs& in, const Gradients& gradients, cudaStream_t stream);
 

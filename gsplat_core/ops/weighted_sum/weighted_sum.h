@@ -60,7 +60,7 @@ struct Kernels {
                    const InputGradients& out);
 };
 
-// CUDA versions of the two passes; all pointers are device memory.
+// Weighted sums on CUDA, forward and backward; all pointers are device memory.
 void weighted_sums_on_device(const Inputs& in, float* sums, cudaStream_t stream);
 void weighted_sums_backward_on_device(const Inputs& in, const float* v_sums, const InputGradients& out, cudaStream_t stream);
 

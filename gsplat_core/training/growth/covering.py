@@ -198,7 +198,7 @@ class Covering:
         self._under_way: list[Future[Gaussians | None]] = []
 
     def begin(self, camera: Camera | None, device: torch.device, rows: int) -> None:
-        """Start another scene.
+        """Prepare for a new scene, cancelling the creation of Gaussians for the previous one.
 
         Args:
             camera: camera for a captured coverage test on a GPU, or None for no such test.

@@ -53,7 +53,7 @@ class OutOfView:
         """Cached result of `unseen_s` since the last test."""
 
     def restart(self) -> None:
-        """Reset for another scene."""
+        """Empty the archive and forget when Gaussians were visible, for a new scene."""
         self.last_seen.restart()
         self._unseen_s = None
         self.archive = Archive(ARCHIVED_SCENES * self._capacity)

@@ -69,7 +69,7 @@ class LastSeen:
         return unseen
 
     def restart(self) -> None:
-        """Reset for other Gaussians."""
+        """Remove all Gaussians; those of the next scene get their times when they join."""
         self._count = 0
 
     def see(self, now: Gaussians, observation: Observation) -> None:

@@ -39,9 +39,9 @@ class Points:
     """Points from structure from motion, from which the Gaussians are initialised."""
 
     positions: NDArray[np.float64]
-    """[N, 3], world units."""
+    """Positions of the points in the world, [N, 3]."""
     colours: NDArray[np.uint8]
-    """RGB [N, 3]."""
+    """Colours of the points, RGB [N, 3]."""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ RESETS_AT_LEAST = 10
 
 @dataclass(frozen=True)
 class StaticConfig:
-    """Options of a training.
+    """Options of the training of a static scene.
 
     Raises:
         InvalidSetting: if a value is out of range.
@@ -69,7 +69,7 @@ class StaticConfig:
 
     steps: int = FULL_STEPS
     strategy: str = "adc"
-    """Key of `STARTS`."""
+    """Name of the densification strategy, in `STARTS`."""
     max_gaussians: int = 1_000_000
     """Number of Gaussians at which `mcmc` stops to add, and after which `adc` multiplies none."""
     absgrad: bool = False
@@ -125,14 +125,14 @@ class StaticConfig:
 
 @dataclass(frozen=True)
 class StaticStep:
-    """Result of one step."""
+    """Result of one training step."""
 
     step: int
     """Number of the step, from 0."""
     loss: Tensor
-    """Scalar, on the device."""
+    """Loss of the step, a scalar on the device."""
     picture: int
-    """Index of the picture."""
+    """Index of the picture trained on."""
 
 
 class StaticTrainer:

@@ -93,7 +93,7 @@ class Rounds:
     """Strategy that changes the Gaussians in a few rounds, by their visibility and error in random frames."""
 
     def __init__(self, plan: Plan, change: Callable[[TrainingStep, Shares, int], None]) -> None:
-        """Create the strategy.
+        """Create a strategy whose rounds change the scene by `change`.
 
         Args:
             plan: the training.
