@@ -144,9 +144,10 @@ their colours agree as well.
 """
 SAME_AFTER_GAP_COLOURS = 0.65
 """Overlap of colours required for frames after a gap."""
-LONGEST_DOUBT_FRAMES = 6
-"""Largest number of consecutive unmatched frames before a cut is reported. Normally a cut is
-confirmed by the next frame matching the unmatched one.
+LONGEST_DOUBT_FRAMES, LONGEST_DOUBT_S = 6, 0.25
+"""Largest number of consecutive unmatched frames, and their duration in seconds, before a cut is reported. Normally a
+cut is confirmed by the next frame matching the unmatched one. Each cut without confirmation halves the number until a
+frame matches, so that a stream of unrelated pictures passes.
 """
 KEPT_VIEWS = 4
 """Number of views kept of the present scene. Twice as many are kept of earlier scenes."""
@@ -182,6 +183,8 @@ class CutDetector:
         self._shape: tuple[int, ...] = ()
         self._doubted: View | None = None
         self._doubts = 0
+        self._doubts_since_ns = 0
+        self._most_doubts = LONGEST_DOUBT_FRAMES
         self._gap = False
         self._views: deque[View] = deque(maxlen=KEPT_VIEWS)
         self._earlier: deque[View] = deque(maxlen=2 * KEPT_VIEWS)
@@ -209,10 +212,15 @@ class CutDetector:
             self._shape = image.shape
             return self._accept(view, "resized")
         if self._related(view):
+            self._most_doubts = LONGEST_DOUBT_FRAMES
             return self._accept(view, "frame rate" if other_rate else None)
         settled = self._doubted is not None and self._same(view, self._doubted, gap=False)
+        if self._doubts == 0:
+            self._doubts_since_ns = pts_ns
         self._doubts += 1
-        if settled or self._doubts > LONGEST_DOUBT_FRAMES:
+        too_long = pts_ns - self._doubts_since_ns > 1e9 * LONGEST_DOUBT_S
+        if settled or self._doubts > self._most_doubts or too_long:
+            self._most_doubts = LONGEST_DOUBT_FRAMES if settled else self._most_doubts // 2
             known = any(self._same(view, earlier, gap=False) for earlier in self._earlier)
             return self._accept(view, "returned" if known else "cut")
         self._doubted = view

@@ -19,8 +19,8 @@ LEAST_TISSUE = 0.02
 """Share of tissue below which a frame is not trained on."""
 LOST_TOOL_SHARE = 0.05
 """Share of tool pixels in the previous mask from which a mask without any tool counts as lost."""
-LOST_FRAMES = 5
-"""Largest number of consecutive frames with a lost mask. After that the tool counts as withdrawn."""
+LOST_S = 0.15
+"""Duration of a lost mask in seconds after which the tool counts as withdrawn."""
 FARTHEST_MM = 2000.0
 """Largest plausible depth for an endoscope, in millimetres."""
 WRONG_DEPTH_SHARE = 0.2
@@ -36,18 +36,19 @@ class MaskCheck:
 
     def __init__(self) -> None:
         self._tool_share = 0.0
-        self._lost = 0
+        self._seen_ns = 0
+        """Time of the newest mask that was not lost."""
 
-    def fault(self, mask: NDArray[np.generic]) -> str | None:
-        """Return "no tissue" or "tool mask lost" for a faulty mask [H, W] (1 = tissue), else None."""
+    def fault(self, mask: NDArray[np.generic], pts_ns: int) -> str | None:
+        """Return "no tissue" or "tool mask lost" for a faulty mask [H, W] (1 = tissue) at `pts_ns`, else None."""
         some = _some(mask)
         tissue = np.count_nonzero(some) / some.size
         if tissue < LEAST_TISSUE:
             return "no tissue"
-        if tissue == 1.0 and self._tool_share >= LOST_TOOL_SHARE and self._lost < LOST_FRAMES:
-            self._lost += 1
+        lost_s = (pts_ns - self._seen_ns) * 1e-9
+        if tissue == 1.0 and self._tool_share >= LOST_TOOL_SHARE and 0 <= lost_s <= LOST_S:
             return "tool mask lost"
-        self._tool_share, self._lost = 1 - tissue, 0
+        self._tool_share, self._seen_ns = 1 - tissue, pts_ns
         return None
 
 

@@ -27,6 +27,8 @@ NOISE_SHARE = 0.5
 """Difference of neighbouring pixels relative to that of unrelated ones, from which a picture is
 noise. Tissue has 0.01 to 0.04.
 """
+AVERAGED_PX = 4
+"""Side in pixels of the squares whose averages must be noise, too."""
 SAME_LEVELS = 2
 """Largest difference of equal pixels, as caused by re-encoding."""
 SAME_SHARE = 0.9995
@@ -37,6 +39,8 @@ FROZEN_FRAMES = 8
 """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
 TORN_SHARE = 0.08
 """Share of rows, up to the lower edge, equal to the previous picture from which a picture is torn."""
+TORN_FRAMES = 5
+"""Largest number of consecutive torn pictures. After that the layout counts as changed, as by an overlay."""
 MOVING_SHARE = 0.9
 """Share of frames in which a row must change to be used in the test for torn pictures; excludes
 black borders and recorder overlays.
@@ -54,6 +58,7 @@ class SequenceCheck:
         self._row_moves: NDArray[np.float64] = np.zeros(0)
         """Recent frequency of changes of each row, 0..1."""
         self._frames_seen = 0
+        self._torn_run = 0
 
     def fault(self, image: NDArray[np.uint8], pts_ns: int) -> str | None:
         """Check the next picture, RGB uint8 [H, W, 3], shown at `pts_ns`.
@@ -77,6 +82,9 @@ class SequenceCheck:
         self._new_since_ns, self._same_run = pts_ns, 0
         changed = share > 0.01
         torn = self._torn(small, changed)
+        self._torn_run = self._torn_run + 1 if torn else 0
+        if self._torn_run > TORN_FRAMES:
+            torn, self._torn_run, self._frames_seen = False, 0, 0
         if not torn:
             # Adapt quickly at first, then average over about the last 50 frames.
             self._frames_seen += 1
@@ -91,7 +99,12 @@ class SequenceCheck:
         if self._one_grey(levels, pixels) and self._one_colour(small):
             return "one colour"
         if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > NOISE_SHARE:
-            return "noise"
+            # A picture is left if averages are smooth, as with fibre bundles or a noisy camera.
+            height, width = image.shape[:2]
+            size = width // AVERAGED_PX, height // AVERAGED_PX
+            averages = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            if _roughness(averages) > NOISE_SHARE:
+                return "noise"
         return None
 
     def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:

@@ -108,6 +108,20 @@ def test_scenes_that_change_with_every_frame_are_cut_after_a_while():
     assert list(verdicts([*texture(1, 5, 64, 48), *unrelated]).values()) == ["in doubt"] * 6 + ["cut"]
 
 
+def test_a_stream_of_unrelated_pictures_passes_after_a_while(rng):
+    pictures = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(30)]
+    detector = CutDetector()
+    doubts = [detector.observe(picture, k, k * FRAME_NS).in_doubt for k, picture in enumerate(pictures)]
+    assert doubts == [False, *[True] * 6, False, *[True] * 3, False, True, *[False] * 17]
+
+
+def test_at_a_low_rate_a_cut_is_in_doubt_for_a_quarter_of_a_second(rng):
+    pictures = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(4)]
+    detector = CutDetector()
+    doubts = [detector.observe(picture, k, k * 200_000_000).in_doubt for k, picture in enumerate(pictures)]
+    assert doubts == [False, True, True, False]
+
+
 def test_another_size_is_a_new_scene_at_once():
     assert verdicts([*texture(1, 5), *texture(1, 5, 120, 90)]) == {5: "resized"}
 

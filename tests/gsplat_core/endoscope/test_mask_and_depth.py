@@ -18,18 +18,19 @@ def mask(tool_columns, size=40):
 
 def test_a_frame_full_of_tool_has_no_tissue():
     check = MaskCheck()
-    assert [check.fault(mask(columns)) for columns in (8, 40, 8)] == [None, "no tissue", None]
+    assert [check.fault(mask(columns), 0) for columns in (8, 40, 8)] == [None, "no tissue", None]
 
 
-def test_a_tool_that_is_gone_at_once_is_a_lost_mask_but_not_for_ever():
+@pytest.mark.parametrize(("fps", "lost"), [(60, 8), (30, 4), (5, 0)])
+def test_a_tool_that_is_gone_at_once_is_a_lost_mask_for_three_twentieths_of_a_second(fps, lost):
     check = MaskCheck()
-    found = [check.fault(mask(columns)) for columns in (12, 12, *[0] * 8, 12)]
-    assert found == [None, None] + ["tool mask lost"] * 5 + [None] * 4
+    found = [check.fault(mask(columns), round(k * 1e9 / fps)) for k, columns in enumerate((12, 12, *[0] * 12, 12))]
+    assert found == [None, None] + ["tool mask lost"] * lost + [None] * (13 - lost)
 
 
 def test_a_tool_that_leaves_over_some_frames_is_no_fault():
     check = MaskCheck()
-    assert {check.fault(mask(columns, 160)) for columns in (48, 36, 20, 4, 0, 0)} == {None}
+    assert {check.fault(mask(columns, 160), 0) for columns in (48, 36, 20, 4, 0, 0)} == {None}
 
 
 def plane(value=60.0):
@@ -78,4 +79,4 @@ def test_nothing_raises(height, width, dtype, seed):
     depth[rng.random((height, width)) < 0.2] = np.nan
     found = DepthCheck().checked(depth)
     assert found.depth is None or np.isfinite(found.depth).all()
-    MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8))
+    MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8), 0)
