@@ -57,6 +57,8 @@ class TrainingCounts:
     """Number of rehearsal steps, which train on earlier frames of the training window."""
     withheld: dict[str, int] = field(default_factory=dict)
     """Number of frames excluded from training (withheld or damaged), by reason."""
+    withheld_now: dict[str, int] = field(default_factory=dict)
+    """Those of `withheld` since the last frame that was not excluded."""
     scenes: dict[str, int] = field(default_factory=dict)
     """Number of times that the model was restarted for a new scene, by reason."""
     places_found: int = 0
@@ -93,9 +95,12 @@ class Learner:
     def accepts(self, frame: Frame) -> bool:
         """Return True if a frame can be trained on. Counts the reason if not."""
         reason = frame.unusable
-        if reason is not None:
-            self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
-        return reason is None
+        if reason is None:
+            self.counts.withheld_now = {}
+            return True
+        self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
+        self.counts.withheld_now = {**self.counts.withheld_now, reason: self.counts.withheld_now.get(reason, 0) + 1}
+        return False
 
     def enter(self, frame: Frame, *, usable: bool) -> bool:
         """Restart the reconstructor's scene if the frame belongs to another scene or has another size.

@@ -325,6 +325,7 @@ def graph_figures(graph: Pipeline) -> dict[str, object]:
         "steps": counts.steps,
         "passed_over": counts.passed_over,
         "withheld": dict(counts.withheld),
+        "withheld_now": dict(counts.withheld_now),
         "gaussians": graph.reconstruct.newest_gaussians,
         "source": source.state.value,
         "source_counts": dict(source.counts()) if isinstance(source, CapturedSource) else {},

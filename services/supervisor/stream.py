@@ -134,8 +134,17 @@ class Stream:
         )
 
 
-OUT_OF_BODY = "out of body"
-"""Reason string of frames withheld by the engine's out-of-body gate."""
+CHECK_SOURCE = "check what the source sends"
+REMEDIES = {
+    "out of body": "the stream's option out_of_body: off lets those out of body pass",
+    "no tissue": "the stream's option tool_mask: none takes every pixel for tissue",
+    "tool mask lost": "the stream's option tool_mask: none takes every pixel for tissue",
+    "damaged": "check the connection of the source",
+    **dict.fromkeys(("black", "one colour", "noise", "duplicate", "frozen", "torn", "out of order"), CHECK_SOURCE),
+}
+"""Remedy for each reason of withheld frames that does not pass by itself."""
+WITHHELD_FRAMES = 5
+"""Number of consecutive withheld frames from which a stale picture is explained by them."""
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:
@@ -150,8 +159,10 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
     if engine.state != "running":
         return "starting", f"the camera's picture is live; the engine is {engine.state}: {engine.reason}"
     shown = (engine.figures.get("picture") or {}).get("state")
-    if shown in ("live", "stale", "frozen", "source lost"):
-        return str(shown), None
+    if shown == "live":
+        return "live", None
+    if shown in ("stale", "frozen", "source lost"):
+        return str(shown), _withheld_now(engine)
     return "starting", _withheld(engine) or "the first picture is being made"
 
 
@@ -161,9 +172,22 @@ def _withheld(engine: ProcessState) -> str | None:
     frames, withheld = engine.figures.get("frames"), engine.figures.get("withheld")
     if not frames or not isinstance(withheld, Mapping) or not withheld:
         return None
-    counts = ", ".join(f"{reason}: {count}" for reason, count in sorted(withheld.items(), key=lambda each: -each[1]))
-    hint = "; the stream's option out_of_body: off lets those out of body pass" if OUT_OF_BODY in withheld else ""
-    return f"nothing is shown: of {frames} frames {sum(withheld.values())} were withheld ({counts}){hint}"
+    return f"nothing is shown: of {frames} frames {sum(withheld.values())} were withheld {_counts(withheld)}"
+
+
+def _withheld_now(engine: ProcessState) -> str | None:
+    """Return the reason why a displayed picture is old: the last frames were withheld; None otherwise."""
+    withheld = engine.figures.get("withheld_now")
+    if not isinstance(withheld, Mapping) or sum(withheld.values()) < WITHHELD_FRAMES:
+        return None
+    return f"nothing new is shown: the last {sum(withheld.values())} frames were withheld {_counts(withheld)}"
+
+
+def _counts(withheld: Mapping[str, int]) -> str:
+    """Return counts of withheld frames by reason, most frequent first, and the remedies."""
+    ordered = sorted(withheld.items(), key=lambda each: -each[1])
+    counts = ", ".join(f"{reason}: {count}" for reason, count in ordered)
+    return "; ".join([f"({counts})", *dict.fromkeys(REMEDIES[reason] for reason, _ in ordered if reason in REMEDIES)])
 
 
 class SupervisedStreams:

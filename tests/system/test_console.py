@@ -96,6 +96,18 @@ def test_the_live_page_fits_the_window(page, window):
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
+def test_the_live_page_says_why_a_stream_shows_nothing(page, client):
+    opened(page, "live")
+    assert page.is_hidden("#stream-reason")
+    reason = "nothing is shown: of 45 frames 45 were withheld (out of body: 45)"
+    view = {**client.stream("theatre-1").model_dump(mode="json"), "state": "starting", "reason": reason}
+    page.route("**/v1/streams", lambda route: route.fulfill(json=[view]))
+    page.wait_for_selector("#stream-reason:not([hidden])")
+    assert page.inner_text("#stream-reason") == f"starting: {reason}"
+    page.unroute("**/v1/streams")
+    page.wait_for_selector("#stream-reason", state="hidden")
+
+
 def test_a_picture_may_tell_what_trivial_predictors_score(page):
     texts = page.evaluate(
         """async () => { const { quality } = await import("/console/streams.js");

@@ -103,6 +103,14 @@ function chooseAmong(streams) {
     if (names.includes(chosen)) choice.value = chosen;
   }
   watch(choice.value);
+  explain(streams.find((stream) => stream.name === choice.value));
+}
+
+/** Show why a stream displays nothing new, such as frames withheld by a check, with the option to change. */
+function explain(stream) {
+  const reason = stream?.reason && stream.state !== "stopped" ? `${stream.state}: ${stream.reason}` : "";
+  if (at("stream-reason").textContent !== reason) at("stream-reason").textContent = reason; // screen readers announce a change
+  at("stream-reason").hidden = !reason;
 }
 
 let myself = null;

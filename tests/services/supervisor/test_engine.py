@@ -208,7 +208,7 @@ def test_a_reconstruction_ends_on_a_stop_or_when_a_model_is_wanted(reconstructin
 def test_figures_of_a_graph_before_and_while_it_runs():
     assert engines.graph_figures(SimpleNamespace()) == engines.graph_figures(SimpleNamespace(metrics=None)) == {}
     source = SimpleNamespace(state=SimpleNamespace(value="live"), counts=lambda: {"late": 1})
-    counts = SimpleNamespace(frames=3, steps=9, passed_over=2, withheld={"blur": 4})
+    counts = SimpleNamespace(frames=3, steps=9, passed_over=2, withheld={"blur": 4}, withheld_now={"blur": 1})
     graph = SimpleNamespace(
         metrics=object(),
         frame_source=source,
@@ -217,8 +217,8 @@ def test_figures_of_a_graph_before_and_while_it_runs():
     )
     found = engines.graph_figures(graph)
     assert found == {
-        "frames": 11, "trained": 3, "steps": 9, "passed_over": 2, "withheld": {"blur": 4}, "gaussians": 70,
-        "source": "live", "source_counts": {},
+        "frames": 11, "trained": 3, "steps": 9, "passed_over": 2, "withheld": {"blur": 4}, "withheld_now": {"blur": 1},
+        "gaussians": 70, "source": "live", "source_counts": {},
     }  # fmt: skip
 
 

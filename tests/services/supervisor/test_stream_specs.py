@@ -122,7 +122,9 @@ def test_a_stream_whose_frames_are_all_withheld_says_why_nothing_is_shown():
         "nothing is shown: of 45 frames 42 were withheld (out of body: 40, blur: 2);"
         " the stream's option out_of_body: off lets those out of body pass",
     )
-    assert reason(frames=2, withheld={"black": 2})[1] == "nothing is shown: of 2 frames 2 were withheld (black: 2)"
+    assert reason(frames=2, withheld={"black": 2})[1] == (
+        "nothing is shown: of 2 frames 2 were withheld (black: 2); check what the source sends"
+    )
     for figures in (
         {},
         {"frames": 3},
@@ -132,6 +134,21 @@ def test_a_stream_whose_frames_are_all_withheld_says_why_nothing_is_shown():
     ):
         assert reason(**figures) == ("starting", "the first picture is being made")
     assert reason(picture={"state": "live"}, frames=45, withheld=withheld) == ("live", None)
+
+
+def test_an_old_picture_is_explained_by_the_frames_withheld_since():
+    capture = ProcessState("live", "", 1, 0, {}, 0.1)
+
+    def reason(state, **withheld):
+        figures = {"frames": 900, "withheld": {"blur": 99}, "withheld_now": withheld, "picture": {"state": state}}
+        return overall(capture, ProcessState("running", "reconstructs", 2, 0, figures, 0.1))
+
+    assert reason("frozen", **{"no tissue": 30, "blur": 2}) == (
+        "frozen",
+        "nothing new is shown: the last 32 frames were withheld (no tissue: 30, blur: 2);"
+        " the stream's option tool_mask: none takes every pixel for tissue",
+    )
+    assert reason("stale", blur=3) == ("stale", None) and reason("live", blur=30) == ("live", None)
 
 
 def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_path):
