@@ -16,7 +16,7 @@ SIZE = 100_000
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    options = ["limits.stall_s=0.5", "limits.head_s=2", "limits.uploads=2"]
+    options = ["limits.stall_s=3", "limits.head_s=10", "limits.uploads=2"]
     given = [argument for option in options for argument in ("--set", option)]
     folder = tmp_path_factory.mktemp("slow")
     with serving(folder, *given) as (_, port, key):

@@ -51,7 +51,9 @@ def reported(capsys, *arguments: object) -> dict:
 
 
 @EACH_FIELD
-@pytest.mark.parametrize("command", [("live",), ("replay", "--steps-per-frame", 2), ("reconstruct", "--steps", 8)])
+@pytest.mark.parametrize(
+    "command", [("live", "--scale", 1), ("replay", "--steps-per-frame", 2), ("reconstruct", "--steps", 8)]
+)
 def test_a_command_that_makes_a_model_takes_the_field(recording, tmp_path, capsys, field, command):
     name, *options = command
     folder = tmp_path / "out"

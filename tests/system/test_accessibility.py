@@ -27,6 +27,7 @@ def page() -> Iterator[Any]:
         serving(Path(folder)) as (url, key),
     ):
         page = browser.new_page(viewport={"width": 1920, "height": 1080})
+        page.set_default_timeout(300_000)
         page.goto(f"{url}/")
         page.wait_for_selector("#sign-in[open]")
         yield page, key

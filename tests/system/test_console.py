@@ -38,7 +38,7 @@ def console() -> Iterator[tuple[Any, Client]]:
     ):
         said: list[str] = []
         page = browser.new_page(timezone_id="Asia/Tokyo", accept_downloads=True)
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(300_000)
         page.on("pageerror", lambda error: said.append(str(error)))
         page.goto(f"{url}/#key={key}")
         page.wait_for_selector("#account:not([hidden])")
@@ -65,7 +65,7 @@ def listed(client: Client) -> list[KeyView]:
 
 def until(page: Any, true: str) -> None:
     """Wait until an expression is true. Playwright's own way needs `eval`, which the page's policy forbids."""
-    for _ in range(200):
+    for _ in range(6000):
         if page.evaluate(true):
             return
         page.wait_for_timeout(50)

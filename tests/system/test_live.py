@@ -22,7 +22,7 @@ from operators.errors import RunFailed, SourceLost
 from operators.frame_log import read_frames
 from operators.sources.recording import RealtimeSource, play
 from operators.storage import STAGING_PREFIX
-from services.cli.exit_codes import user_sentence
+from services.cli.exit_codes import NOTHING_SHOWN, user_sentence
 from services.reports.schema import RunReport
 
 
@@ -35,7 +35,7 @@ def scope(tmp_path_factory):
 
 def showing(start, source, out):
     """A run whose pictures are on the screen."""
-    process = start("live", source, "--loop", "--out", out)
+    process = start("live", source, "--loop", "--scale", 1, "--out", out)
     for line in process.stderr:
         if line.startswith("live"):
             return process
@@ -61,11 +61,10 @@ def one_sentence(err):
     return said[0]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.slow
-def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start, number):
+def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start):
     process = showing(start, scope, tmp_path / "out")
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)  # SIGINT: test_recorded_sessions
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0 and "Traceback" not in err
     assert "ended: interrupted" in out and "error" not in err
@@ -74,7 +73,10 @@ def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start, number):
 
 
 def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
-    done = intrasplat("live", scope, "--loop", "--seconds", "3", "--out", tmp_path / "out", "--json")
+    for seconds in (2, 20, 200):  # a very busy machine shows nothing in the first ones
+        done = intrasplat("live", scope, "--loop", "--seconds", seconds, "--out", tmp_path / "out", "--json")
+        if done.code != NOTHING_SHOWN:
+            break
     assert done.code == 0, done.err
     report = reached(tmp_path / "out")
     assert report.run.stop_reason == "end of the time asked for" and not report.run.interrupted
@@ -101,7 +103,7 @@ def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
         return Dying(source.recording, replace(options, process=False))
 
     monkeypatch.setattr(live_module, "open_source", dying)
-    done = intrasplat("live", scope, "--loop", "--out", tmp_path / "out")
+    done = intrasplat("live", scope, "--loop", "--scale", 1, "--out", tmp_path / "out")
     assert done.code == 2
     assert "the scope was pulled out; plug it in again" in one_sentence(done.err)
     assert "the scope was pulled out" in reached(tmp_path / "out").run.stop_reason
@@ -118,7 +120,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Reconstructor, "observe", observing)
     written = []
-    settings = LiveSettings(str(scope), tmp_path / "out", loop=True)
+    settings = LiveSettings(str(scope), tmp_path / "out", loop=True, scale=1.0)
     with pytest.raises(RunFailed) as failed:
         live_module.live(settings, report=lambda outcome, folder: written.append(outcome))
     assert "operator 'reconstruct' failed" in written[0].stop_reason

@@ -29,7 +29,21 @@ def drapes(tmp_path):
 def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
     """A single test, because a live run takes seconds."""
     assert (
-        run(["live", str(drapes), "--out", str(tmp_path / "out"), "--record", "--max-frames", "6", "--fps", "20"])
+        run(
+            [
+                "live",
+                str(drapes),
+                "--scale",
+                "1",
+                "--out",
+                str(tmp_path / "out"),
+                "--record",
+                "--max-frames",
+                "6",
+                "--fps",
+                "20",
+            ]
+        )
         == NOTHING_SHOWN
     )
     said = capsys.readouterr().err
@@ -56,6 +70,8 @@ def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsy
             [
                 "live",
                 str(drapes),
+                "--scale",
+                "1",
                 "--out",
                 str(tmp_path / "out"),
                 "--out-of-body",

@@ -256,11 +256,11 @@ def test_a_disk_that_does_not_answer_is_given_up(tmp_path, gate, monkeypatch):
 
 
 def test_what_is_being_written_is_waited_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(session_recorder, "CLOSE_S", 1.0)
+    monkeypatch.setattr(session_recorder, "CLOSE_S", 3.0)
     written = SessionWriter.frame
 
     def slow(self, frame):
-        time.sleep(0.1)
+        time.sleep(0.25)
         written(self, frame)
 
     monkeypatch.setattr(SessionWriter, "frame", slow)

@@ -72,19 +72,19 @@ def test_rtsp_motion_jpeg_by_tcp_and_udp(rtsp_server, reading, fragment):
 
 
 @pytest.mark.slow
-def test_a_server_that_is_killed_and_comes_back_after_five_seconds(rtsp_server, reading):
+def test_a_server_that_is_killed_and_comes_back_after_a_while(rtsp_server, reading):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("camera"), HERE))
     before = [stream.frame() for _ in range(5)][-1]
     rtsp_server.kill()
     stream.until(lambda: stream.source.state is SourceState.RECONNECTING)
     assert "is lost" in stream.source.state_sentence and "attempt" in stream.source.state_sentence
-    time.sleep(5)
+    time.sleep(1)
     assert stream.source.read(0) is None and stream.source.state is SourceState.RECONNECTING
     rtsp_server.start()
     after = stream.frame()
     assert stream.source.state is SourceState.LIVE and stream.source.counts()["reconnections"] == 1
-    assert after.seq > before.seq and after.pts_ns - before.pts_ns > 5e9, "five seconds have passed"
+    assert after.seq > before.seq and after.pts_ns - before.pts_ns > 1e9, "a second has passed"
     assert stream.frame().seq > after.seq
 
 

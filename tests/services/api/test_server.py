@@ -68,7 +68,7 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    options = ["--set", "limits.head_s=0.5", "--set", "limits.stall_s=0.5"]
+    options = ["--set", "limits.head_s=3", "--set", "limits.stall_s=3"]
     with serving(tmp_path_factory.mktemp("server"), *options) as server:
         yield server
 
@@ -84,7 +84,7 @@ def ask(port: int, path: str, key: str | None = None, method: str = "GET", **hea
     return answer, body
 
 
-def raw(port: int, data: bytes, timeout_s: float = 10.0) -> bytes:
+def raw(port: int, data: bytes, timeout_s: float = 300.0) -> bytes:
     """Return the whole response until the server closes the connection."""
     with socket.create_connection(("127.0.0.1", port), timeout=timeout_s) as client:
         client.sendall(data)

@@ -24,9 +24,7 @@ def served(tmp_path) -> Iterator[tuple[int, str, FakeDisplay, DrainingServer]]:
     display = FakeDisplay(jpeg=bytes(PICTURE))
     parts = fake_parts(display=display)
     parts.streams.kept["endoscope"] = stream_view("endoscope", state="live")
-    settings = ServiceSettings(
-        paths={"data": tmp_path}, server={"port": 0, "drain_s": 2}, limits={"viewer_stall_s": 0.5}
-    )
+    settings = ServiceSettings(paths={"data": tmp_path}, server={"port": 0, "drain_s": 2}, limits={"viewer_stall_s": 3})
     app = new_app(settings, parts)
     listener, ready = bind(settings), threading.Event()
     server = DrainingServer(config_of(app, settings), app.state.control, ready.set)

@@ -50,8 +50,9 @@ def run(scenario) -> None:
 def test_viewers_get_the_same_picture_encoded_once(runtime):
     async def scenario() -> None:
         async with published(runtime) as (hub, _), hub.subscribe("shown") as one, hub.subscribe("shown") as other:
-            seen = [(await anext(one), await anext(other)) for _ in range(5)]
-            assert any(a.jpeg is b.jpeg for a, b in seen)
+            seen = [(await anext(one), await anext(other))]
+            while not any(a.jpeg is b.jpeg for a, b in seen):
+                seen.append((await anext(one), await anext(other)))
             header = seen[-1][0].header
             assert header["state"] == "live" and header["model_version"] == 3
             assert (header["width_px"], header["height_px"], header["picture"]) == (24, 16, "shown")

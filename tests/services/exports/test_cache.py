@@ -17,9 +17,8 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
 from operators.settings import RenderOptions
 from services.errors import ExportBusy, ExportFailed, ExportRefused
-from services.exports.cache import ALL, ExportCache, ExportPrograms
+from services.exports.cache import ExportCache, ExportPrograms
 from services.exports.renderings import PICTURES, RenderWish
-from services.registry.bundle_file import members_of
 from tests.services.supervisor.test_model_show import uniform
 
 STUB = (sys.executable, str(Path(__file__).with_name("stub_make.py")))
@@ -157,20 +156,11 @@ def test_the_program_itself(tmp_path):
     cache = ExportCache(tmp_path / "exports")
     with cache.get("a", lambda: tmp_path / "model", PLY).file as ply:
         assert ply.read(3) == b"ply"
-    packed = cache.get("a", lambda: tmp_path / "model", ExportWish(ALL["isplat"]))
-    with packed.file as file:
-        names = [member.name for member in members_of(file, packed.size_bytes)]
-    assert names == ["manifest.json", "model.safetensors"]
     with pytest.raises(ExportRefused, match="window"):
         cache.get("a", lambda: tmp_path / "model", ExportWish(FORMATS["glb"], 9.0))
-    (tmp_path / "model" / "model.safetensors").unlink()
-    with pytest.raises(ExportRefused, match="missing"):
-        cache.get("b", lambda: tmp_path / "model", PLY)
 
 
-@pytest.mark.parametrize(
-    "module", ["services.exports.cache", "services.exports.snapshots", "services.exports.snapshots"]
-)
+@pytest.mark.parametrize("module", ["services.exports.cache", "services.exports.snapshots"])
 @pytest.mark.slow
 def test_this_process_loads_no_torch(module):
     program = f"import sys, {module}; assert not {{'torch', 'cv2'}} & set(sys.modules)"

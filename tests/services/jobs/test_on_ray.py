@@ -18,18 +18,28 @@ pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
 WITHIN_S = 300.0
 
 
-@pytest.mark.filterwarnings("ignore")  # of Ray's own
-def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path):
+@pytest.fixture
+def on_ray():
+    """A local Ray. It gives itself 30 s to start, and a very busy machine takes longer: then it is started again."""
+    import ray
+
     from services.jobs.runners import OnRay
 
-    good = store.submit(
-        [NewJob("a", str(recording)), NewJob("b", str(recording))], {"steps_per_frame": 2}, "operator"
-    ).ids
+    for last in (False, False, False, True):
+        try:
+            return OnRay("local")
+        except Exception:
+            ray.shutdown()
+            if last:
+                raise
+
+
+@pytest.mark.filterwarnings("ignore")  # of Ray's own
+def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path, on_ray):
+    (good,) = store.submit([NewJob("a", str(recording))], {"steps_per_frame": 2}, "operator").ids
     (missing,) = store.submit([NewJob("c", str(tmp_path / "nothing"))], {}, "operator").ids
     (long,) = store.submit([NewJob("d", str(recording))], {"steps_per_frame": 10_000}, "operator").ids
-    pool = JobPool(
-        store.database, Results(tmp_path / "results"), OnRay("local"), PoolSettings(workers=2, pack_models=True)
-    )
+    pool = JobPool(store.database, Results(tmp_path / "results"), on_ray, PoolSettings(workers=1, pack_models=True))
     end_s = time.monotonic() + WITHIN_S
 
     def is_over():
@@ -39,14 +49,16 @@ def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path):
         return not any(job.is_open for job in store.newest())
 
     pool.run(is_over)
-    assert [store.get(job_id).state for job_id in (*good, missing, long)] == [
-        JobState.DONE, JobState.DONE, JobState.FAILED, JobState.CANCELLED,
-    ]  # fmt: skip
+    assert [store.get(job_id).state for job_id in (good, missing, long)] == [
+        JobState.DONE,
+        JobState.FAILED,
+        JobState.CANCELLED,
+    ]
     assert "no such file" in store.get(missing).reason
-    reports = [json.loads((tmp_path / "results" / job_id / "report.json").read_text()) for job_id in good]
-    assert reports[0]["frames_sha256"] == reports[1]["frames_sha256"]
-    assert sorted(path.name for path in (tmp_path / "results").iterdir()) == sorted([*good, RUNNING])
-    assert (tmp_path / "results" / good[0] / "model.isplat").is_file()
+    report = json.loads((tmp_path / "results" / good / "report.json").read_text())
+    assert report["frames"]["displayed"] == 3
+    assert sorted(path.name for path in (tmp_path / "results").iterdir()) == sorted([good, RUNNING])
+    assert (tmp_path / "results" / good / "model.isplat").is_file()
 
 
 @pytest.mark.parametrize("address", ["no address", "scheme://x"])

@@ -50,7 +50,8 @@ async def watch(endpoint: str, seen: list[tuple[str, int, str]]) -> None:
 
 def test_no_picture_is_of_two_models_and_none_of_another_than_it_says(runtime, bundles):
     async def scenario() -> None:
-        settings = StreamSettings(source="synthetic:?width=64&height=64&frames=3&fps=20", device="cpu")
+        source = "synthetic:?width=64&height=64&frames=3&fps=20"
+        settings = StreamSettings(source=source, device="cpu", options={"engine_scale": 1})
         stream = Stream(settings, specs_of("a", settings), runtime, start=Direct())
         await stream.start()
         seen: list[tuple[str, int, str]] = []
@@ -62,7 +63,7 @@ def test_no_picture_is_of_two_models_and_none_of_another_than_it_says(runtime, b
 
                 async def show(version: int) -> None:
                     where = {"folder": str(bundles[version]), "version": version, "name": "wall"}
-                    await stream.engine.command("show_model", timeout_s=30.0, **where)
+                    await stream.engine.command("show_model", timeout_s=SOON_S, **where)
                     while not seen or seen[-1][:2] != ("model", version):
                         await asyncio.sleep(0.005)
 

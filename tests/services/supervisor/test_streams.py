@@ -188,7 +188,7 @@ async def run():
     launcher = ByLauncher(runtime, orphan_after_s=600.0)
     launcher.open()
     await launcher.ready.wait()
-    settings = StreamSettings(source=sys.argv[2], device="cpu")
+    settings = StreamSettings(source=sys.argv[2], device="cpu", options={"engine_scale": 1})
     specs = specs_of("a", settings, ProcessLimits(orphan_after_s=600.0))
     await Stream(settings, specs, runtime, start=launcher).start()
     await asyncio.sleep(600)
@@ -208,7 +208,7 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
         raw, shown = Headers(folder.pictures("capture")), Headers(folder.pictures("engine"))
         events: list[StreamEvent] = []
         launcher = ByLauncher(runtime, orphan_after_s=600.0)
-        settings = StreamSettings(source=SMALL, device="cpu")
+        settings = StreamSettings(source=SMALL, device="cpu", options={"engine_scale": 1})
         specs = specs_of("a", settings, ProcessLimits(orphan_after_s=600.0))
         stream = Stream(settings, specs, runtime, start=launcher, on_event=events.append)
         try:
@@ -255,7 +255,7 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
             assert numbers == sorted(numbers)
 
             # A finished model takes over from the live reconstruction, outlasts the engine, and gives way again.
-            answer = await stream.engine.command("show_model", timeout_s=30.0, folder=str(bundle), version=7)
+            answer = await stream.engine.command("show_model", timeout_s=SOON_S, folder=str(bundle), version=7)
             assert answer["version"] == 7
             await until(lambda: shown.seen[-1]["show"] == "model")
             kill(stream.engine.state.pid)
