@@ -95,7 +95,7 @@ class FrameClock:
     """
 
     def __init__(self, settings: ClockSettings, fps: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Start with nominal values.
+        """Create a clock, with the nominal frame rate until frames arrive.
 
         Args:
             settings: deadline and step limits.

@@ -44,7 +44,7 @@ def pyigtl() -> Any:
 
 
 class StreamMessages:
-    """Packer of one stream's messages.
+    """Converts a stream's pictures to OpenIGTLink messages.
 
     Picture axes: i right, j down, k = 0, with three components (red, green, blue). A voxel is `spacing_mm` wide and
     high, and the origin is the picture's centre. Camera coordinates (x right, y down, z forward) are sent as RAS, so

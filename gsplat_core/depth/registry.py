@@ -107,7 +107,7 @@ def evidence(choice: str, fields: frozenset[str]) -> list[str]:
 
 
 def of_recording(choice: str) -> str | None:
-    """Return the name of the estimator among those of a setting that needs a complete recording, or None."""
+    """Return which estimator of a setting needs all frames of a recording, by name; None if none does."""
     return next((name for name, kind in _kinds(choice).items() if issubclass(kind, OfRecording)), None)
 
 

@@ -213,7 +213,7 @@ NO_VALLEY, SHARPER_EDGE = 0.25, 0.8
 CLEAR_VALLEY = 1.15
 """Smallest ratio of both neighbouring peaks of the redness distribution to the valley between them."""
 SMALLEST_SHARE = 0.003
-"""Smallest share of pixels below the threshold."""
+"""Share of a picture's pixels that must be lit, and that must be greyer than the threshold, for tools to be found."""
 HELD_FRAMES = 3
 """Number of frames for which tools that disappear suddenly (glare, blur) are kept."""
 BIN_EDGES = np.linspace(LOWEST, HIGHEST, BINS + 1)

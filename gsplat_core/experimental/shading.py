@@ -88,7 +88,7 @@ class Shading(Cells):
 
 @dataclass(frozen=True)
 class SmallPicture:
-    """Picture reduced for the analysis of its light."""
+    """Picture reduced in size, from which depth is estimated by shading."""
 
     levels: NDArray[np.uint8]
     """Reduced picture, RGB uint8 [H, W, 3]."""
@@ -99,7 +99,7 @@ class SmallPicture:
 
     @classmethod
     def of(cls, frame: Frame) -> SmallPicture:
-        """Reduce a frame. Exposure is ignored since it is uniform over the picture."""
+        """Return a frame's picture at reduced size. Exposure is ignored since it is uniform over the picture."""
         return _reduced(frame)
 
     @property

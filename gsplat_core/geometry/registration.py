@@ -38,7 +38,7 @@ class Closest(NamedTuple):
     normals: Array
     """Unit normals [N, 3] of the triangles that contain the points."""
     distances: Array
-    """Non-negative distances [N]."""
+    """Distances of the points to the mesh, not negative, [N]."""
 
 
 class ClosestPoints:

@@ -202,7 +202,7 @@ class SnapshotSlots:
     """Slots of one publisher. One thread publishes; any thread may hold snapshots."""
 
     def __init__(self, device: torch.device | str, most: int = MOST_SLOTS, rows: int = 0) -> None:
-        """Create slots on demand.
+        """Create an empty pool; slots are allocated on demand.
 
         Args:
             device: device of the slots.

@@ -184,7 +184,8 @@ separated poses may be worse than the static ones.
 
 @one_thread()
 def separability(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
-    """Compare the motion attributed to the tissue with its expected error.
+    """Return whether poses without breathing motion are more reliable than those for static tissue, and the possible
+    error.
 
     Args:
         before: poses estimated for static tissue [C, 4, 4].

@@ -127,7 +127,7 @@ class _Smoothness:
     triangle: Tensor
     """Triangular QR factor of the columns [1, waves], whitened by `factor`, [1 + B, 1 + B]."""
     scale: Tensor
-    """Variance of each coordinate, [6]."""
+    """Variance of each pose coordinate in the trajectory prior, [6]."""
 
     def precision(self, one: Tensor) -> Tensor:
         """Return the precision matrices [6, C, C] with a free constant offset."""
@@ -366,8 +366,8 @@ def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: T
 def _amplitude_terms(
     bundle: MovingBundle, square: Tensor, pull: Tensor, places: _Places, eliminated: Tensor, *, held: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return coupling of amplitudes to cameras [6 C, n], their own matrix [n, n] and gradient [n],
-    after eliminating the rest positions.
+    """Return the Hessian blocks of amplitudes and cameras [6 C, n] and of the amplitudes [n, n], and the amplitudes'
+    gradient [n], after eliminating the rest positions.
     """
     count, waves = len(bundle.rest), bundle.waves[bundle.camera]
     cameras, wave_count, nodes = len(bundle.poses), waves.shape[1], bundle.influence.shape[1]

@@ -60,7 +60,7 @@ class Budget:
 
     @staticmethod
     def given(budget: Budget | None, steps: int | None) -> Budget | None:
-        """Return the budget, or one of `steps` steps, or None if neither is given.
+        """Return `budget`, or a new budget of `steps` steps; None if neither is given.
 
         Raises:
             InvalidInput: if both are given.

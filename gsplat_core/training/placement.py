@@ -129,7 +129,7 @@ class CapturedCorrection:
     """
 
     def __init__(self, rows: Gaussians, motion: CapturedMotion, camera: Camera) -> None:
-        """Prepare the correction.
+        """Allocate the buffers for correcting the depths of a scene.
 
         Args:
             rows: the scene's tensors with all allocated rows.

@@ -28,7 +28,8 @@ RENDERED_PX = 160
 COMPARED_PX = 64
 """Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels."""
 FINE_PX, COARSE_PX = 1.0, 16.0
-"""Standard deviations, in pixels of that size, of the band-pass filter that removes noise and illumination."""
+"""Standard deviations, in pixels of the compared pictures, of the band-pass filter that removes noise and illumination.
+"""
 SAME_PLACE = 0.75
 """Correlation from which a picture counts as showing a left scene. See benchmarks/results/constants.md."""
 LEAST_SHARE = 0.3

@@ -212,7 +212,7 @@ class NewestFirstSchedule(Schedule):
     """
 
     def __init__(self, live: LiveTraining, config: ReconstructorConfig, device: torch.device) -> None:
-        """Create the schedule.
+        """Create the schedule of training steps per frame.
 
         Raises:
             InvalidSetting: if `live` requests colour correction that `config` does not allow.

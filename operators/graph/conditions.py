@@ -173,7 +173,7 @@ class AsynchronousCondition(Condition):
 
     @property
     def event_state(self) -> AsynchronousEventState:
-        """State of the event."""
+        """State of the awaited event."""
         return self._state
 
     @event_state.setter

@@ -18,7 +18,7 @@ class SinkOptions:
     """Parameters of a run that the factories in `SINKS` receive."""
 
     out: Path
-    """Output folder of the run."""
+    """Folder for all output of the run."""
     source: SourceDescription
     reserve: StorageReserve
     """Check that each write leaves enough free disk space to finish the run."""

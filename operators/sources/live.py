@@ -36,7 +36,7 @@ class Backoff:
     def __init__(self, first_s: float = FIRST_S, most_s: float = MOST_S) -> None:
         self._first_s, self._most_s = first_s, most_s
         self.failures = 0
-        """Number of consecutive failures."""
+        """Number of failed attempts in a row."""
 
     def failed(self) -> float:
         """Record a failure. Return the delay in seconds."""
@@ -236,7 +236,7 @@ class LiveSource(ThreadedSource):
         """Return the stop event of the current thread. A reader that outlived `close` keeps its own event."""
         return getattr(self._own, "stop", self._stop)
 
-    # Methods for the consumer.
+    # Methods for the consumer of the frames.
 
     @property
     def drops(self) -> bool:

@@ -116,7 +116,7 @@ class FrameReader:
             return [memoryview(bytearray(memory[begin : begin + size])) for begin, size in places]
 
     def close(self) -> None:
-        """Unmap the memory."""
+        """Unmap the shared memory."""
         if self._memory is not None:
             self._memory.close()
             self._memory = None

@@ -31,7 +31,7 @@ from gsplat_core.scene.frames import Frame
 
 
 class SourceState(Enum):
-    """State of a source."""
+    """Whether a source delivers frames."""
 
     LIVE = "live"
     """Frames arrive as expected."""
@@ -76,7 +76,7 @@ class SourceDescription:
 
     @staticmethod
     def from_json(content: Any) -> SourceDescription:
-        """Return the description of `as_json`.
+        """Return the description from the JSON values that `as_json` returned.
 
         Raises:
             InvalidMessage: the content does not describe a source.

@@ -62,7 +62,7 @@ class Entry:
 
 
 def parse_line(line: bytes) -> tuple[Entry, str]:
-    """Parse a line of `Entry.line`.
+    """Return the entry and digest of a line of the audit log.
 
     Returns:
         The entry and the stated digest.

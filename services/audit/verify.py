@@ -36,7 +36,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of `verify`."""
+    """Result of checking the audit log's chain of digests."""
 
     entries: int
     head: Head

@@ -29,7 +29,7 @@ MAX_PART_BYTES = max(np.dtype(array.kind).itemsize * array.values for array in A
 
 @dataclass(frozen=True)
 class Picture:
-    """Picture with its header."""
+    """Picture received from a publisher, with its header."""
 
     header: Mapping[str, Any]
     image: NDArray[np.uint8]

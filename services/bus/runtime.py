@@ -290,7 +290,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a file of `write_json`.
+    """Read a JSON file written by `write_json`.
 
     Raises:
         BadMessage: if the content is malformed.

@@ -42,7 +42,7 @@ class Check:
 
 
 def doctor_command(*, as_json: bool) -> int:
-    """Print all checks.
+    """Print the result of each check of this machine.
 
     Returns:
         The exit code; 2 if a needed component is missing.

@@ -70,7 +70,7 @@ def _why_cuda_does_not_start() -> str:
 
 
 def main() -> int:
-    """Print the result.
+    """Print whether the GPU works.
 
     Returns:
         The exit code; 0 if a GPU is usable.

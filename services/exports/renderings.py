@@ -20,7 +20,7 @@ PICTURES: Mapping[str, ExportFormat] = {
 
 @dataclass(frozen=True)
 class RenderWish:
-    """Requested rendering of a model.
+    """Rendering of a model that a client requests: format, viewpoint and size.
 
     Raises:
         InvalidSetting: if the fields do not fit together.

@@ -198,7 +198,7 @@ class PoolProcess:
 
 
 def new_runner(ray: str | None) -> Runner:
-    """Create the runner.
+    """Create the runner of job attempts: on a Ray cluster, or on this machine.
 
     Raises:
         StoreUnavailable: if Ray is configured and cannot be used.

@@ -110,7 +110,7 @@ class RecordingRetention:
         events: SystemEvents,
         trusts_ages: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Set the limits.
+        """Set the age and total size beyond which recordings are deleted.
 
         Args:
             store: recordings.
@@ -140,7 +140,7 @@ class RecordingRetention:
             await asyncio.to_thread(self._store.close)
 
     async def enforce(self) -> None:
-        """Delete recordings beyond the limits.
+        """Delete recordings that are too old, or the oldest if all take too much space.
 
         Raises:
             StoreUnavailable: if the database does not answer.
@@ -171,7 +171,7 @@ class ReplayRetention:
         events: SystemEvents,
         trusts_ages: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Set the limits; see `RecordingRetention`."""
+        """Set the age and number beyond which replays are deleted."""
         self._replays, self._most, self._events = replays, keep_results, events
         self._trusts_ages = trusts_ages
         self._max_age_s = None if keep_days is None else keep_days * DAY_S
@@ -187,7 +187,7 @@ class ReplayRetention:
             await asyncio.gather(task, return_exceptions=True)
 
     async def enforce(self) -> None:
-        """Delete replays beyond the limits.
+        """Delete replays that are too old or too many.
 
         Raises:
             StoreUnavailable: if the database does not answer.

@@ -169,7 +169,7 @@ class Task:
         _write(Path(self.folder) / OUTCOME, {"state": str(state), "reason": reason})
 
     def progress(self) -> JobProgress:
-        """Return the reported progress."""
+        """Return the progress that the attempt reported."""
         said = _read(Path(self.folder) / PROGRESS)
         return JobProgress(**said) if said else JobProgress(0, None, None)
 

@@ -24,7 +24,7 @@ class Runner(Protocol):
     starts and ends them."""
 
     def start(self, task: Task) -> None:
-        """Start an attempt."""
+        """Start an attempt of a job."""
 
     def ended(self) -> Mapping[str, str]:
         """Return the attempts that ended since the last call: job id and description of the end."""
@@ -34,7 +34,7 @@ class Runner(Protocol):
         """Kill an attempt; `ended` reports it. No effect on an ended attempt."""
 
     def close(self) -> None:
-        """Kill all attempts."""
+        """Kill all running attempts of jobs."""
 
 
 ORPHANED = 3
@@ -58,7 +58,7 @@ class Forks:
     def __init__(self) -> None:
         self._life_read, self._life_write = os.pipe()
         self._pids: dict[int, str] = {}
-        """Job id per process."""
+        """Id of the job that each running process executes."""
 
     def start(self, task: Task) -> None:
         """Start an attempt in a forked process."""
@@ -169,7 +169,7 @@ class OnRay:
         except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
             raise StoreUnavailable(f"Ray at {address} cannot be used: {error}; check that it runs") from error
         self._attempts: dict[Any, str] = {}
-        """Job id per attempt."""
+        """Id of the job of each running Ray task."""
 
     def start(self, task: Task) -> None:
         """Start an attempt as a Ray task."""

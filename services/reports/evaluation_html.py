@@ -310,7 +310,7 @@ def facts_section(report: EvaluationReport) -> str:
 
 
 def notes_section(report: EvaluationReport) -> str:
-    """Return the notes."""
+    """Return the section with the notes."""
     if not report.notes:
         return ""
     items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
@@ -322,7 +322,7 @@ def _rows(facts: dict[str, str]) -> str:
 
 
 def write_evaluation_html(report: EvaluationReport, path: Path) -> None:
-    """Write the page atomically."""
+    """Write the HTML page of an evaluation atomically."""
     write_whole(path, render_evaluation(report).encode())
 
 

@@ -294,13 +294,13 @@ class EvaluationReport(Part):
     series_frames_per_entry: dict[str, Annotated[int, Field(ge=1)]]
 
     def write(self, path: Path) -> None:
-        """Write JSON atomically."""
+        """Write the report as a JSON file, atomically."""
         text = json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False)
         write_whole(path, (text + "\n").encode())
 
     @classmethod
     def read(cls, path: Path) -> EvaluationReport:
-        """Read a report.
+        """Read a report from its JSON file.
 
         Raises:
             pydantic.ValidationError: if the content does not match the schema.

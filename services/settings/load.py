@@ -44,7 +44,7 @@ class YamlFile:
 
     @classmethod
     def read(cls, path: Path) -> YamlFile:
-        """Read a file.
+        """Read a YAML settings file.
 
         Raises:
             SettingsInvalid: if the file is missing, is not YAML, or repeats a key.

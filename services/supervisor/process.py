@@ -42,7 +42,7 @@ class Restarts:
         settled_s: float = SETTLED_S,
         most_worked_s: float = MOST_WORKED_S,
     ) -> None:
-        """Set the delays, all in seconds.
+        """Set the delays between restarts, all in seconds.
 
         Args:
             first_s: delay before the second restart in a row; doubles with each further restart.
@@ -141,7 +141,7 @@ class Rate:
             self._samples.popleft()
 
     def clear(self) -> None:
-        """Discard all samples."""
+        """Discard all samples of the counter."""
         self._samples.clear()
 
     @property

@@ -289,7 +289,7 @@ class Layers:
         self._changed = threading.Condition()
         self._scene: Scene | None = None
         self._number = 0
-        """Number of offered scenes."""
+        """Number of scenes offered for drawing so far."""
         self._drawn_of: dict[Layer, tuple[int, float]] = dict.fromkeys(LAYERS, (0, 0.0))
         """Number of the scene that each layer drew last, and the start time of that drawing."""
         self._watched: frozenset[Layer] = frozenset()
@@ -300,7 +300,7 @@ class Layers:
         self._thread = threading.Thread(target=self._run, name="layers", daemon=True)
 
     def open(self) -> None:
-        """Start the thread."""
+        """Start the thread that draws layers."""
         self._thread.start()
 
     def close(self) -> None:

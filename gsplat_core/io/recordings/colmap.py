@@ -43,7 +43,7 @@ HELD_OUT_EVERY = 8
 
 @dataclass(frozen=True)
 class PosedImage:
-    """Image of a scene."""
+    """Image of a static scene, with its camera."""
 
     name: str
     """Path of the image inside `images/`."""

@@ -51,7 +51,7 @@ VIEWS_FILE = "views.json"
 VIEWS_FORMAT = "intrasplat-views"
 VIEWS_VERSION = 1
 MOST_VIEWS = 16
-"""Maximum number of additional cameras."""
+"""Maximum number of additional cameras in a recording."""
 
 
 @dataclass(frozen=True)

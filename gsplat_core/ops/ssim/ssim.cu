@@ -17,7 +17,7 @@ constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 __device__ constexpr float kTap[kRadius + 1] = {0.266011724862f,  0.213005537711f,   0.10936068951f,
                                                 0.0360007721284f, 0.00759875813524f, 0.00102838008448f};
 
-// Return a column or row of a tile in shared memory, filtered around its element `at`.
+// Return the Gaussian-filtered value at `at`, along a column or row of a tile in shared memory.
 template <int kStep>
 __device__ inline float filter(const float* at) {
   float sum = kTap[0] * at[0];

@@ -50,7 +50,7 @@ struct Images {
   }
 };
 
-// Write `map`, or add to `gradient` the gradient of `upstream` times the map; the other pointer is null.
+// Compute SSIM: write its map, or add its gradient, scaled by `upstream`, to `gradient`; the other pointer is null.
 void run(Call& call, const Images& images, const float* upstream, float* map, float* gradient) {
 #if defined(GSPLAT_CUDA)
   check(images.height <= kSsimMostRows && images.width <= kSsimMostRows, "image must have at most ", kSsimMostRows,

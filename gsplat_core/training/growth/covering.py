@@ -88,7 +88,7 @@ class Uncovered:
     """Tissue of one frame that the scene does not cover, as tensors that are being copied to the host."""
 
     pixels: HostCopy
-    """Uncovered pixels, bool [H, W]."""
+    """Pixels of tissue that no Gaussian covers, bool [H, W]."""
     depth: HostCopy | None
     """Depth of the scene, float32 [H, W], 0 where uncovered; None if the frame's own depth is used."""
 

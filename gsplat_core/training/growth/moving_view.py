@@ -206,7 +206,7 @@ class NewTissue:
         return self._grid[wanted.numpy()], depth_mm.numpy()
 
     def _of_cells(self, values: Tensor) -> Tensor:
-        """Expand cell values [rows, columns] to pixels [H, W]."""
+        """Return the values of cells [rows, columns] at each pixel in them, [H, W]."""
         size = self._camera.height_px, self._camera.width_px
         row, column = (
             (torch.arange(pixels, device=values.device) / self._spacing).long().clamp(max=cells - 1)

@@ -50,7 +50,7 @@ class Triangulated(NamedTuple):
     pixels: Tensor
     """Pixel coordinates [P, 2] in the frame."""
     points: Tensor
-    """Positions [P, 3]."""
+    """Positions of triangulated points, [P, 3]."""
 
 
 class TriangulationLoss:

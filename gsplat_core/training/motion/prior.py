@@ -394,7 +394,7 @@ class Following:
             self._waiting.append((frame, observation))
 
     def skip(self, step: TrainingStep) -> None:
-        """Process the two newest trained frames. Called when a frame is displayed without training, so that the
+        """Give the prior the two newest trained frames. Called when a frame is displayed without training, so that the
         published scene keeps moving.
         """
         if self._at_once:

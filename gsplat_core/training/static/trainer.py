@@ -51,7 +51,7 @@ class Start:
 
 
 STARTS = {"adc": Start(), "mcmc": Start(0.5, 0.1, 0.01, 0.01), "none": Start()}
-"""Strategies by name: adaptive density control, MCMC, and a fixed number of Gaussians."""
+"""Initial values for each strategy: adaptive density control, MCMC, and a fixed number of Gaussians."""
 ABSGRAD_THRESHOLD = 0.0008
 """Gradient above which Gaussians multiply with `absgrad` (Ye et al. 2024)."""
 REFINE_EVERY = 100

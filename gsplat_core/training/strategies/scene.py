@@ -24,7 +24,7 @@ class Plan:
     """An offline training that is about to begin."""
 
     step: TrainingStep
-    """Scene and optimiser."""
+    """Scene that the strategy changes, with its optimiser."""
     observations: Sequence[Observation]
     """Observations of both eyes to train on."""
     steps: int
