@@ -321,7 +321,12 @@ class Reconstructor:
             self._covering.cover(self._step, frame, observation, first=number == 0)
             given.tracks.apply(self._step, number, first_new)
         training = OfflineTraining(
-            self._step, seen, most_gaussians=self.config.max_gaussians, seed=self._seed, strategy=self.config.strategy
+            self._step,
+            seen,
+            between=given.between,
+            most_gaussians=self.config.max_gaussians,
+            seed=self._seed,
+            strategy=self.config.strategy,
         )
         loss = training(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)

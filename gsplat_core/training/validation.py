@@ -17,7 +17,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 
 VALIDATE_EVERY = 9
 """One of this many training frames validates."""
-LEAST_FRAMES = 2
+LEAST_FRAMES = 1
 """Smallest number of validation frames from which steps are chosen."""
 FIRST_STEPS = 500
 """Steps of the first trial. Each further trial has twice as many."""
@@ -25,6 +25,8 @@ MOST_STEPS = 64_000
 """Largest number of steps that is tried."""
 LEAST_GAIN_DB = 0.05
 """Smallest gain of a trial, in dB, for which longer trainings are tried."""
+INPUT_GAIN_DB = 0.3
+"""Smallest gain, in dB, for which other inputs than the given ones are used. Depth also gives the scale and the shape."""
 USUAL_STEPS = 2000
 """Steps for recordings with too few frames to validate."""
 
@@ -39,6 +41,8 @@ class Trial:
     steps: int
     psnr_db: float
     """Mean tissue PSNR of the validation frames, in dB."""
+    seconds: float = 0.0
+    """Duration of the training and its validation."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,16 @@ def validation_psnr_db(learned: Reconstructor, frames: Sequence[Frame]) -> float
     return fmean([each for each in scores if math.isfinite(each)] or [0.0])
 
 
-def choose_steps(train: Callable[[int], float], limit_s: float, clock: Clock, spent_s: float = 0.0) -> ChosenSteps:
+def trial_of(train: Callable[[int], float], steps: int, clock: Clock) -> Trial:
+    """Train with a number of steps and return the score and the duration."""
+    began = clock()
+    psnr_db = train(steps)
+    return Trial(steps, psnr_db, clock() - began)
+
+
+def choose_steps(
+    train: Callable[[int], float], limit_s: float, clock: Clock, spent_s: float = 0.0, first: Trial | None = None
+) -> ChosenSteps:
     """Find the number of steps with the best validation score, by trials of doubling length.
 
     The search leaves enough of the time limit for the training on all frames.
@@ -97,24 +110,20 @@ def choose_steps(train: Callable[[int], float], limit_s: float, clock: Clock, sp
         limit_s: time for the search and the training on all frames, in seconds.
         clock: source of the time.
         spent_s: part of the limit that is already spent, in seconds.
+        first: trial of `FIRST_STEPS`, if it is known.
     """
-    begin, trials, steps = clock() - spent_s, [], FIRST_STEPS
-    best: Trial | None = None
-    step_s = 0.0
-    while True:
+    begin = clock() - spent_s
+    best = first or trial_of(train, FIRST_STEPS, clock)
+    trials = [best]
+    while 2 * best.steps <= MOST_STEPS:
+        steps, step_s = 2 * best.steps, best.seconds / best.steps
         left_s = limit_s - (clock() - begin)
         # A trial is followed by a training of the same length on all frames.
-        if best is not None and 2 * steps * step_s > left_s:
-            longest = int(left_s / step_s) if step_s else steps
-            return ChosenSteps(max(1, min(steps, longest)), tuple(trials), "limit")
-        began = clock()
-        trial = Trial(steps, train(steps))
+        if 2 * steps * step_s > left_s:
+            return ChosenSteps(max(1, min(steps, int(left_s / step_s))), tuple(trials), "limit")
+        trial = trial_of(train, steps, clock)
         trials.append(trial)
-        step_s = (clock() - began) / steps
-        if best is not None and trial.psnr_db < best.psnr_db + LEAST_GAIN_DB:
-            chosen = trial if trial.psnr_db > best.psnr_db else best
-            return ChosenSteps(chosen.steps, tuple(trials), "best")
+        if trial.psnr_db < best.psnr_db + LEAST_GAIN_DB:
+            return ChosenSteps(max(trial, best, key=lambda one: one.psnr_db).steps, tuple(trials), "best")
         best = trial
-        if 2 * steps > MOST_STEPS:
-            return ChosenSteps(steps, tuple(trials), "most")
-        steps *= 2
+    return ChosenSteps(best.steps, tuple(trials), "most")

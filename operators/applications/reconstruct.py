@@ -6,10 +6,10 @@ The protocol's held-out frames are excluded from training. The evaluation uses t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -18,17 +18,20 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.models.model import Model
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training import validation
 from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.offline import ToFit
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes
 from gsplat_core.training.validation import (
+    INPUT_GAIN_DB,
     LEAST_FRAMES,
     USUAL_STEPS,
     ChosenSteps,
     Clock,
     choose_steps,
     split,
+    trial_of,
     validation_psnr_db,
 )
 from operators.applications.device import seeded
@@ -50,6 +53,8 @@ from operators.sources.source import FrameSource
 
 MINUTES_ON_GPU, MINUTES_ON_CPU = 1.0, 10.0
 """Time limits of a training with an automatic number of steps, in minutes."""
+ALTERNATIVE_SHARE = 0.1
+"""Share of the time limit from which a first trial is too long to try other inputs."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,7 @@ def reconstruct(
         source = prepare(inside, notes, offline=True)
         start = Start.now()
         fitted = _Fitting(source, inside, progress, stop_requested, notes, clock).done(steps)
-        model = fitted.model
+        model, inside = fitted.model, fitted.settings
         graph = replay_graph(
             source,
             inside,
@@ -157,6 +162,45 @@ class Fitted(NamedTuple):
     eyes: BothEyes
     """Eyes that were trained on."""
     steps: ChosenSteps
+    settings: ReplaySettings
+    """Settings with the inputs that were chosen."""
+
+
+class _Inputs:
+    """Settings of a training with the frames that it gets."""
+
+    def __init__(self, source: FrameSource, settings: ReplaySettings) -> None:
+        self.settings, self._source = settings, source
+        learning = self.new()
+        self.eyes = learning.eyes
+        frames = self._frames()
+        self.have_depth = any(frame.depth is not None for frame in frames)
+        self.have_poses = any(frame.pose is not None for frame in frames)
+        self.given = learning.prepared(frames)
+        self.have_depth |= any(one.depth is not None for one in self.given.seen)
+
+    def new(self) -> Reconstructor:
+        """Create an untrained reconstructor."""
+        return new_reconstructor(self.settings, self._source, offline=True)
+
+    def _frames(self) -> list[Frame]:
+        """Return the training frames with their depth."""
+        description, settings = self._source.description, self.settings
+        if description.digest is None or description.frame_count is None:
+            raise InvalidSetting(
+                f"{description.name} can be read only once; reconstruct needs a recording, or use replay"
+            )
+        # `fit` estimates depth that needs all frames at once.
+        choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
+        finder = DepthFinder(choice, description.camera, device=settings.device)
+        frames = FirstFrames(self._source, description.frame_count)
+        chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
+        if not chosen:
+            raise NothingShown(
+                f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on, since they are damaged,"
+                " withheld or held out; give a recording with other frames"
+            )
+        return chosen
 
 
 class _Fitting:
@@ -174,38 +218,55 @@ class _Fitting:
         self._source, self._settings, self._progress = source, settings, progress
         self._stop_requested, self._notes, self._clock = stop_requested, notes, clock
         self._begin_s = clock()
-        self._learning = self._new()
-        self._eyes = self._learning.eyes
+        self._learning: Reconstructor | None = None
         self._is_stopped = False
 
     def done(self, steps: int | None) -> Fitted:
-        """Train with a number of steps; None chooses the number first."""
+        """Train with a number of steps; None chooses the number and the inputs first."""
         settings = self._settings
         with seeded(settings.seed, settings.device):
-            given = self._learning.prepared(self._frames())
-            chosen = ChosenSteps(steps, (), "given") if steps is not None else self._chosen(given)
+            inputs = _Inputs(self._source, settings)
+            chosen = ChosenSteps(steps, (), "given")
+            if steps is None:
+                inputs, chosen = self._chosen(inputs)
             if not self._is_stopped:
-                self._learning = self._new()
-                self._train(given, chosen.steps, "train")
-        if chosen.reason != "given" and not self._is_stopped:
+                self._train(inputs, inputs.given, chosen.steps, "train")
+        learning = self._learning
+        assert learning is not None
+        if steps is None and not self._is_stopped:
             self._notes.append(chosen.sentence)
-        for doubt, count in sorted(self._learning.depth_doubts.items()):
+        for doubt, count in sorted(learning.depth_doubts.items()):
             self._notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
-        return Fitted(self._learning.snapshot(), self._eyes, chosen)
+        return Fitted(learning.snapshot(), inputs.eyes, chosen, inputs.settings)
 
-    def _chosen(self, given: ToFit) -> ChosenSteps:
-        part, validation = split(given)
-        if len(validation) < LEAST_FRAMES:
-            return ChosenSteps(USUAL_STEPS, (), "few frames")
+    def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
+        """Return the inputs and the number of steps that are best for validation frames."""
+        if len(split(inputs.given)[1]) < LEAST_FRAMES:
+            return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
+        limit_s = 60 * self._minutes
+        first = trial_of(self._trial(inputs), validation.FIRST_STEPS, self._clock)
+        for reason, change in _alternatives(inputs):
+            if self._is_stopped or first.seconds > ALTERNATIVE_SHARE * limit_s:
+                break
+            other = _Inputs(self._source, replace(inputs.settings, **change))
+            trial = trial_of(self._trial(other), validation.FIRST_STEPS, self._clock)
+            if trial.psnr_db >= first.psnr_db + INPUT_GAIN_DB and not self._is_stopped:
+                self._notes.append(
+                    f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"
+                )
+                inputs, first = other, trial
+        return inputs, choose_steps(self._trial(inputs), limit_s, self._clock, self._clock() - self._begin_s, first)
+
+    def _trial(self, inputs: _Inputs) -> Callable[[int], float]:
+        """Return a function that trains without the validation frames and returns their score."""
+        part, kept = split(inputs.given)
 
         def train(steps: int) -> float:
             if self._is_stopped:
                 return -math.inf  # ends the search
-            self._learning = self._new()
-            self._train(part, steps, "validate")
-            return validation_psnr_db(self._learning, validation)
+            return validation_psnr_db(self._train(inputs, part, steps, "validate"), kept)
 
-        return choose_steps(train, 60 * self._minutes, self._clock, self._clock() - self._begin_s)
+        return train
 
     @property
     def _minutes(self) -> float:
@@ -214,30 +275,9 @@ class _Fitting:
             return settings.minutes
         return MINUTES_ON_CPU if settings.device == "cpu" else MINUTES_ON_GPU
 
-    def _new(self) -> Reconstructor:
-        return new_reconstructor(self._settings, self._source, offline=True)
-
-    def _frames(self) -> list[Frame]:
-        """Return the training frames with their depth."""
-        description, settings = self._source.description, self._settings
-        if description.digest is None or description.frame_count is None:
-            raise InvalidSetting(
-                f"{description.name} can be read only once; reconstruct needs a recording, or use replay"
-            )
-        # `fit` estimates depth that needs all frames at once.
-        choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
-        finder = DepthFinder(choice, description.camera, device=settings.device)
-        frames = FirstFrames(self._source, description.frame_count)
-        chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
-        if not chosen:
-            raise NothingShown(
-                f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on, since they are damaged,"
-                " withheld or held out; give a recording with other frames"
-            )
-        return chosen
-
-    def _train(self, given: ToFit, steps: int, stage: str) -> None:
-        """Train the present reconstructor until its last step or a stop request."""
+    def _train(self, inputs: _Inputs, given: ToFit, steps: int, stage: str) -> Reconstructor:
+        """Train until the last step or a stop request."""
+        learning = self._learning = inputs.new()
         done = 0
 
         def after_step(step: int, loss: Tensor) -> None:
@@ -249,8 +289,17 @@ class _Fitting:
                 raise _StopFitting
 
         try:
-            self._learning.fit(given, steps, after_step)
+            learning.fit(given, steps, after_step)
         except _StopFitting:
             self._is_stopped = done < steps or stage != "train"
         if self._is_stopped:
             self._notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
+        return learning
+
+
+def _alternatives(inputs: _Inputs) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield other inputs to try, each as a sentence for the report and changed options."""
+    if inputs.have_depth and inputs.settings.depth != "none":
+        yield "depth was not used, because it makes the pictures worse", {"depth": "none"}
+    if inputs.settings.eyes == "both":
+        yield "the right eye was not used, because it makes the pictures of the left one worse", {"eyes": "left"}

@@ -1,0 +1,52 @@
+"""Pictures interpolated at the times of missing frames."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.motion.between import between_frames
+from gsplat_core.training.observations import Observation
+
+WIDTH, HEIGHT = 96, 64
+CAMERA = Camera(K=np.array([[80.0, 0, WIDTH / 2], [0, 80.0, HEIGHT / 2], [0, 0, 1]]), width_px=WIDTH, height_px=HEIGHT)
+
+
+def pictures(count: int, px_per_frame: float, noise: float) -> list[np.ndarray]:
+    """Return smooth texture that moves to the right, with independent noise in each picture."""
+    random = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(random.uniform(0, 255, (HEIGHT, WIDTH + 200, 3)), (0, 0), 3)
+    texture = (texture - texture.mean()) * 6 + 128
+    found = []
+    for number in range(count):
+        x = np.arange(WIDTH, dtype=np.float32)[None] + np.float32(100 - number * px_per_frame)
+        y = np.arange(HEIGHT, dtype=np.float32)[:, None]
+        moved = cv2.remap(texture.astype(np.float32), *np.broadcast_arrays(x, y), cv2.INTER_LINEAR)
+        found.append((moved + noise * random.standard_normal(moved.shape)).clip(0, 255).astype(np.uint8))
+    return found
+
+
+def seen(images: list[np.ndarray], numbers: list[int]) -> list[Observation]:
+    tissue = torch.ones(HEIGHT, WIDTH, dtype=torch.uint8)
+    return [Observation(n, n / 30, CAMERA, torch.from_numpy(images[n]), tissue, None) for n in numbers]
+
+
+@pytest.mark.parametrize(
+    "px_per_frame, noise, least_gain_db", [(2.0, 1.0, 3.0), (0.0, 8.0, 1.0)], ids=["moves", "still"]
+)
+def test_a_missing_frame_is_better_than_its_neighbour(px_per_frame, noise, least_gain_db):
+    images = pictures(10, px_per_frame, noise)
+    (found,) = between_frames(seen(images, [0, 1, 2, 3, 4, 6, 7, 8, 9]))
+    assert found.time_s == pytest.approx(5 / 30)
+    shown = found.image.numpy()
+    copied = psnr_tissue_db(images[4], images[5])
+    assert psnr_tissue_db(shown, images[5]) > copied + least_gain_db
+
+
+@pytest.mark.parametrize("numbers", [[0, 1, 2, 3], [0, 1, 2, 3, 9], [0]], ids=["none missing", "many missing", "one"])
+def test_other_intervals_are_left_alone(numbers):
+    assert between_frames(seen(pictures(10, 1.0, 0.0), numbers)) == []
