@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.falling_behind import BehindGuard
 from operators.frame_clock import FrameClock
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
 from operators.graph.tracking import DurationSummary, Histogram
@@ -30,6 +31,7 @@ WAITING = 4
 """Capacity of the input queue, in pictures."""
 COLOURS = {
     PictureState.LIVE: (40, 200, 80),
+    PictureState.BEHIND: (255, 190, 0),
     PictureState.STALE: (255, 190, 0),
     PictureState.FROZEN: (255, 90, 0),
     PictureState.SOURCE_LOST: (230, 0, 40),
@@ -86,6 +88,7 @@ class DisplayOp(Operator):
     Params:
         clock: clock of the run; receives the measured display latency.
         source_state: returns the state of the source; thread-safe.
+        guard: judge of the pictures, shared with training; None for one without effect on training.
     """
 
     def __init__(
@@ -94,9 +97,10 @@ class DisplayOp(Operator):
         *args: Any,
         clock: FrameClock,
         source_state: Callable[[], SourceState],
+        guard: BehindGuard | None = None,
         **kwargs: Any,
     ) -> None:
-        self.clock = clock
+        self.clock, self._guard = clock, guard or BehindGuard()
         self.source_state = source_state
         self._tissue = RememberedTissue()
         self._reset()
@@ -123,6 +127,8 @@ class DisplayOp(Operator):
         self._first_ms: float | None = None
         self._current: RenderedFrame | None = None
         self._sent_ns = 0
+        self._is_behind = False
+        self._guard.reset()
 
     @property
     def age_p50_ms(self) -> float:
@@ -133,11 +139,14 @@ class DisplayOp(Operator):
         arrived: RenderedFrame | None = op_input.receive("rendered")
         if arrived is not None:
             self._current = arrived
+            self._is_behind = self._guard.judge(arrived.frame, arrived.image)
         if self._current is None:
             return
         now_ns = self.clock.now_ns()
         age_ns = max(0, now_ns - _content_ns(self._current, now_ns))
         state = picture_state(age_ns, self.clock.interval_ns, self.source_state())
+        if self._is_behind and state is PictureState.LIVE:
+            state = PictureState.BEHIND
         changed = state is not self.state
         repeat = state is not PictureState.LIVE and now_ns - self._sent_ns >= REPEAT_NS
         if arrived is None and not changed and not repeat:

@@ -140,6 +140,8 @@ class PictureState(Enum):
 
     LIVE = "live"
     """The picture shows a frame that has just arrived."""
+    BEHIND = "behind"
+    """The picture is recent, but the model does not follow: the previous frame shown again would be better."""
     STALE = "stale"
     """The content is older than the limit for a live picture; newer frames may be in flight."""
     FROZEN = "frozen"

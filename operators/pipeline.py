@@ -17,7 +17,7 @@ sinks:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from operators.choices import SINKS, Policy
 from operators.compare_shown import CompareShownOp
 from operators.depth import DepthOp
 from operators.display import DisplayOp
+from operators.falling_behind import BehindGuard
 from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler, Operator
@@ -135,6 +136,8 @@ class Pace:
     """Returns True for frames that are displayed and scored but not trained on."""
     predict_every: int = 1
     """Predict one in this many frames before training on it; 0 for a finished model."""
+    guard: BehindGuard = field(default_factory=BehindGuard)
+    """Judge of live pictures, shared by training and display."""
 
     def scheduler(self, device: str, graph: Application) -> GreedyScheduler | MultiThreadScheduler:
         """Return the scheduler: one thread per operator for a live stream, otherwise that of `scheduler_for`."""
@@ -149,7 +152,7 @@ class Pace:
     def training(self, depth: DepthOp) -> Training:
         """Return the policy that decides how much each frame is trained on; `depth` is the graph's depth operator."""
         if self.clock is not None:
-            return UntilDisplay(self.clock, depth.background)
+            return UntilDisplay(self.clock, depth.background, self.guard)
         if self.session is not None:
             return RecordedCalls(self.session.schedule, self.session.late_depths)
         return EveryFrame(self.held_out)
@@ -295,6 +298,7 @@ class Pipeline(Application):
             name="display",
             clock=clock,
             source_state=lambda: self.frame_source.state,
+            guard=self.pace.guard,
         )
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})
         if outputs.recorder is not None:

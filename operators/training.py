@@ -29,6 +29,7 @@ from gsplat_core.training.budget import Budget
 from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.depth import BackgroundDepth, TakenDepth
+from operators.falling_behind import BehindGuard
 from operators.frame_clock import FrameClock
 from operators.graph.tracking import Histogram
 from operators.messages import Reconstruction
@@ -61,6 +62,8 @@ class TrainingCounts:
     """Those of `withheld` since the last frame that was not excluded."""
     scenes: dict[str, int] = field(default_factory=dict)
     """Number of times that the model was restarted for a new scene, by reason."""
+    renewed: int = 0
+    """Number of times that the model of a scene fell behind and was started anew."""
     places_found: int = 0
     """Number of new scenes recognised as a place that the stream had shown before."""
 
@@ -123,10 +126,16 @@ class Learner:
             self._scene = frame.scene
         return True
 
-    def begin_scene(self, frame: Frame) -> None:
-        """Start a new scene in the reconstructor with its first frame `frame`, and clear the published model."""
-        self.counts.places_found += self.reconstructor.begin_scene(frame)
-        self._record(lambda: SceneBegun(seq=frame.seq))
+    def begin_scene(self, frame: Frame, *, anew: bool = False) -> None:
+        """Start a new scene in the reconstructor with its first frame `frame`, and clear the published model. With
+        `anew` it is the same scene, whose model fell behind.
+        """
+        if anew:
+            self.reconstructor.begin_scene(frame, anew=True)
+            self.counts.renewed += 1
+        else:
+            self.counts.places_found += self.reconstructor.begin_scene(frame)
+        self._record(lambda: SceneBegun(seq=frame.seq, anew=anew))
         self.newest = None
 
     def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool) -> Reconstruction:
@@ -247,14 +256,17 @@ class UntilDisplay(Training):
     model and not trained on.
     """
 
-    def __init__(self, clock: FrameClock, depth: BackgroundDepth | None = None) -> None:
+    def __init__(
+        self, clock: FrameClock, depth: BackgroundDepth | None = None, guard: BehindGuard | None = None
+    ) -> None:
         """Set the collaborators.
 
         Args:
             clock: display deadlines and training budgets.
             depth: depth estimator for trained frames; None disables late depth.
+            guard: judge of the displayed pictures, which requests that the model is started anew; None never does.
         """
-        self._clock, self._depth = clock, depth
+        self._clock, self._depth, self._guard = clock, depth, guard or BehindGuard()
         self.begin()
 
     def begin(self) -> None:
@@ -278,7 +290,12 @@ class UntilDisplay(Training):
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):
             return None
+        anew = usable and learner.newest is not None and self._guard.renewal_is_due()
+        if anew:
+            learner.begin_scene(frame, anew=True)
         first = learner.newest is None
+        if first:
+            self._guard.scene_begun(frame.seq, anew=anew)
         if usable and self._depth is not None:
             self._depth.offer(frame)
         budget = self._clock.budget(frame, first=first, behind=behind)
@@ -326,6 +343,8 @@ class UntilDisplay(Training):
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
         """Add notes on dropped frames and late depth to the outcome of the run."""
+        if counts.renewed:
+            outcome.note(f"the model fell behind the pictures and was started anew {counts.renewed} times")
         age_ms = self._depth_ages.summary().p50_ms
         outcome.add(TakenDepth(self._depths_taken, age_ms, self._depths_dropped))
         if self._depths_taken:
@@ -425,7 +444,7 @@ class RecordedCalls(Training):
             if self._observed and line.seq == next(reversed(self._observed)):
                 learner.grow(self._observed[line.seq])
         elif line.seq == frame.seq:
-            learner.begin_scene(frame)
+            learner.begin_scene(frame, anew=isinstance(line, SceneBegun) and line.anew)
 
     def _take_depth(self, line: DepthTaken | LostLine, learner: Learner) -> None:
         """Replay a late depth estimate, or note that the frame or depth is missing."""

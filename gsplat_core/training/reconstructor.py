@@ -246,22 +246,26 @@ class Reconstructor:
         if self._step is not None and self._growth is not None:
             self._growth.once(self._step, self._window.newest)
 
-    def begin_scene(self, frame: Frame) -> bool:
+    def begin_scene(self, frame: Frame, *, anew: bool = False) -> bool:
         """Leave the current scene. The next observed frame, `frame`, starts a new scene or returns to one that was left
         before.
 
         A bounded number of left scenes is kept in host memory in their last state. The frame may have another size.
         Version numbers continue.
 
+        Args:
+            frame: first frame of the scene.
+            anew: start the model of the present scene anew. The present one is not kept, and no left scene is recognised.
+
         Returns:
             True if the frame shows a scene that was left before.
         """
-        if self._step is not None:
+        if self._step is not None and not anew:
             self._left.leave(self._step, self._window.newest, self._last_time_s)
         self._end_scene()
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
-        return self._left.recognise(frame)
+        return not anew and self._left.recognise(frame)
 
     def forget(self) -> None:
         """Reset to the state before the first frame, but keep the allocated memory and the estimated step time."""

@@ -69,7 +69,7 @@ class FittedModel:
         self.model, self.eyes = model, eyes
         self.camera, self.device, self.parameter_count = model.camera, model.device, model.parameter_count
 
-    def begin_scene(self, frame: Frame) -> bool:
+    def begin_scene(self, frame: Frame, *, anew: bool = False) -> bool:
         """Ignore the scene change; the model covers all scenes."""
         return False
 

@@ -41,7 +41,7 @@ class StreamRequest(StreamSettings):
 
 
 class StreamView(BaseModel):
-    """Stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason` explains it."""
+    """Stream. `state`: stopped, starting, live, behind, stale, frozen, source lost or failed; `reason` explains it."""
 
     name: str = Field(examples=["endoscope"])
     source: str = Field(examples=["rtsp://10.0.0.5/stream"])

@@ -118,7 +118,7 @@ def _items(value: Any) -> Iterator[tuple[str, Any]]:
         yield from value.items()
 
 
-STATES = ("stopped", "starting", "live", "stale", "frozen", "source lost", "failed")
+STATES = ("stopped", "starting", "live", "behind", "stale", "frozen", "source lost", "failed")
 
 
 class StreamMeasures(Collector):

@@ -159,8 +159,8 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
     if engine.state != "running":
         return "starting", f"the camera's picture is live; the engine is {engine.state}: {engine.reason}"
     shown = (engine.figures.get("picture") or {}).get("state")
-    if shown == "live":
-        return "live", None
+    if shown in ("live", "behind"):
+        return str(shown), None
     if shown in ("stale", "frozen", "source lost"):
         return str(shown), _withheld_now(engine)
     return "starting", _withheld(engine) or "the first picture is being made"

@@ -18,6 +18,7 @@ from operators.display import (
     draw_label,
     picture_state,
 )
+from operators.falling_behind import BehindGuard
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.messages import PictureState
 from operators.outcome import OutcomeBuilder
@@ -119,7 +120,7 @@ def test_a_picture_that_is_not_live_is_labelled_even_where_labels_are_off(
     assert (lost.image != picture.image).any()
 
 
-@pytest.mark.parametrize("state", PictureState)
+@pytest.mark.parametrize("state", [state for state in PictureState if state is not PictureState.BEHIND])
 def test_the_label_is_drawn_into_a_copy(screen, rendered, frame, fake_time, compute_queued, state):
     picture = of_height(LEAST_LABELLED_PX, rendered, frame, fake_time)
     before = picture.image.copy()
@@ -306,3 +307,20 @@ def test_the_text_of_a_label_lies_in_its_box_in_the_colour_of_the_state(state):
     black = np.nonzero((inside == 0).all(-1))
     assert len(rows) > 20 and rows.max() < black[0].max() and columns.max() < black[1].max()
     assert len(black[0]) > len(rows)
+
+
+def test_a_picture_that_the_previous_frame_would_beat_is_shown_as_behind(rendered, frame, fake_time, compute_queued):
+    guard = BehindGuard()
+    guard.scene_begun(0)
+    clock = FrameClock(ClockSettings(), 30.0, fake_time)
+    operator = DisplayOp(None, clock=clock, source_state=lambda: SourceState.LIVE, guard=guard)
+    guard.scene_begun(0)
+    states = []
+    for seq in range(4):
+        arriving = frame(seq, arrived_ns=fake_time.ns)
+        image = 255 - arriving.image if seq in (1, 2) else arriving.image
+        (shown,) = compute_queued(operator, rendered=[rendered(seq, frame=arriving, image=image)])
+        states.append(shown.state)
+        fake_time.pass_ms(33)
+    assert states == [PictureState.LIVE, PictureState.BEHIND, PictureState.BEHIND, PictureState.LIVE]
+    assert operator.states == {"live": 2, "behind": 1}

@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from gsplat_core.io.sessions.records import SceneBegun
 from gsplat_core.scene.frames import FrameStatus
 from operators.depth import TakenDepth
+from operators.falling_behind import BehindGuard
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult, ReconstructOp
@@ -35,8 +37,8 @@ class FakeReconstructor:
     def whole_model(self, shown):
         return self.make_model(shown.version + 100)
 
-    def begin_scene(self, frame):
-        self.calls.append(("begin_scene", frame.seq))
+    def begin_scene(self, frame, *, anew=False):
+        self.calls.append(("begin_scene", frame.seq, anew) if anew else ("begin_scene", frame.seq))
         return False
 
     def grow(self, frame):
@@ -78,12 +80,13 @@ def live(model, camera, fake_time):
     clock = FrameClock(ClockSettings(), 30.0, fake_time)
     clock.wait_until_shown = lambda: None
     depth = FakeDepth()
+    guard = BehindGuard()
     operator = ReconstructOp(
-        None, make_reconstructor=lambda: fake, training=UntilDisplay(clock, depth), recorder=recorder
+        None, make_reconstructor=lambda: fake, training=UntilDisplay(clock, depth, guard), recorder=recorder
     )
     operator.start()
     return SimpleNamespace(
-        operator=operator, fake=fake, lines=lines, depths=depths, time=fake_time, depth=depth, clock=clock
+        operator=operator, fake=fake, lines=lines, depths=depths, time=fake_time, depth=depth, clock=clock, guard=guard
     )
 
 
@@ -128,6 +131,17 @@ def test_no_scene_begins_with_a_withheld_frame(live, one_by_one):
 def test_a_scene_begins_though_its_first_frame_was_lost_or_withheld(live, one_by_one, missed):
     one_by_one((0, {}), *missed, (2, {"scene": 1}), (3, {"scene": 1}))
     assert live.fake.seqs("begin_scene") == [2]
+
+
+def test_a_model_that_fell_behind_is_started_anew_with_the_next_usable_frame(live, one_by_one, frame):
+    one_by_one((0, {}))
+    for seq in range(3):
+        live.guard.judge(frame(seq), frame(seq).image if seq == 0 else 255 - frame(seq).image)
+    assert live.guard.renewal_is_due()
+    shown = one_by_one((3, {"withheld": "blur"}), (4, {}), (5, {}))
+    assert [call for call in live.fake.calls if call[0] == "begin_scene"] == [("begin_scene", 4, True)]
+    assert [(line.seq, line.anew) for line in live.lines if isinstance(line, SceneBegun)] == [(4, True)]
+    assert live.operator.counts.renewed == 1 and len(shown) == 3
 
 
 def test_a_scene_that_goes_on_begins_once(live, one_by_one):

@@ -166,6 +166,8 @@ class SceneBegun(Record):
 
     event: Literal["begin_scene"] = "begin_scene"
     seq: Count
+    anew: bool = False
+    """True if the model of the same scene was started anew."""
 
 
 class Observed(Record):
