@@ -126,7 +126,7 @@ class StageOp(Operator):
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the counts of the checks to the run's outcome."""
         for stage in self.stages:
             outcome.add(stage.counts())
 
@@ -245,7 +245,7 @@ class PictureStagesOp(StageOp):
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the counts of the checks to the run's outcome."""
         super().contribute(outcome)
         outcome.add(OrdinaryFrames(*self._counts))
 

@@ -49,7 +49,7 @@ Scale = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class SourceSection(Section):
-    """Size of the frames."""
+    """Option for the size of the frames."""
 
     scale: Scale = 1.0
 
@@ -61,7 +61,7 @@ class SourceSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class LengthSection(Section):
-    """Length of a run."""
+    """Options that limit the length of a run."""
 
     max_frames: Annotated[
         int | None,
@@ -74,7 +74,7 @@ Loop = Annotated[bool, Option("Play a recording again and again", LIVE)]
 
 @dataclass(frozen=True, kw_only=True)
 class PlaybackSection(Section):
-    """Playback of a recording in real time."""
+    """Options for the playback of a recording in real time."""
 
     fps: Annotated[
         float | None,
@@ -85,7 +85,7 @@ class PlaybackSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class SeedSection(Section):
-    """Random numbers."""
+    """Option for random numbers."""
 
     seed: Annotated[
         int,
@@ -97,7 +97,7 @@ class SeedSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructSection(Section):
-    """Model and its training."""
+    """Options of the model and its training."""
 
     device: Annotated[Device, Option("Processor that trains and renders", COMMANDS)] = "cpu"
     field: Annotated[str, Option("Deformation field; auto is the better one"), Names(FIELDS)] = "auto"
@@ -110,7 +110,7 @@ class ReconstructSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class DepthSection(Section):
-    """Depth and poses of the frames."""
+    """Options for the depth and poses of the frames."""
 
     depth: Annotated[
         str,
@@ -132,7 +132,7 @@ class DepthSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class DisplaySection(Section):
-    """Pictures of the model.
+    """Options for pictures of the model.
 
     Raises:
         InvalidSetting: if the renderer does not have an option or output.
@@ -192,7 +192,7 @@ def check_display(options: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class StillSection(Section):
-    """Pictures of a model that stands still."""
+    """Options for pictures of a model that stands still."""
 
     progressive: Annotated[
         bool,
@@ -214,7 +214,7 @@ class StillSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSection(Section):
-    """Pictures of a finished model."""
+    """Options for pictures of a finished model."""
 
     outputs: Annotated[
         tuple[Annotated[str, Names(OUTPUTS, more=STANDARD)], ...],
@@ -230,7 +230,7 @@ class RenderSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputSection(Section):
-    """Files that a run writes in addition to its report and its model."""
+    """Options for files that a run writes in addition to its report and its model."""
 
     sinks: Annotated[
         tuple[Annotated[str, Names(SINKS)], ...], Option("Outputs for the report, or none", TRAINING_RUNS)
@@ -246,7 +246,7 @@ class OutputSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ScheduleSection(Section):
-    """Work per frame of a replay."""
+    """Options for the work per frame of a replay."""
 
     steps_per_frame: Annotated[
         int | None,
@@ -267,14 +267,14 @@ class ScheduleSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class GraphSection(Section):
-    """Execution of a replay's graph."""
+    """Option for the engine that executes a replay's operators."""
 
     engine: Annotated[Engine, Option("Engine that executes the operators", ("replay",))] = "embedded"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OfflineSection(Section):
-    """Offline training."""
+    """Options of offline training."""
 
     steps: Annotated[
         int | None,
@@ -311,7 +311,7 @@ class OfflineSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ChecksSection(Section):
-    """Checks of the frames."""
+    """Options for the checks of the frames."""
 
     tool_mask: Annotated[
         str,
@@ -326,7 +326,7 @@ class ChecksSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveSection(Section):
-    """Clock of a live run."""
+    """Options for the timing of a live run."""
 
     budget_ms: Annotated[
         float | None,

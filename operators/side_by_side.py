@@ -101,7 +101,7 @@ class SideBySideOp(Operator):
 
 
 TAKEN_OVER = ("mask", "rehearsal_mask")
-"""Fields merged from other chains if the first chain's frame lacks them."""
+"""Fields of a frame that are taken from another chain of operators if the first chain leaves them empty."""
 
 
 def with_findings(decided: Frame, found: Frame) -> Frame:

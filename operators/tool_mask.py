@@ -97,7 +97,7 @@ class RecordedToolMaskOp(Operator):
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add a note on frames without a tool mask to the run's outcome."""
         if self.without_mask:
             outcome.note(f"{self.without_mask} frames had no tool mask; all of their pixels counted as tissue")
 
@@ -182,7 +182,7 @@ class FoundToolMaskOp(Operator):
         return all_tissue(frame)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the counts of tool masks to the run's outcome."""
         share = self._tool_shares / self._found if self._found else 0.0
         outcome.add(FoundMasks(self.method, self._found, self._recorded, share, self._disbelieved))
         if self._disbelieved:
@@ -246,7 +246,7 @@ class OnnxToolMaskOp(FoundToolMaskOp):
         super().__init__(fragment, *args, make_finder=lambda: finder, method="onnx", **kwargs)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """See `Contributor`."""
+        """Add the counts of tool masks to the run's outcome."""
         super().contribute(outcome)
         if self.finder.not_finite:
             outcome.note(

@@ -188,10 +188,10 @@ class Training(ABC):
     """Policy that decides how many steps the model is trained on a frame, and when."""
 
     def begin(self) -> None:  # noqa: B027 - stateless policies do not override it
-        """Reset the state for a new stream."""
+        """Prepare the policy for a new stream."""
 
     def end(self) -> None:  # noqa: B027
-        """Release the state after a stream."""
+        """Discard what the policy keeps of a stream."""
 
     def take(self, op_input: Any, learner: Learner) -> Frame:
         """Take the next frame from the queue of the input `frame`. A policy may drop frames."""
@@ -200,7 +200,7 @@ class Training(ABC):
 
     @abstractmethod
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """Train on a frame.
+        """Train the model on a frame, as the policy decides.
 
         Args:
             frame: next frame in order.
@@ -259,7 +259,7 @@ class UntilDisplay(Training):
     def __init__(
         self, clock: FrameClock, depth: BackgroundDepth | None = None, guard: BehindGuard | None = None
     ) -> None:
-        """Set the collaborators.
+        """Create the policy of a live run.
 
         Args:
             clock: display deadlines and training budgets.
@@ -363,7 +363,7 @@ class RecordedCalls(Training):
         schedule: Callable[[], Iterator[ScheduleLine | LostLine]],
         late_depths: Callable[[], Iterator[dict[str, Any] | None]],
     ) -> None:
-        """Set the recording.
+        """Create a policy that repeats a recorded schedule.
 
         Args:
             schedule: called in `begin`; yields the lines of the schedule from the beginning.

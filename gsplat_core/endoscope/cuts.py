@@ -92,7 +92,9 @@ class View:
 
 
 def difference(one: View, other: View) -> float:
-    """Return `Likeness.difference`, which is fast to compute; 1 if one picture is dark everywhere."""
+    """Return the median brightness difference of two pictures (`Likeness.difference`); 1 if one picture is dark
+    everywhere.
+    """
     either = one.bright & other.bright
     if either.sum() < either.size // 50:
         return 1.0
@@ -192,7 +194,7 @@ class CutDetector:
         self._rate = FrameRate()
 
     def skip(self) -> None:
-        """Record an unusable frame."""
+        """Record that a frame of the stream could not be used."""
         self._gap = True
 
     def observe(self, image: NDArray[np.uint8], seq: int, pts_ns: int) -> SceneVerdict:

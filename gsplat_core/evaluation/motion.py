@@ -254,7 +254,7 @@ class _Started:
     """Positions of the pixels' surface points in the model's world, [P, 3]."""
     pixels: Values
     here: NDArray[np.bool_]
-    """Mask [H, W] of the compared pixels."""
+    """Mask [H, W] of the pixels whose motion is compared."""
     own: Camera
     true: TrueMotion
     true_pose: Values

@@ -50,7 +50,7 @@ class NovelView:
     For a right eye this is a shift by the median disparity.
     """
     seen: float
-    """Share of the view's pixels that were compared."""
+    """Share of the view's pixels that count in the scores."""
 
 
 class NovelViewSums:

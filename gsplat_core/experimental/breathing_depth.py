@@ -157,7 +157,7 @@ class _Window:
     off: Array
     """Ray errors [T, N, 2]: observed rays minus those predicted by the fitted motion."""
     error: float
-    """Relative error common to all distances."""
+    """Relative error that all distances of the window have in common."""
 
 
 class MovingTissue:

@@ -48,7 +48,7 @@ class Element:
 
 
 def header_lines(elements: list[tuple[str, int, list[str]]]) -> list[str]:
-    """Return the lines of a header.
+    """Return the lines of a PLY file's header.
 
     Args:
         elements: name, number of rows, and properties such as `float x` of each element.

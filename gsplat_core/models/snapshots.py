@@ -136,7 +136,7 @@ class Snapshot:
         self.training_digest = training_digest
         self._unseen_s = unseen_s
         self.depth_source = depth_source
-        """Source of the training depth."""
+        """Depth source of the frames that the model was trained on."""
         self.parameter_count = slot.parameter_count
         """Number of parameters, without the slot's spare capacity."""
         self.slot = slot
@@ -186,7 +186,7 @@ class Snapshot:
             return seen
 
     def as_model(self) -> Model:
-        """Immutable copy in separate memory, created on first access."""
+        """Return a copy of the snapshot as an immutable model, created on first access."""
         with self._lock:
             if self._model is None:
                 with self.reading() as slot, torch.no_grad():

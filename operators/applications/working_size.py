@@ -119,7 +119,7 @@ class WorkingSize:
 
     @property
     def sentence(self) -> str:
-        """Choice and reason as a sentence for the report."""
+        """The chosen working size and the reason for it, as a sentence for the report."""
         size, full = f"{self.width_px}x{self.height_px}", "{}x{}".format(*self.full_size)
         of = f"all {size} pixels" if self.scale == 1 else f"{size} of {full} pixels"
         took, between = f"{1e3 * self.frame_s:.0f} ms", f"{1e3 * self.interval_s:.0f} ms"

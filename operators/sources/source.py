@@ -59,7 +59,7 @@ class SourceDescription:
     frame_count: int | None = None
     """Number of frames; None for an endless stream."""
     digest: str | None = None
-    """SHA-256 of the data; None if they cannot be read again."""
+    """SHA-256 of the source's files; None if the frames cannot be read again."""
     notes: tuple[str, ...] = ()
     """Fallbacks and assumptions, as sentences for the user."""
 

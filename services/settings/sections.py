@@ -151,7 +151,7 @@ HostPattern = Annotated[str, AfterValidator(_host_pattern), Field(examples=["roo
 
 
 class ServerSettings(Section):
-    """Listening address of the API, TLS and proxies."""
+    """Settings of the API server: listening address, TLS and proxies."""
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects a free port.")
@@ -205,7 +205,7 @@ class PathSettings(Section):
 
 
 class AuthSettings(Section):
-    """API keys and tickets."""
+    """Settings of API keys and tickets."""
 
     admin_key_file: Path | None = Field(
         default=None,
@@ -237,7 +237,7 @@ class AuditSettings(Section):
 
 
 class LimitSettings(Section):
-    """Resource limits per caller."""
+    """Limits on the resources that one caller of the API may use."""
 
     body_bytes: int = Field(
         default=MIB, ge=1024, description="Largest body of a request other than an upload, in bytes."
@@ -300,7 +300,7 @@ class SourceRules(Section):
 
 
 class RegistrySettings(Section):
-    """Storage of models."""
+    """Settings of the model registry's storage."""
 
     database: SecretStr | None = Field(
         default=None, description="SQLAlchemy URL. Default: an SQLite file in paths.data."
@@ -331,7 +331,7 @@ class RecordingSettings(Section):
 
 
 class JobSettings(Section):
-    """Replay jobs."""
+    """Settings of replay jobs."""
 
     folder: Path | None = Field(default=None, description="Folder of the results. Default: replays in paths.data.")
     workers: int = Field(default=1, ge=1, le=256, description="Number of concurrent replays.")
@@ -364,7 +364,7 @@ class JobSettings(Section):
 
 
 class LogSettings(Section):
-    """Log output on standard error."""
+    """Settings of the log on standard error."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
     format: Literal["auto", "json", "text"] = Field(
@@ -373,7 +373,7 @@ class LogSettings(Section):
 
 
 class StreamSettings(Section):
-    """Stream that exists from the start."""
+    """Settings of a stream that the service creates when it starts."""
 
     source: str = Field(
         max_length=1000,
