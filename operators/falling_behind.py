@@ -1,4 +1,4 @@
-"""Comparison of the displayed pictures with trivial ones, and the decision to start the model anew.
+"""Live check whether displayed pictures are better than trivial ones; a model that falls behind is started anew.
 
 A model that cannot follow a fast scope shows its tissue at the wrong place. Training then repairs it more slowly than the
 pictures move on. A new scene, created from the newest frame, shows that frame at once. All comparisons are relative to the
@@ -24,12 +24,12 @@ FIRST_MARGIN_DB = 3.0
 scene discards the past, which a smaller gain is not worth.
 """
 RENEW_AFTER = 2
-"""Consecutive pictures behind after which the model is started anew. The picture of a single odd frame recovers by
-itself.
+"""Number of consecutive pictures worse than trivial ones (`BehindGuard`) after which the model is started anew. The
+picture of a single odd frame recovers by itself.
 """
 USEFUL_FRAMES = 16
-"""Multiple of the pictures behind before a renewal that the new scene must last. Otherwise renewals do not help, and the
-next one waits for twice as many pictures.
+"""Length of a scene that makes a renewal of its model useful, in multiples of the bad pictures before it. After a
+useless renewal the next one waits for twice as many pictures.
 """
 COMPARED_ROWS = 128
 """Number of picture rows that are compared at least; rows between them are left out, to save time before the display."""
@@ -47,7 +47,7 @@ class BehindGuard:
         self.reset()
 
     def reset(self) -> None:
-        """Prepare for another stream."""
+        """Discard the pictures judged so far, at the start of a stream."""
         with self._lock:
             self._previous: Frame | None = None
             self._first_seq: int | None = None
@@ -69,7 +69,7 @@ class BehindGuard:
             return self._run >= self._patience
 
     def judge(self, frame: Frame, image: NDArray[np.uint8]) -> bool:
-        """Compare a picture with its frame.
+        """Judge a displayed picture by its frame and the previous one.
 
         Args:
             frame: frame that the picture reconstructs. Withheld and damaged frames are not compared.

@@ -59,7 +59,7 @@ class TrainingCounts:
     withheld: dict[str, int] = field(default_factory=dict)
     """Number of frames excluded from training (withheld or damaged), by reason."""
     withheld_now: dict[str, int] = field(default_factory=dict)
-    """Those of `withheld` since the last frame that was not excluded."""
+    """Number of frames excluded from training since the last one that was not, by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
     """Number of times that the model was restarted for a new scene, by reason."""
     renewed: int = 0

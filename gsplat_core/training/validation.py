@@ -16,27 +16,29 @@ from gsplat_core.training.offline import ToFit
 from gsplat_core.training.reconstructor import Reconstructor
 
 VALIDATE_EVERY = 9
-"""One of this many training frames validates."""
+"""Interval of validation frames among the training frames."""
 LEAST_FRAMES = 1
 """Smallest number of validation frames from which steps are chosen."""
 FIRST_STEPS = 500
-"""Steps of the first trial. Each further trial has twice as many."""
+"""Training steps of the first trial. Each further trial has twice as many."""
 MOST_STEPS = 64_000
-"""Largest number of steps that is tried."""
+"""Largest number of training steps that is tried."""
 LEAST_GAIN_DB = 0.05
 """Smallest gain of a trial, in dB, for which longer trainings are tried."""
 INPUT_GAIN_DB = 0.3
-"""Smallest gain, in dB, for which other inputs than the given ones are used. Depth also gives the scale and the shape."""
+"""Smallest gain, in dB, for which other inputs than the given ones are used. Depth is not left out for less, because it
+also gives the scale and the shape.
+"""
 USUAL_STEPS = 2000
-"""Steps for recordings with too few frames to validate."""
+"""Number of training steps for recordings with too few frames to validate."""
 
 Clock = Callable[[], float]
-"""Returns a time in seconds."""
+"""Function that returns the time in seconds, for measuring durations."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One training that was validated."""
+    """Training with some number of steps, and its score on the validation frames."""
 
     steps: int
     psnr_db: float
@@ -85,7 +87,7 @@ def split(given: ToFit) -> tuple[ToFit, list[Frame]]:
 
 
 def validation_psnr_db(learned: Reconstructor, frames: Sequence[Frame]) -> float:
-    """Return the mean tissue PSNR of frames in dB."""
+    """Return the mean tissue PSNR of a reconstruction on validation frames, in dB."""
     scores = [psnr_tissue_db(learned.picture(frame), frame.image, frame.mask) for frame in frames]
     # A frame without tissue has no score.
     return fmean([each for each in scores if math.isfinite(each)] or [0.0])

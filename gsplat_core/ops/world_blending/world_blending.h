@@ -79,7 +79,7 @@ constexpr int64_t backward_scratch(int64_t channels) {
   return kWindow * kWindow * (kPixelNumbers + channels) + channels * kMostLanes;
 }
 
-// CUDA versions for all pixels, in device memory.
+// Blending of all pixels on CUDA, forward and backward; all pointers are device memory.
 void blend_on_device(const Inputs& in, const Pixels& out, cudaStream_t stream);
 void blend_backward_on_device(const Inputs& in, const PixelGradients& from, const InputGradients& out, CudaScratch& scratch,
                               cudaStream_t stream);

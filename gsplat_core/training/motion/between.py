@@ -28,18 +28,18 @@ SHORTEST, LONGEST = 1.5, 2.5
 COMPARED = 12
 """Number of frames, spread over the recording, in which both kinds of interpolation are compared."""
 NO_FRAME = -1
-"""Number of an interpolated picture, which no frame has."""
+"""Frame number of interpolated pictures, which no frame has."""
 
 
 class _Picture(NamedTuple):
     image: NDArray[np.float32]
-    """RGB [H, W, 3] in grey levels."""
+    """Colours RGB [H, W, 3], in levels from 0 to 255."""
     tissue: NDArray[np.float32]
-    """[H, W], 1 = tissue."""
+    """Weight of tissue [H, W]: 1 on tissue, 0 on tools."""
 
 
 def between_frames(seen: Sequence[Observation]) -> list[Observation]:
-    """Return an observation for each missing frame.
+    """Return an interpolated observation for each frame that is missing between two.
 
     The interpolation is the mean of the neighbours, or their mean after each was moved half-way along the optical flow to
     the other. The kind is the one that predicts the frames between two other training frames better.

@@ -25,11 +25,11 @@ class Particles:
     places: NDArray[np.float64]
     """Positions at time 0 in shares of the box, [N, 3]."""
     velocities_mm_s: NDArray[np.float64]
-    """Velocities [N, 3]."""
+    """Velocities of the particles, [N, 3]."""
     radii_mm: NDArray[np.float64]
-    """Radii [N]."""
+    """Radii of the particles, [N]."""
     whiteness: NDArray[np.float64]
-    """Reflectances [N]."""
+    """Reflectances of the particles, [N]."""
     box_mm: tuple[float, float, float]
     """Size of the box, which starts at the scope's plane at time 0 and is centred on its axis."""
 

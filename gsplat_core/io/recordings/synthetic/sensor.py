@@ -111,7 +111,7 @@ class Sensor:
     field: Field = Field()
     exposure: Exposure = Exposure()
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors on red, green and blue."""
+    """White balance: factors on red, green and blue."""
     contrast: float = 1.45
     """Steepness of the tone curve."""
     blur_px: float = 0.0

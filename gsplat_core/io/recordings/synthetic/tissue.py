@@ -27,11 +27,11 @@ class Breathing:
     """Phase of breathing over time. Its sine has the minimum at -pi/2 and the maximum at pi/2."""
 
     start: float
-    """Phase at time 0, before the asymmetry is applied."""
+    """Phase of breathing at time 0 in radians, before the asymmetry is applied."""
     ratio: float = 1.0
     """Expiration to inspiration ratio: duration of the falling half over that of the rising half."""
     wander: float = 0.0
-    """Largest relative deviation of the rate."""
+    """Largest relative deviation of the breathing rate from its mean."""
     wander_phases: tuple[float, float] = (0.0, 0.0)
     period_s: float = PERIOD_S
     """Mean period of a breath, in seconds."""
@@ -101,18 +101,18 @@ class TissueLook:
     mottling: float = 1.0
     """Factor on the amplitude of the large light and dark areas."""
     fat_from: float = 0.75
-    """Level of normal noise from which there is fat; larger values give less fat."""
+    """Level of normally distributed noise above which the tissue is fat; larger values give less fat."""
     veins: int = 7
     arteries: int = 16
     vessel_strength: float = 1.0
     grain: float = 0.10
     """Standard deviation of the fine texture, relative to the colour."""
     creases: float = 0.20
-    """Darkening of the creases."""
+    """How much darker the creases of the tissue are."""
     roughness: float = 1.0
-    """Factor on the slopes of the fine relief."""
+    """Factor on the slopes of the tissue's fine relief."""
     wetness: float = 0.12
-    """Smallest wetness, 0 to 1."""
+    """Wetness of the driest tissue, 0 to 1; wet tissue has highlights."""
     glint: float = 9.0
     """Strength of the narrow highlight lobe."""
     glint_power: float = 900.0
@@ -124,7 +124,7 @@ class TissueLook:
     bleed: Colour = (0.060, 0.014, 0.010)
     """Colour of the light that scatters inside the tissue."""
     zoom: float = 1.0
-    """Size of the texture relative to its usual size."""
+    """Size of the tissue's texture relative to its usual size."""
 
 
 USUAL_LOOK = TissueLook()
@@ -254,7 +254,7 @@ class TissueShape:
     bowl: float = 1.0
     """Factor on the curvature of the sheet towards the scope."""
     tilt: float = 0.10
-    """Largest slope of the sheet along each axis."""
+    """Largest slope of the tissue sheet along each axis."""
     breath: float = 1.0
     """Factor on the amplitude of breathing."""
     pulse: float = 1.0

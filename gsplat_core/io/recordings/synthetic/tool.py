@@ -80,12 +80,12 @@ class ToolPlan:
 
     kind: Kind = "grasper"
     scale: float = 1.0
-    """Factor on the thickness and the jaws."""
+    """Factor on the usual thickness of the shaft and size of the jaws."""
     port_mm: tuple[float, float, float] = PORT_MM
     cycle_s: float = CYCLE_S
-    """Duration of one approach, tug and retreat."""
+    """Duration of one approach to the tissue, tug and retreat, in seconds."""
     hover_mm: float = HOVER_MM
-    """Distance from the tissue between two tugs."""
+    """Distance of the tool's tip from the tissue between two tugs, in mm."""
     reach_mm: float = 15.0
     """Largest distance of the grasp points from their centre."""
     centre_mm: tuple[float, float] = (-4.0, -3.0)
