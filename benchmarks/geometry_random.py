@@ -29,7 +29,7 @@ from run_facts import run_facts
 
 from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.multiview import ParallaxDepth
-from gsplat_core.depth.stereo import StereoDepth, reach_of, variance_px2
+from gsplat_core.depth.stereo import StereoDepth
 from gsplat_core.endoscope.field_of_view import FieldOfView
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
@@ -139,14 +139,8 @@ def stereo(seed: int, asked: argparse.Namespace) -> dict[str, Any]:
         assert found is not None
         if found.doubt is not None:
             doubts.add(found.doubt)
-        errors.add(frame, found, standard_error(found, frame, recording.camera))
+        errors.add(frame, found, estimator.standard_error(found, frame, recording.camera))
     return errors.figures() | {"doubts": sorted(doubts)}
-
-
-def standard_error(found: DepthMap, frame: Frame, camera: Camera) -> np.ndarray:
-    """Return the standard error of depth by matching, [H, W]."""
-    variance = variance_px2(found.confidence, frame.width_px, 0.0)
-    return np.sqrt(variance) * np.square(found.depth) / reach_of(frame, camera)
 
 
 def poses(seed: int, asked: argparse.Namespace) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -184,6 +184,10 @@ class PairLook:
     """Row difference right minus left in pixels, [3]: value in the middle of the picture, and
     increments at its right and lower edges.
     """
+    points: Points
+    """Positions of these points in the left picture [N, 2] as (x, y), in pixels."""
+    error_px: float
+    """Standard error of these disparities in pixels, from the scatter of the points across the rows."""
     doubt: str | None = None
 
 
@@ -222,11 +226,13 @@ def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[n
         return _doubt(
             f"the pair is not rectified: the right eye's rows are off by {rows[0]:.1f} px; check the calibration"
         )
-    return PairLook((here - there)[agree, 0], rows)
+    scatter = there[agree, 1] - here[agree, 1] - _basis(here[agree], width, height) @ rows
+    error_px = 1.4826 * float(np.median(np.abs(scatter)))
+    return PairLook((here - there)[agree, 0], rows, here[agree], error_px)
 
 
 def _doubt(text: str) -> PairLook:
-    return PairLook(np.zeros(0, np.float32), np.zeros(3), text)
+    return PairLook(np.zeros(0, np.float32), np.zeros(3), np.zeros((0, 2), np.float32), 0.0, text)
 
 
 def _points_in_both(
@@ -374,10 +380,11 @@ class StereoDepth(Estimator):
         left, right = grey(frame.image), grey(frame.right_image)
         # Disparity of points at infinity. It is not 0 if the principal points differ.
         parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
+        look = None
         if self._look_in == 0:
-            why = self._look(left, right, frame, parallel_px)
-            if why is not None:
-                return doubted(shape, STEREO, why)
+            look = self._look(left, right, frame, parallel_px)
+            if look.doubt is not None:
+                return doubted(shape, STEREO, look.doubt)
         self._look_in -= 1
         span = self._span_of(frame.width_px)
         if span.count > MOST_DISPARITIES:
@@ -391,20 +398,33 @@ class StereoDepth(Estimator):
             # Match the first frame of a scene with the same range as the following ones.
             planes = self._planes(left, right, frame, camera, widened, parallel_px)
             found = self._as_depth(planes, frame, camera, parallel_px)
+        why = None if look is None or found.doubt is not None else _why_wrong(found, look, frame, camera, parallel_px)
+        if why is not None:
+            self._look_in = 0
+            return doubted(shape, STEREO, why)
         return found
 
-    def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> str | None:
-        """Check the pair and update its rows and disparity range. Returns the reason why the pair is unusable, or None."""
+    def standard_error(self, found: DepthMap, frame: Frame, camera: Camera) -> NDArray[np.float32]:
+        """Return the standard error of the last estimated depth [H, W] in its unit; meaningless where it is unknown.
+
+        It combines the error of matching with that of the calibration. The calibration is assumed to be wrong along
+        the rows by as much as across them, which the pictures show.
+        """
+        beside = float(np.median(self._rows, axis=0)[0]) / _shrink(frame.width_px) if self._rows else 0.0
+        return _depth_error(variance_px2(found.confidence, frame.width_px, beside**2), found.depth, frame, camera)
+
+    def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> PairLook:
+        """Check the pair and update its rows and disparity range."""
         look = look_at(left, right, frame.loss_mask)
         why = look.doubt or _why_implausible(look, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:
-            return why
+            return replace(look, doubt=why)
         self._rows = [*self._rows, look.rows][-KEPT_LOOKS:]
         low, high = (float(value) for value in np.percentile(look.disparities, (1, 99)))
         known = self._seen or (low, high)
         self._span = self._looked = min(low, known[0]), max(high, known[1])
         self._look_in = LOOK_EVERY
-        return None
+        return look
 
     def _widen_to(self, seen: tuple[float, float]) -> None:
         """Extend the search range by the disparities of the last frame.
@@ -516,7 +536,7 @@ def variance_px2(confidence: NDArray[np.float32], width_px: int, beside: float) 
         width_px: width of the pictures.
         beside: additional variance, in squared pixels of the matched pictures.
 
-    float32 [H, W] in squared pixels of pictures of `width_px`.
+    Returns:
         float32 [H, W] in squared pixels of pictures of `width_px`.
     """
     own = HALF_BELIEVED_PX**2 * (1 / np.maximum(confidence, np.float32(1e-6)) - 1)
@@ -560,6 +580,41 @@ def _why_implausible(look: PairLook, parallel_px: float, *, calibrated: bool) ->
         what = "wrong calibration" if calibrated else "uncalibrated eyes that are not parallel"
         return f"some of the tissue would be behind the scope: {behind:.0%} of the points, because of {what}"
     return None
+
+
+def _why_wrong(found: DepthMap, look: PairLook, frame: Frame, camera: Camera, parallel_px: float) -> str | None:
+    """Return the reason why depth is wrong by more than its intervals, as a sentence, or None.
+
+    Points that were followed to the other eye are an independent measurement. Both measurements have errors, and 10 %
+    of their differences are outside of the 90 % intervals of the differences. More are counted as wrong depth if
+    chance explains them with a probability of less than 1 %. Intervals are at least those of barely believed depth,
+    because the window of a followed point blurs the relief.
+    """
+    x, y = look.points.astype(int).T
+    depth, confidence = found.depth[y, x], found.confidence[y, x]
+    known = (confidence >= BELIEVED) & (depth > 0)
+    if known.sum() < LEAST_POINTS:
+        return None
+    disparity = reach_of(frame, camera) / depth[known] + parallel_px
+    spread = np.sqrt(variance_px2(confidence[known], frame.width_px, 0.0) + look.error_px**2)
+    spread = np.maximum(spread, HALF_BELIEVED_PX * _shrink(frame.width_px))
+    outside = float((np.abs(disparity - look.disparities[known]) > HALF_OF_90 * spread).mean())
+    chance = ONE_PERCENT * float(np.sqrt(outside * (1 - outside) / known.sum()))
+    if outside - chance <= 0.1:
+        return None
+    return f"two ways of matching the eyes contradict each other: {outside:.0%} of the points differ by more than their 90 % interval"
+
+
+HALF_OF_90 = 1.645
+"""Half width of the central 90 % interval of a normal distribution, in standard deviations."""
+ONE_PERCENT = 2.33
+"""Standard deviations that a normal value exceeds with a probability of 1 %."""
+
+
+def _depth_error(
+    variance: NDArray[np.float32], depth: NDArray[np.float32], frame: Frame, camera: Camera
+) -> NDArray[np.float32]:
+    return np.asarray(np.sqrt(variance) * np.square(depth) / reach_of(frame, camera), np.float32)
 
 
 def reach_of(frame: Frame, camera: Camera) -> float:

@@ -309,3 +309,42 @@ def test_rows_that_are_off_make_disparities_uncertain_towards_the_border():
     assert off[1, 2] == 0
     assert off[2, 2] == pytest.approx(0.4 * 3 / 5) and off[1, 4] == pytest.approx(0.6 * 5 / 3)
     assert off[0, 0] == pytest.approx(np.hypot(0.24, 1.0))
+
+
+def test_depth_that_contradicts_followed_points_is_doubted(left, right, monkeypatch):
+    found = stereo.find_disparity
+
+    def wrong(here, there, span):
+        disparity = found(here, there, span)
+        off = torch.where(torch.arange(disparity.px.shape[1]) < disparity.px.shape[1] // 3, 3.0, 0.0)
+        return replace(disparity, px=disparity.px + off)
+
+    assert estimate(frame(left, right)).doubt is None
+    monkeypatch.setattr(stereo, "find_disparity", wrong)
+    assert "two ways of matching the eyes contradict each other" in estimate(frame(left, right)).doubt
+
+
+def test_a_round_field_of_view_is_left_out(left, right):
+    rows, columns = np.indices(left.shape[:2]) + 0.5
+    inside = np.hypot(columns - left.shape[1] / 2, rows - left.shape[0] / 2) < 0.45 * left.shape[0]
+    seen = [
+        np.where(inside[..., None] if each.ndim == 3 else inside, each, 0).astype(np.uint8) for each in (left, right)
+    ]
+    found = estimate(frame(*seen).with_fields(loss_mask=inside.astype(np.uint8)))
+    assert found.doubt is None
+    assert not found.confidence[~inside].any()
+    error, believed = off_by(found, bowl())
+    assert error < 0.005 and believed > 0.2
+
+
+def test_the_interval_contains_the_depth_and_grows_with_the_row_error(left, right):
+    estimator, pair = StereoDepth(), frame(left, right)
+    found = estimator.estimate(pair, camera())
+    error = estimator.standard_error(found, pair, camera())
+    seen = found.confidence >= 0.5
+    inside = np.abs(found.depth - FOCAL_PX * BASELINE_MM / bowl()) <= 1.645 * error
+    assert inside[seen].mean() > 0.6
+    lowered = frame(left, np.roll(right, 2, axis=0))
+    lower = StereoDepth()
+    moved = lower.estimate(lowered, camera())
+    assert np.median(lower.standard_error(moved, lowered, camera())[seen]) > 5 * np.median(error[seen])
