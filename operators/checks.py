@@ -67,14 +67,14 @@ class Stage(ABC):
 
     @abstractmethod
     def annotate(self, frame: Frame) -> Frame:
-        """Return the frame with the stage's findings in its fields."""
+        """Return a frame with the check's findings in its fields."""
 
     def carried(self, frame: Frame) -> Frame:
         """Return a frame that skips `annotate`, with results that stay valid between frames, such as a loss mask."""
         return frame
 
     def apply(self, frame: Frame) -> Frame:
-        """Count the frame and return it annotated."""
+        """Count a frame, and return it with the check's findings in its fields."""
         self.frames += 1
         return self.annotate(frame)
 

@@ -126,9 +126,9 @@ def _cost(
 
 
 SMALL_STEP = 0.02
-"""Penalty P1 for a difference of one label between neighbours."""
+"""Penalty P1 of semi-global matching for a difference of one label between neighbours."""
 LARGE_STEP = 0.1
-"""Penalty P2 for any larger difference."""
+"""Penalty P2 for a difference of several labels between neighbours."""
 
 
 def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:

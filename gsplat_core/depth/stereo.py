@@ -192,7 +192,7 @@ class PairLook:
 
 
 def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None = None) -> PairLook:
-    """Check two grey pictures of a stereo pair.
+    """Compare two grey pictures of a stereo pair; return their row differences, disparities and any doubt.
 
     Args:
         left, right: uint8 [H, W].

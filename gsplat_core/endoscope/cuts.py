@@ -102,7 +102,7 @@ def difference(one: View, other: View) -> float:
 
 
 def likeness(one: View, other: View) -> Likeness:
-    """Compute all measures, in about a millisecond."""
+    """Compute all similarity measures of two pictures, in about a millisecond."""
     colours = float(np.minimum(one.hues, other.hues).sum())
     moved = max(_moved(one.detail, other.detail), _moved(other.detail, one.detail))
     return Likeness(difference(one, other), colours, _structure(one.detail, other.detail), moved)

@@ -122,7 +122,7 @@ LEAST_CLEAR_DRIFT = 1.0
 MOST_UNLIKE = 0.25
 """Median difference from every reference, after removing the gain, above which a frame's exposure is not measured."""
 LARGEST_GAIN = 8.0
-"""Bound of gains and their inverses."""
+"""Largest exposure gain; the smallest one is its inverse."""
 FORGET_S = 300.0
 """Time constant in seconds with which a held gain returns to 1, slower than the model learns,
 so that errors do not accumulate over days.
@@ -168,7 +168,7 @@ class ExposureEstimator:
         self._log_gain, self.following = np.zeros(3), False
 
     def observe(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None, pts_ns: int) -> Gains:
-        """Estimate the gains of a frame.
+        """Estimate a frame's exposure gains relative to the scene's first frame.
 
         Args:
             image: RGB uint8 [H, W, 3].

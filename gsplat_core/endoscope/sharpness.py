@@ -87,7 +87,7 @@ class SharpnessGate:
         self.start_scene()
 
     def start_scene(self) -> None:
-        """Reset the usual values for another scene."""
+        """Discard the usual sharpness and clarity, at the start of a scene."""
         self._recent: deque[tuple[float, float, float]] = deque(maxlen=LONGEST_RECENT)
         """Interval in seconds and sharpness along rows and columns of recent frames."""
         self._last_ns: int | None = None
@@ -99,7 +99,7 @@ class SharpnessGate:
         """
 
     def fault(self, image: NDArray[np.uint8], pts_ns: int, kept: NDArray[np.generic] | None = None) -> str | None:
-        """Judge the stream's next frame.
+        """Return why the stream's next frame is blurred or smoky, or None.
 
         Args:
             image: RGB uint8 [H, W, 3].

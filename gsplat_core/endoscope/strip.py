@@ -24,11 +24,11 @@ BAND_SHARE = 0.08
 EXAMINE_EVERY = 4
 """Number of frames in which all four borders are examined in turn."""
 DECIDE_EVERY = 10
-"""Number of examined rounds between decisions."""
+"""Number of rounds of examination between two decisions whether there is a strip."""
 REMEMBERED_FRAMES = 40
 """Time constant of the temporal means, in rounds."""
 EDGE_LEVELS = 10.0
-"""Smallest step of a strip's edge, in levels."""
+"""Smallest step of brightness at a strip's edge, in levels of 255."""
 EDGE_STEADINESS = 2.5
 """Smallest ratio of a strip's edge step to the step's mean temporal deviation."""
 EDGE_SHARE = 0.15
@@ -36,7 +36,7 @@ EDGE_SHARE = 0.15
 WHOLE_SHARE = 0.6
 """Visible share of the border from which a strip is extended along all of it."""
 TEXT_LEVELS = 25.0
-"""Smallest step of text, in levels."""
+"""Smallest step of brightness that counts as text, in levels of 255."""
 TEXT_STEADINESS = 5.0
 """Smallest ratio of a text's edge step to the step's mean temporal deviation."""
 TEXT_LENGTH = 0.02

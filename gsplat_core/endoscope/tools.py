@@ -280,7 +280,7 @@ class ToolFinder:
         return tissue
 
     def _find(self, view: View) -> Bytes:
-        """Return 1 on tools, at working size."""
+        """Return a mask of the tools at working size: 1 on tools, else 0."""
         least_lit = int(0.25 * mean_level(view.levels))
         if view.levels[least_lit + 1 :].sum() < SMALLEST_SHARE * view.redness.size:
             self.reset()

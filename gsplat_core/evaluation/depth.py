@@ -122,7 +122,7 @@ class DepthErrors:
     mae_mm: float
     """Mean absolute depth error in mm."""
     rmse_mm: float
-    """Root of the mean squared error."""
+    """Root mean square depth error in mm."""
     relative: float
     """Mean absolute error divided by the true depth."""
     scaled_rmse_mm: float

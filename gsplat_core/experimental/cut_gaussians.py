@@ -31,7 +31,7 @@ FARTHEST_FLIP = 0.5
 side of the curve (a flip).
 """
 SMALLEST_FLIP = 0.15
-"""Lower bound of the shift to a flip in the gradient, which is inversely proportional to the shift."""
+"""Smallest shift to a flip with which the gradient is computed, since it is inversely proportional to the shift."""
 BEND = 1.0
 """Bend of a first curve in standard deviations. Nearly straight curves have an ill-conditioned implicit form."""
 TILE_SIZE, MAX_ALPHA, LEAST_ALPHA = 16, 0.99, 1 / 255

@@ -243,7 +243,7 @@ class ExpectedPicture:
         self._newest = picture
 
     def after(self, motion: Flow, others: Sequence[Weighted] = ()) -> Field | None:
-        """Predict the picture after a motion.
+        """Predict the colours of the next picture for a motion of the tissue.
 
         Args:
             motion: most likely flow after the newest picture.

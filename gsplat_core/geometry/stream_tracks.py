@@ -147,7 +147,7 @@ class StreamTracks:
         self.picture, self.numbers, self.pixels = picture, numbers, pixels
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
-        """Drop the points that are not marked."""
+        """Keep only the marked points."""
         self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
 
     def take_up(self) -> Numbers:

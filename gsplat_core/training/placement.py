@@ -200,7 +200,7 @@ class Placement:
     """Depth corrections of consecutive scenes: the first depth places the whole scene, later ones refine it."""
 
     def __init__(self, *, postpones: bool = False) -> None:
-        """Set the state before the first scene.
+        """Create the corrections of a stream, before its first scene.
 
         Args:
             postpones: postpone corrections by a frame's own depth to `catch_up`, so that the

@@ -106,7 +106,7 @@ class Schedule(ABC):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """Spend the budget of the newest frame.
+        """Train the scene within the budget of the newest frame.
 
         Args:
             step: training step of the scene.
@@ -152,7 +152,7 @@ class WindowSchedule(Schedule):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """Spend the budget of the newest frame on steps on it and on earlier frames of the window."""
+        """Train the scene within the budget of the newest frame."""
         spending = Spending(budget, self.step_s)
         plan: list[Observation] = [observation]
         first_loss: HostCopy | None = None
@@ -226,7 +226,7 @@ class NewestFirstSchedule(Schedule):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """Spend the budget of the newest frame on steps on this frame alone."""
+        """Train the scene within the budget of the newest frame."""
         spending = Spending(budget, self.step_s)
         loss = None
         while spending.allows_step(by_turns=observation.right_eye is not None):

@@ -254,7 +254,7 @@ def _repeated(cells: Tensor, counted: Tensor) -> Tensor:
     """Mark the `counted` elements whose integer cell [N, 2] occurs earlier, bool [N]."""
     count = len(cells)
     number = cells[:, 1].double() * 2**20 + cells[:, 0].double()
-    # Give every uncounted element a unique cell.
+    # Give every element that is not counted a cell of its own, so that it repeats none.
     number = torch.where(counted, number, -1.0 - torch.arange(count, device=cells.device))
     ordered, order = number.sort(stable=True)
     marks = torch.zeros(count, dtype=torch.bool, device=cells.device)

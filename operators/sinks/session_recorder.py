@@ -105,7 +105,7 @@ class _Part:
     """Kind of picture data that the item holds; None for a line without pictures."""
     seq: int = 0
     bytes: int = 0
-    """Size of the pictures in bytes."""
+    """Size of the item's pictures in bytes."""
     share: float = 1.0
     """Fill level of the queue above which the item is dropped."""
 

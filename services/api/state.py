@@ -79,7 +79,7 @@ class ViewerCount:
 
     @property
     def full(self) -> bool:
-        """Return True if the limit is reached."""
+        """Return True if as many displays are open as allowed."""
         return self._open >= self._most
 
     @contextmanager

@@ -224,7 +224,8 @@ class GeometryFacts(Part):
     normals: NormalFacts | None
     views: list[ViewFacts]
     scaled_views: list[ViewFacts]
-    """Views after the sequence's depth scale factor: relative."""
+    """Scores of the views after scaling the model's depth by one factor for the sequence; they do not assess lengths.
+    """
     tracking: TrackingFacts | None
     flow: FlowFacts | None = None
     trajectory: TrajectoryFacts | None

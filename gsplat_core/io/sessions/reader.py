@@ -148,7 +148,7 @@ class SessionReader:
 
     @property
     def made(self) -> ReconstructorMade | None:
-        """Return the line that created the first reconstructor.
+        """Return the log line with the settings of the session's first reconstructor.
 
         None if the line, or any data before it, has been deleted.
         """

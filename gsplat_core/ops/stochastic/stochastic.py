@@ -22,9 +22,9 @@ METHODS: tuple[str, ...] = get_args(Method)
 QUEUE_BYTES = 64 << 20
 """Default memory of the queue of large splats, which limits the memory of a frame."""
 CHUNK = 4096
-"""Splats that share the ranges of quantised values."""
+"""Number of splats that share the range of quantised colours."""
 COLOUR_CHUNK = 256
-"""Splats that share the range of quantised colours."""
+"""Number of splats that share the range of quantised colours."""
 CHUNK_FLOATS = 20 + 6 * (CHUNK // COLOUR_CHUNK)
 """Number of float32 values of a chunk's ranges: minima and steps of positions and log-scales [3 each], of the four
 bands, and of each colour chunk.
