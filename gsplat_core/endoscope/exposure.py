@@ -96,7 +96,9 @@ UNCHANGED: Gains = (1.0, 1.0, 1.0)
 DEAD_ZONE = 0.08
 """Difference of a log gain from the held gain up to which the gain stays held."""
 DRIFT_ZONE = 0.1
-"""Threshold for slow changes against older references; larger because the tissue has moved since."""
+"""Difference of a log gain from the held gain up to which it stays held, for slow changes measured by older references;
+larger than `DEAD_ZONE`, because the tissue has moved since.
+"""
 MORE_PIXELS = 1.5
 """Ratio of the pixels that agree with a gain change to those that agree with no change, from which the change is
 accepted.

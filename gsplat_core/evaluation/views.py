@@ -228,7 +228,7 @@ class SecondEye:
     semi-global matching, and the previous right picture.
     """
     left_out_px: int
-    """Number of excluded columns at the right edge."""
+    """Number of pixel columns at the right edge that are not scored, because only the right eye sees them."""
 
 
 def evaluate_second_eye(

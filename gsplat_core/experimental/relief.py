@@ -140,7 +140,7 @@ class Appearance:
 
 
 def appearance(places: Places, coefficients: Array, slopes: float = 1.0) -> Appearance:
-    """Compute the appearance of a relief.
+    """Compute the brightness and the highlights of a relief at some places, with derivatives.
 
     Args:
         places: positions.
@@ -284,7 +284,7 @@ class Brightness:
         ])  # fmt: skip
 
     def equations(self, key: Array, changes: Array, slopes: float) -> Equations:
-        """Linearise at the current relief."""
+        """Return the linearised equations at the current relief."""
         shown = [
             appearance(each, key + changes[time], slopes) for each, time in zip(self._places, self._times, strict=True)
         ]
@@ -314,7 +314,7 @@ class Followed:
         self._finer, self._width, self._light = _finer(grid), CHANGE, 0.0
 
     def equations(self, key: Array, change: Array, slopes: float = 1.0) -> Equations:
-        """Linearise at the current relief and change."""
+        """Return the linearised equations at the current relief and its change."""
         before, after = appearance(self._before, key, slopes), appearance(self._after, key + change, slopes)
         off = self._brighter - (after.lit - before.lit) - self._light
         weight = self._weight / np.sqrt(1 + (off / CHANGE_ERROR) ** 2)
@@ -347,7 +347,7 @@ class Glints:
         self._looks = min(GLINT_LOOKS, len(shadings)) / len(shadings)
 
     def equations(self, key: Array, changes: Array) -> Equations:
-        """Linearise at the current relief."""
+        """Return the linearised equations at the current relief."""
         shown: list[Appearance] = [appearance(self._places, key + change) for change in changes]
         angle, by_relief = (
             np.concatenate([each.angle for each in shown]),

@@ -314,7 +314,7 @@ def _seen_by_right(pixels: NDArray[np.float64], z: NDArray, camera: Camera, righ
 
 
 def _smeared(cells: NDArray[np.bool_], shifts: list[float]) -> NDArray[np.uint8]:
-    """Return cells [rows, columns] shifted to the left by all values between two shifts."""
+    """Return the cells marked in `cells` [rows, columns], moved to the left by each of the shifts between two limits."""
     found = np.zeros(cells.shape, np.uint8)
     if not cells.any():
         return found

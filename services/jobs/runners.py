@@ -84,7 +84,7 @@ class Forks:
                 os.kill(pid, signal.SIGKILL)  # the child was not reaped, so its process id cannot have been reused
 
     def close(self) -> None:
-        """Kill the processes of all attempts."""
+        """Kill the processes of all running attempts."""
         for pid in self._pids:
             os.kill(pid, signal.SIGKILL)
         for pid in self._pids:

@@ -239,7 +239,7 @@ class SecondEyeFacts(Part):
     score: ScoreFacts
     """`psnr_tissue_db` after a linear fit per channel, over pixels visible to both eyes."""
     left_out_px: Count
-    """Columns excluded at the right edge, visible to the right eye only."""
+    """Number of pixel columns at the right edge that are not scored, because only the right eye sees them."""
 
 
 class ReturnFacts(Part):

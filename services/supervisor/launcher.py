@@ -135,7 +135,7 @@ class Start(Protocol):
         ...
 
     async def how_ended(self, pid: int) -> str | None:
-        """Return a description of how a process ended, or None if unknown."""
+        """Return how a process ended, as a phrase, or None if unknown."""
         ...
 
 
@@ -167,7 +167,7 @@ class Direct:
         )
 
     async def how_ended(self, pid: int) -> str | None:
-        """Return a description of how the process ended, or None if unknown."""
+        """Return how a process ended, as a phrase, or None if unknown."""
         return status_of_child(pid)
 
 

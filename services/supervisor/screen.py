@@ -183,7 +183,7 @@ class LayerDrawing:
         self._stream = torch.cuda.Stream() if device == "cuda" else None
 
     def draw(self, layer: Layer, scene: LayerScene) -> Picture:
-        """Render one layer of a scene."""
+        """Render one layer of a scene: its depth, its confidence or the view of an orbiting camera."""
         kinds: Mapping[Layer, Callable[[LayerScene], Picture]] = {
             "depth": self._draw_depth,
             "confidence": self._draw_confidence,

@@ -49,7 +49,7 @@ class Recording(Protocol):
 
     @property
     def digest(self) -> str:
-        """Return the sha256 of the input files."""
+        """Return the SHA-256 over all files of the recording."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:

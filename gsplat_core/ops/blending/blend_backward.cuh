@@ -33,7 +33,7 @@ __device__ inline int block_furthest(int warp_furthest) {
   return furthest;
 }
 
-// Shared memory of blend_backward.
+// Shared memory of a block of the kernel blend_backward.
 template <int D, bool kAbs>
 struct BackwardStage {
   static constexpr int kQuads = quads_of(shape_size(D, kAbs), D);

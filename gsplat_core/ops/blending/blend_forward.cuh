@@ -55,7 +55,7 @@ struct FloatPixels {
 constexpr int kForwardBatch = kBlockThreads;  // splats staged per batch, one per thread
 constexpr int kUnrolled = 4;                  // splats that a warp blends between two tests for closed pixels
 
-// Shared memory of blend_forward; double-buffered.
+// Shared memory of a block of the kernel blend_forward; double-buffered.
 template <int D>
 struct ForwardStage {
   StagedSplat<D> splats[2][kForwardBatch + 1];  // the last entry reaches no pixel

@@ -22,7 +22,7 @@ struct PixelSums {
   float2 pairs[3];
 };
 
-// Shared memory of blend_half.
+// Shared memory of a block of the kernel blend_half.
 struct HalfStage {
   HalfSlot slots[kHalfBatch];
   HalfSplat none;                                          // a splat that reaches no pixel
