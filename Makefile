@@ -21,8 +21,8 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
-# Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time, the longest first. There are
-# more of them than cores, because many tests wait for processes. The output of a group is printed when it has ended.
+# Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time. There are more of them than
+# cores, because many tests wait for processes. The output of a group is printed when it has ended.
 JOBS ?= $(shell expr $$(nproc) + 2)
 SYSTEM_TESTS := tests/system
 PROGRAM_TESTS := tests/attacks tests/test_examples.py tests/recipes tests/deploy
@@ -30,7 +30,8 @@ REGISTRY_TESTS := $(addprefix tests/services/,registry jobs exports audit superv
 TRAINING_TESTS := tests/gsplat_core/training tests/gsplat_core/experimental tests/gsplat_core/evaluation
 OP_TESTS := tests/gsplat_core/ops tests/gsplat_core/rendering tests/gsplat_core/deformation
 GEOMETRY_TESTS := tests/gsplat_core/geometry
-GROUPS := system registry operators training services programs rest ops geometry
+NUMERIC := training rest ops geometry
+GROUPS := system programs training registry rest operators services ops geometry
 ignoring = $(patsubst %,--ignore=%,$1)
 test-of-system: TESTS = $(SYSTEM_TESTS)
 test-of-programs: TESTS = $(PROGRAM_TESTS)
@@ -57,10 +58,12 @@ test-isa: native .venv/.development
 $(GROUPS:%=test-of-%): export OMP_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENBLAS_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
+# Numeric tests use what the others leave, because processes of the service run with a lower priority than the tests that wait for them.
+$(NUMERIC:%=test-of-%): NICE := nice -n 10
 # Child processes load compiled modules instead of compiling them again.
 $(GROUPS:%=test-of-%): export PYTHONDONTWRITEBYTECODE :=
 $(GROUPS:%=test-of-%):
-	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(TESTS)
+	$(NICE) $(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(TESTS)
 
 lint: .venv/.development
 	$(BIN)/ruff check .
