@@ -74,6 +74,7 @@ class Attack:
         return self.marker.touch, ()
 
 
+@pytest.mark.slow
 def test_the_good_upload_is_taken(registry, payload, tmp_path):
     (tmp_path / "upload").write_bytes(payload)
     assert registry.upload("liver", tmp_path / "upload", None, "friend").version == 1

@@ -172,6 +172,7 @@ def loaded_or_refused(load: Callable[[], Any]) -> None:
         assert isinstance(error, BundleError) and len(str(error)) < 1000 and "\n" not in str(error)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data())
 def test_any_value_in_any_place_of_a_manifest(bundle, data):
@@ -206,6 +207,7 @@ def test_any_bytes_of_a_manifest(bundle, changes):
         bundle.manifest.write_bytes(before)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data())
 def test_any_change_of_the_tensors_header(bundle, data):

@@ -199,6 +199,7 @@ def test_another_video_under_the_name_of_a_track(session, codec, pixels, size):
     assert isinstance(found, str) or all(frame.status is FrameStatus.DAMAGED for frame in found)
 
 
+@pytest.mark.slow
 def test_bits_that_flip_anywhere_raise_nothing(session, whole, rng):
     """An image that is not reported as damaged equals the recorded one byte for byte."""
     names = [str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file()]

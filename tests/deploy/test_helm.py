@@ -43,6 +43,7 @@ def container(resources: dict[str, dict]) -> dict:
     return only
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("values", [FULL, WITHOUT_A_GPU], ids=["full", "without a GPU"])
 def test_kubernetes_takes_what_is_rendered(render, kubernetes_takes, values):
     for resource in render(values).values():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
 import yaml
 
 HERE = Path(__file__).parent
@@ -18,6 +19,7 @@ def test_prometheus_takes_its_settings_and_rules(tool):
     assert checked.returncode == 0, checked.stderr + checked.stdout
 
 
+@pytest.mark.slow
 def test_alerts_come_and_stay_away(tool, tmp_path):
     for file in (PROMETHEUS / "rules.yaml", HERE / "rules_test.yaml"):
         shutil.copy(file, tmp_path)

@@ -47,6 +47,7 @@ def installed(request):
             sys.modules[name] = before[name]
 
 
+@pytest.mark.slow
 def test_a_program_runs_unchanged_with_the_modules_in_its_folder(tmp_path):
     (tmp_path / "helper.py").write_text("SIZE = 16\n")
     (tmp_path / "program.py").write_text(PROGRAM)

@@ -196,6 +196,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
     assert holds(tmp_path / "out") == {"report.json": "first"}
 
 
+@pytest.mark.slow
 def test_a_lock_ends_with_its_process_however_that_ends(tmp_path):
     code = (
         "import os, sys; from pathlib import Path; from operators.output_folder import OutputFolder\n"

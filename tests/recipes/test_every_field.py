@@ -50,6 +50,7 @@ def reported(capsys, *arguments: object) -> dict:
     return json.loads(said.out)
 
 
+@pytest.mark.slow
 @EACH_FIELD
 @pytest.mark.parametrize(
     "command", [("live", "--scale", 1), ("replay", "--steps-per-frame", 2), ("reconstruct", "--steps", 8)]
@@ -61,6 +62,7 @@ def test_a_command_that_makes_a_model_takes_the_field(recording, tmp_path, capsy
     assert load_bundle(folder / "model").field.kind == FIELDS[field].name
 
 
+@pytest.mark.slow
 @EACH_FIELD
 def test_a_command_that_reads_a_model_takes_the_field(recording, tmp_path, capsys, field):
     folder = tmp_path / "out"

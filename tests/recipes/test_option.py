@@ -105,6 +105,7 @@ def link(package: str, place: Path, changed: set[str]) -> None:
             (place / name).symlink_to(entry)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="links packages")
 def test_an_option_is_a_field_and_its_use(tmp_path):
     """Adds `reconstruct.example` to a copy of the program, by one line in each of two files."""

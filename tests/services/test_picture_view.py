@@ -61,7 +61,7 @@ def served(renderer="alpha", **options):
 
 
 def get(view, path, host=None):
-    with contextlib.closing(http.client.HTTPConnection(*view.address, timeout=60)) as connection:
+    with contextlib.closing(http.client.HTTPConnection(*view.address, timeout=300)) as connection:
         connection.request("GET", path, headers={} if host is None else {"Host": host})
         answer = connection.getresponse()
         return answer.status, answer.headers, answer.read()

@@ -19,6 +19,8 @@ from services.schemas.service import KeyView
 from tests.system.browsers import chromium_by_playwright
 from tests.system.servers import serving
 
+pytestmark = pytest.mark.slow
+
 WINDOWS = {"theatre": (1920, 1080), "laptop": (1280, 800), "tablet": (1024, 768), "phone": (390, 844)}
 CUT = """() => [...document.querySelectorAll("#live canvas, #live figcaption, #live button, header *:not(:empty)")].filter((each) => {
   if (each.checkVisibility && !each.checkVisibility()) return false;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,16 @@ def test_pictures_alone_have_no_figure(intrasplat, tmp_path):
     assert found.depth is None and found.tracking is None and found.views == [] and found.parts is not None
 
 
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Path:
+    """A recording of three frames in `x` and its model in `run`; not to be changed."""
+    folder = tmp_path_factory.mktemp("small")
+    extras = Extras(third=True, tracks=True, flow=True)
+    synthesize(folder / "x", frames=3, fps=3, width_px=48, height_px=40, stereo=False, extras=extras)
+    assert run(["reconstruct", str(folder / "x"), "--out", str(folder / "run"), "--steps", "5"]) == 0
+    return folder
+
+
 @pytest.mark.parametrize(
     ("break_it", "said"),
     [
@@ -111,10 +122,8 @@ def test_pictures_alone_have_no_figure(intrasplat, tmp_path):
         (lambda folder: np.save(folder / "tracks.npy", np.full((3, 63, 3), np.nan, np.float32)), "finite"),
     ],
 )
-def test_truth_that_cannot_be_read_is_said(intrasplat, tmp_path, break_it, said):
-    extras = Extras(third=True, tracks=True, flow=True)
-    folder = synthesize(tmp_path / "x", frames=3, fps=3, width_px=48, height_px=40, stereo=False, extras=extras)
-    assert run(["reconstruct", str(folder), "--out", str(tmp_path / "run"), "--steps", "5"]) == 0
+def test_truth_that_cannot_be_read_is_said(intrasplat, small, tmp_path, break_it, said):
+    folder = shutil.copytree(small / "x", tmp_path / "x")
     break_it(folder)
-    done = intrasplat("evaluate", tmp_path / "run", folder, "--protocol", "geometry")
+    done = intrasplat("evaluate", small / "run", folder, "--protocol", "geometry")
     assert done.code == 2 and said in done.err

@@ -64,6 +64,7 @@ def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
     assert "withheld when they were recorded" in said and "error: 1 recordings have no result" in said
 
 
+@pytest.mark.slow
 def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsys):
     assert (
         run(

@@ -114,6 +114,7 @@ def test_tensors_that_do_not_fit_together_are_refused(change, reason):
         DeformNetwork(10)(**{**given, **change})
 
 
+@pytest.mark.slow
 def test_the_mask_of_the_strategy_follows_the_rows():
     generator = torch.Generator().manual_seed(0)
     n = 12

@@ -40,6 +40,7 @@ def test_breathing_and_heart_are_told_from_the_way(breathing):
     assert found.error < 0.002
 
 
+@pytest.mark.slow
 def test_how_uncertain_the_way_is_is_about_how_far_it_is_off(breathing):
     _, true, found = breathing
     assert found is not None
@@ -47,6 +48,7 @@ def test_how_uncertain_the_way_is_is_about_how_far_it_is_off(breathing):
     assert 0.2 * off_share(found.poses, true) < found.uncertain / way < 5 * off_share(found.poses, true)
 
 
+@pytest.mark.slow
 def test_poses_start_at_the_identity_and_the_unit_is_the_distance(breathing):
     *_, found = breathing
     assert found is not None
@@ -72,6 +74,7 @@ def test_smaller_and_faster_breaths_are_told_too():
     assert off_share(found.poses, true) < off_share(sightings.poses, true)
 
 
+@pytest.mark.slow
 def test_tissue_at_rest_is_said_to_be_at_rest():
     assert found_in(seen_for(20.0, breathes=0.0, rate_hz=5.0, points=150)[0]) is None
 

@@ -13,6 +13,7 @@ from tests.gsplat_core.rendering.test_unscented import H, W, scene
 SIGMAS = {"translation_sigma": 0.05, "rotation_sigma": 0.02}
 
 
+@pytest.mark.slow
 def test_perturbed_poses_are_recovered_from_pictures():
     given = scene()
     deeper = torch.linspace(0.5, 2.5, 60)[:, None]

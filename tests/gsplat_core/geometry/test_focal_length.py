@@ -73,6 +73,7 @@ def search(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("true_px", [250.0, 400.0])
 def test_a_scope_that_turns_around_tissue_tells_it(search, true_px):
     found = search(orbit, true_px, assumed_px=288.0)
@@ -88,6 +89,7 @@ def test_a_scope_that_slides_along_tells_nothing(search):
     assert found.range_px == pytest.approx((SHORTEST * WIDTH, LONGEST * WIDTH))
 
 
+@pytest.mark.slow
 def test_one_beyond_the_bounds_is_not_known(search):
     found = search(orbit, 700.0, assumed_px=288.0, points=120)
     assert found is not None and not found.known and found.range_px[1] == pytest.approx(LONGEST * WIDTH)
@@ -97,6 +99,7 @@ def test_too_few_points_tell_nothing(search):
     assert search(orbit, 288.0, 288.0, points=LEAST_POINTS - 1) is None
 
 
+@pytest.mark.slow
 def test_the_same_points_give_the_same_answer(search):
     assert search(sideways, 330.0, 288.0) == search(sideways, 330.0, 288.0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from gsplat_core.depth.maps import DepthMap
@@ -40,6 +41,7 @@ def test_it_is_found_by_name() -> None:
     assert isinstance(DEPTHS["parallax"](), ParallaxDepth)
 
 
+@pytest.mark.slow
 def test_depth_comes_as_soon_as_a_second_look_confirms_the_first_and_then_from_time_to_time() -> None:
     found = answers(ParallaxDepth(), stream(20))
     known = [number for number, each in enumerate(found) if each is not None and each.doubt is None]
@@ -50,6 +52,7 @@ def test_depth_comes_as_soon_as_a_second_look_confirms_the_first_and_then_from_t
     assert all(1.5 < median_depth(found[number]) < 2.1 for number in known)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow() -> None:
     estimator = ParallaxDepth()
     answers(estimator, stream(30, (0.006, 0.0, 0.0)))

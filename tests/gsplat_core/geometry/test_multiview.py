@@ -38,6 +38,7 @@ def errors(found: DepthMap) -> NDArray[np.float64]:
     return np.abs(found.depth / depth_of_surface() - 1)[believed].astype(np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [SIDEWAYS, (0.0, 0.02, 0.0), (0.015, 0.01, 0.01)])
 def test_a_slanted_surface_is_found(step: tuple[float, float, float]) -> None:
     found = found_in(*video(8, step))

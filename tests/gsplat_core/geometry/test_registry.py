@@ -29,6 +29,7 @@ def origins(finder: DepthFinder, frames: list[Frame]) -> set[DepthOrigin | None]
     return {finder.with_depth(frame).depth_origin for frame in frames}
 
 
+@pytest.mark.slow
 def test_parallax_is_looked_for_by_itself_only_where_there_is_time(stream):
     """A camera that has to be kept up with gets none."""
     assert origins(DepthFinder("auto", FIRST, has_time=True), stream) == {None, DEPTH_ORIGINS["parallax"]}

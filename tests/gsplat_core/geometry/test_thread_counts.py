@@ -52,6 +52,7 @@ def test_bundle_adjustment(cameras, points, points_move):
     check(adjusted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_bundle_adjustment_of_moving_tissue(breathing, with_prior):
     start, sightings = breathing
@@ -79,6 +80,7 @@ def test_priors_and_fields(breathing):
     check(learned)
 
 
+@pytest.mark.slow
 def test_the_trajectory_before_breathing_tissue(breathing, monkeypatch):
     monkeypatch.setattr("gsplat_core.poses.breathing.STAGES", ((0.007, 2, 0.06),))
     _, sightings = breathing

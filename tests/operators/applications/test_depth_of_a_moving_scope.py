@@ -73,6 +73,7 @@ def test_replay_finds_it_by_parallax_unless_something_else_is_asked_for(settings
     assert any("the depth of" in note and "its unit is not known" in note for note in outcome.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["recorded", "none", "stereo"])
 def test_replay_looks_for_none_where_something_else_is_asked_for(settings, asked, depth):
     assert depth_of(replay(replace(settings, depth=depth))).frames == {}
@@ -85,6 +86,7 @@ def test_held_out_frames_take_no_part(settings, asked):
     assert found.frames["parallax"] >= 1
 
 
+@pytest.mark.slow
 def test_showing_a_finished_model_looks_for_none(settings, asked):
     """Offline, training has found it before, in all frames at once."""
     outcome = reconstruct(settings, steps=2)

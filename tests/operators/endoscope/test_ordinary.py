@@ -40,6 +40,7 @@ def with_faults(pictures):
     return faulty
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["cutting", "heart", "colon"])
 def test_every_fault_is_found_that_looking_at_every_frame_finds(recordings_dir, name):

@@ -222,6 +222,7 @@ INTERRUPTED = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["busy", "idle"])
 @pytest.mark.parametrize("where", ["main thread", "other thread"])  # the main one sleeps through what another is handed
 def test_ctrl_c_stops_every_operator_and_comes_out_of_run(runner, mode, where):

@@ -158,6 +158,7 @@ def test_one_that_never_gives_a_frame_is_given_up_with_a_sentence(stand_in, monk
     assert issubclass(SourceLost, UserError)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("address", "what"),
     [
@@ -245,6 +246,7 @@ time.sleep(1000)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_when_the_parent_dies_the_process_ends(number):
     paths = filter(None, [str(ROOT), str(Path(__file__).parent), os.environ.get("PYTHONPATH")])

@@ -91,7 +91,7 @@ threads = []
 def joined(name):
     for thread in [*threads, *threading.enumerate()]:
         if thread.name == name:
-            thread.join(8)
+            thread.join(250)
             if thread.is_alive():
                 os.write(1, f"{name} goes on\\n".encode())
 
@@ -104,7 +104,7 @@ try:
                 os.kill(os.getpid(), getattr(signal, number))
         except KeyboardInterrupt:
             if terminal.GRACE_S == 0:
-                time.sleep(8)
+                time.sleep(250)
             raise
 except KeyboardInterrupt:
     code = 5
@@ -118,7 +118,7 @@ def interrupted(grace_s: float, *signals: str) -> tuple[int, str, str]:
     """Return exit code, output and errors of a program that sends itself signals."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(grace_s), *signals],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 

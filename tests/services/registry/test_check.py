@@ -46,6 +46,7 @@ def checked(checked_words):
     return lambda folder: [json.loads(line) for line in checked_words(folder, "--json")]
 
 
+@pytest.mark.slow
 def test_a_good_model_is_described_and_rendered(tmp_path):
     folder = save_model(tmp_path / "model")
     seen = []

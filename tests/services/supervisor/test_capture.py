@@ -101,7 +101,7 @@ def test_no_source_is_read_in_a_process_of_its_own(kind, video_url, tmp_path):
         [sys.executable, "-c", CAPTURE_COUNTED, address],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         cwd=Path(__file__).parents[3],
     )
     assert run.stdout.split("\n")[-2:-1] == ["1 []"], run.stdout + run.stderr
