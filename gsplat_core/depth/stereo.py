@@ -185,9 +185,9 @@ class PairLook:
     increments at its right and lower edges.
     """
     points: Points
-    """Positions of these points in the left picture [N, 2] as (x, y), in pixels."""
+    """Positions in the left picture of the points found in both eyes [N, 2], as (x, y) in pixels."""
     error_px: float
-    """Standard error of these disparities in pixels, from the scatter of the points across the rows."""
+    """Standard error of the disparities in pixels, from the scatter of the points across the rows."""
     doubt: str | None = None
 
 

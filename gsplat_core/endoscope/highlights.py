@@ -25,9 +25,9 @@ BLACK = 28
 BRIGHTEST_CHANNEL = 235
 """Smallest level of a highlight's brightest channel, 0 to 255."""
 DARKEST_CHANNEL = 170
-"""Smallest level of its darkest channel; saturated colours are tissue."""
+"""Smallest level of a highlight's darkest channel, 0 to 255; saturated colours are tissue."""
 ABOVE_SURROUNDINGS = 30
-"""Smallest excess of its darkest channel over the mean of the surroundings, in levels."""
+"""Smallest excess of a highlight's darkest channel over the mean of the surroundings, in levels."""
 SURROUNDINGS_SHARE = 0.12
 """Side of the square of surroundings, as a share of the longer side."""
 GROWN_SHARE = 0.003

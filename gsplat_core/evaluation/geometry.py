@@ -147,7 +147,7 @@ class Geometry:
     depth: DepthShare | None
     """Errors of the blended depth of the Gaussians' centres."""
     normals: NormalErrors | None
-    """Errors of the normals of that depth."""
+    """Errors of the normals computed from the model's depth."""
     views: tuple[NovelView, ...]
     """Scores rendered at the model's own scale, without scale alignment."""
     scaled_views: tuple[NovelView, ...]

@@ -119,7 +119,7 @@ class StreamTracks:
         self.picture: SmallPicture | None = None
         """Last picture that was tracked."""
         self.pixels: Points = np.zeros((0, 2), np.float32)
-        """Positions of the points in that picture [N, 2]."""
+        """Positions of the tracked points in the last picture, [N, 2]."""
         self.numbers: Numbers = np.zeros(0, np.int64)
         """Numbers of the points, ascending."""
         self.first: Points = np.zeros((0, 2), np.float32)

@@ -52,7 +52,7 @@ class ArrayFormat(NamedTuple):
     """Format of an array field of a frame."""
 
     bit: int
-    """Bit in the header; 0 for the image, which every frame has."""
+    """Bit of the message header that is set if the frame has this array; 0 for the image, which every frame has."""
     kind: str
     """Data type of the values, little-endian."""
     values: int

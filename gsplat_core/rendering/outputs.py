@@ -15,7 +15,7 @@ class OutputKind:
     channels: int | None
     """Number of values per pixel; 1 is an image [H, W], 3 is [H, W, 3]. None if it depends on the model."""
     differentiable: bool
-    """True if training can use it: a function of `gsplat_core.rendering` returns it with gradients."""
+    """True if training can use the output: a function of `gsplat_core.rendering` returns it with gradients."""
 
 
 RAY_DEPTH = OutputKind(

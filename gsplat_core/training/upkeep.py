@@ -60,7 +60,7 @@ class Seen:
     """Scene projected to the picture of a frame."""
 
     now: Gaussians
-    """Scene at the frame's time."""
+    """Gaussians of the scene at the frame's time."""
     pixels: Tensor
     """Pixel positions of the Gaussians' centres, [N, 2]."""
     inside: Tensor

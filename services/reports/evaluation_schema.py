@@ -289,7 +289,7 @@ class EvaluationReport(Part):
     """Frames without a baseline score, by reason."""
     notes: list[str]
     outputs: dict[str, str]
-    """Written files, as paths relative to this file."""
+    """Files written by the evaluation, as paths relative to the report."""
     series: dict[str, list[dict[str, float | int | bool | str | None]]]
     """Entries per scored frame, by protocol. Above 4096 frames, one entry per `series_frames_per_entry` frames."""
     series_frames_per_entry: dict[str, Annotated[int, Field(ge=1)]]

@@ -52,7 +52,8 @@ class FrameMode(IntEnum):
     TRAINING = 1
     """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of weight times z."""
     SEGMENTS = 2
-    """Picture. Every tile's list has its own segment of the buffer, with space for `capacity` instances.
+    """Mode for a picture in which every tile's list has its own segment of the buffer, with space for `capacity`
+    instances.
 
     `capacity` is at most MAX_SEGMENT. A frame takes two kernel launches instead of four, because no prefix sum over
     the list lengths is needed. The buffer takes 8 bytes for each of tiles x `capacity` instances, used or not.

@@ -22,7 +22,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 QUEUE_BYTES = 64 << 20
 """Default memory of the queue of large splats, which limits the memory of a frame."""
 CHUNK = 4096
-"""Number of splats that share the range of quantised colours."""
+"""Number of splats that share the ranges of quantised values."""
 COLOUR_CHUNK = 256
 """Number of splats that share the range of quantised colours."""
 CHUNK_FLOATS = 20 + 6 * (CHUNK // COLOUR_CHUNK)

@@ -41,7 +41,7 @@ GSPLAT_INLINE uint32_t bits_of(float x) {
 
 GSPLAT_INLINE uint64_t word_of(float z, uint32_t row) { return uint64_t(bits_of(z)) << 32 | row; }
 
-// ---- Dilogarithm ----------------------------------------------------------------------------------------------------
+// ---- Dilogarithm Li2, which gives the mean number of points of a splat ----
 
 // Return the dilogarithm Li2(x) for 0 <= x <= 1/2 with w = -ln(1 - x), by the series of Bernoulli numbers.
 GSPLAT_INLINE float dilogarithm_series(float w) {
@@ -65,7 +65,7 @@ GSPLAT_INLINE float inverse_dilogarithm(float t) {
   return x + (dilogarithm(x, log_rest) - t) * x / log_rest;
 }
 
-// ---- Poisson --------------------------------------------------------------------------------------------------------
+// ---- Random numbers with a Poisson distribution ----
 
 // ln(k!)
 GSPLAT_INLINE double log_factorial(double k) {
@@ -107,7 +107,7 @@ GSPLAT_INLINE int64_t poisson(double rate, uint32_t key, uint32_t sample, const 
   }
 }
 
-// ---- Projection -----------------------------------------------------------------------------------------------------
+// ---- Projection of splats to the picture ----
 
 // One Gaussian per lane, before projection.
 struct Loaded {
@@ -171,7 +171,7 @@ GSPLAT_INLINE Plane plane_of(const ProjectionInput& in, const Loaded& one, bool 
   return {{x, y, d[2] - x * camera.k.cx - y * camera.k.cy}, 3.0f * size};
 }
 
-// Values of one lane after projection.
+// Splat of one lane after projection: its position, shape and opacity in the picture.
 struct Lane {
   float u, v, z, conic[3], half[2], determinant, opacity, plane[3], reach;
 };
@@ -234,7 +234,7 @@ GSPLAT_INLINE bool finish_splat(const Request& view, const Lane& lane, uint32_t 
   return true;
 }
 
-// ---- Points ---------------------------------------------------------------------------------------------------------
+// ---- Random points of a splat ----
 
 // Return the sub-pixel of point `number` of a splat, or -1 outside the picture.
 GSPLAT_INLINE int64_t point_of(const Request& view, const Splat& splat, uint32_t number) {

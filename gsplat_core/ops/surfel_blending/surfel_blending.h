@@ -99,7 +99,7 @@ struct Kernels {
                  const InputGradients& out);
 };
 
-// CUDA versions of the two passes; all pointers are device memory.
+// Blending of surfels on CUDA, forward and backward; all pointers are device memory.
 void blend_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream);
 void blend_backward_on_device(const Inputs& in, const PixelGradients& from, const InputGradients& out, CudaScratch& scratch,
                               cudaStream_t stream);

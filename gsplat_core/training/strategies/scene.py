@@ -63,7 +63,7 @@ class StrategyKind:
     losses: Mapping[str, float] = field(default_factory=dict)
     """Losses in `LOSSES` that the strategy adds to those of the user, with their weights."""
     screen_gradients: bool = False
-    """True if it reads `TrainingStep.screen`. The step is then not captured as a CUDA graph."""
+    """True if the strategy reads `TrainingStep.screen`. The step is then not captured as a CUDA graph."""
 
 
 def every_of(steps: int) -> int:
