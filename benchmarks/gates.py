@@ -4,7 +4,8 @@ One JSON line per recording and alteration: `frames`, `withheld` (by reason; for
 withheld frames in seconds. Every frame of a recording is examined unchanged, the first --frames of it altered. The gates are those of a live run, in the same
 order, with the built-in tool mask.
 
-With --margins, one line per threshold of the out-of-body gate: the most extreme value of frames from inside whose other measure exceeds its own threshold, by
+With --margins, one line per alteration, also the hard ones, with the number of pictures and those with evidence, by recording, for the whole pictures and for
+their middle quarters; one line per sample from outside, with crops and reduced copies; and one line per threshold of the out-of-body gate: the most extreme value of frames from inside whose other measure exceeds its own threshold, by
 recording; and the number of frames of each recording withheld by a threshold chosen on the others alone, half-way to the pictures from outside.
 
 Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--margins]
@@ -37,14 +38,14 @@ from gsplat_core.endoscope.out_of_body import (
     Evidence,
     evidence_of,
 )
-from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.frames import Frame
 from operators.checks import PICTURE_STAGES, TISSUE_STAGES, new_stages
+from operators.tool_mask import built_in_finder
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.gsplat_core.endoscope.outside import OUTSIDE
-from tests.gsplat_core.endoscope.unusual import UNUSUAL, Change
+from tests.gsplat_core.endoscope.unusual import HARD, UNUSUAL, Change
 
 Image = NDArray[np.uint8]
 INSIDE = {
@@ -62,6 +63,22 @@ INSIDE = {
 """Recordings and single pictures from inside, by name."""
 FROM_OUTSIDE = ("0008", "0009", "0010")
 STILL_NS = 40_000_000
+WIDEST_PX = 400
+PARTS: dict[str, Callable[[Image], Image]] = {
+    "whole": lambda image: image,
+    "middle": lambda image: np.ascontiguousarray(
+        image[len(image) // 4 : 3 * len(image) // 4, image.shape[1] // 4 : 3 * image.shape[1] // 4]
+    ),
+}
+VIEWS: dict[str, Callable[[Image], Image]] = {
+    "whole": lambda image: image,
+    "without border": lambda image: image[30:1040, 330:1590],
+    "a third as large": lambda image: np.asarray(cv2.resize(image, (640, 360), interpolation=cv2.INTER_AREA), np.uint8),
+    "upper left": lambda image: image[30:630, 330:1030],
+    "lower right": lambda image: image[430:1040, 930:1590],
+    "middle": lambda image: image[230:830, 630:1330],
+}
+"""Crops and a reduced copy of the samples from outside."""
 MEASURES: dict[str, Callable[[Evidence], float]] = {
     "straight": lambda evidence: evidence.straight,
     "light": lambda evidence: evidence.even + evidence.smooth,
@@ -123,7 +140,7 @@ def changed(pictures: Iterable[tuple[Image, int]], change: Change) -> Iterator[t
 
 def withheld(pictures: Iterable[tuple[Image, int]]) -> dict[str, object]:
     """Run the gates of a live run over a stream; count the frames that they withhold."""
-    gate, finder = BodyGate(), ToolFinder()
+    gate, finder = BodyGate(), built_in_finder()
     before, after = new_stages(PICTURE_STAGES), new_stages(TISSUE_STAGES)
     reasons: Counter[str] = Counter()
     count, longest_ns, newest_ns = 0, 0, None
@@ -155,32 +172,48 @@ def evidence_words(image: Image) -> str:
 
 
 def report_margins(folder: Path, names: list[str], count: int) -> None:
-    """Measure every picture, and report the distance of pictures from inside to each threshold."""
-    inside = {name: measured_inside(folder / INSIDE[name], count) for name in names}
-    pictures = [next(frames(folder / f"out_of_body/{number}.png"))[0] for number in FROM_OUTSIDE]
-    pictures += [draw(np.random.default_rng(seed)) for draw in OUTSIDE.values() for seed in range(3)]
-    outside = [measures for each in pictures if (measures := evidence_of(each)) is not None]
+    """Measure every picture; report evidence by alteration, and the distance of pictures from inside to each threshold."""
+    spread = {name: spread_frames(folder / INSIDE[name], count) for name in names}
+    inside: dict[str, list[Evidence]] = {name: [] for name in names}
+    for change, make in {**UNUSUAL, **HARD}.items():
+        for part, cut in PARTS.items():
+            found: Counter[str] = Counter()
+            pictures = 0
+            for name, images in spread.items():
+                for image in images:
+                    pictures += 1
+                    evidence = evidence_of(make(cut(image), np.random.default_rng(0)))
+                    found[name] += evidence is not None and evidence.outside is not None
+                    if evidence is not None and change in UNUSUAL and part == "whole":
+                        inside[name].append(evidence)
+            say({"change": change, "part": part, "pictures": pictures, "evidence": dict(+found)})
+    samples = [next(frames(folder / f"out_of_body/{number}.png"))[0] for number in FROM_OUTSIDE]
+    for number, sample in zip(FROM_OUTSIDE, samples, strict=True):
+        words = {name: evidence_words(np.ascontiguousarray(view(sample))) for name, view in VIEWS.items()}
+        say({"outside": number, "evidence": words})
+    pictures_outside = [
+        *samples,
+        *(draw(np.random.default_rng(seed)) for draw in OUTSIDE.values() for seed in range(3)),
+    ]
+    outside = [measures for each in pictures_outside if (measures := evidence_of(each)) is not None]
     for name, (limit, colour, colour_limit) in PAIRS.items():
         for measure, its, other, others in ((name, limit, colour, colour_limit), (colour, colour_limit, name, limit)):
             threshold = measure if measure == name else f"{colour} beside {name}"
             say({"threshold": threshold, "value": its, **margins(inside, outside, measure, its, other, others)})
 
 
-def measured_inside(path: Path, count: int) -> list[tuple[str, Evidence]]:
-    """Measure every alteration of up to `count` evenly spaced frames."""
-    pictures = [image for image, _ in frames(path)]
+def spread_frames(path: Path, count: int) -> list[Image]:
+    """Return up to `count` evenly spaced frames, at most `WIDEST_PX` wide and high."""
+    pictures = []
+    for image, _ in frames(path):
+        scale = min(1.0, WIDEST_PX / max(image.shape))
+        pictures.append(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     spread = np.unique(np.linspace(0, len(pictures) - 1, min(count, len(pictures))).astype(int))
-    found = []
-    for change, make in UNUSUAL.items():
-        for index in spread:
-            evidence = evidence_of(make(pictures[index], np.random.default_rng(0)))
-            if evidence is not None:
-                found.append((change, evidence))
-    return found
+    return [np.asarray(pictures[index], np.uint8) for index in spread]
 
 
 def margins(
-    inside: Mapping[str, list[tuple[str, Evidence]]],
+    inside: Mapping[str, list[Evidence]],
     outside: list[Evidence],
     measure: str,
     limit: float,
@@ -189,7 +222,7 @@ def margins(
 ) -> dict[str, object]:
     """Return extreme values of one measure among pictures whose other measure exceeds its threshold, and the leave-one-recording-out count."""
     value, beside = MEASURES[measure], MEASURES[other]
-    values = {name: [value(each) for _, each in found if beside(each) >= other_limit] for name, found in inside.items()}
+    values = {name: [value(each) for each in found if beside(each) >= other_limit] for name, found in inside.items()}
     extremes = {name: max(each, default=0.0) for name, each in values.items()}
     beyond = min(value(each) for each in outside if beside(each) >= other_limit and value(each) >= limit)
     left_out = {}

@@ -166,3 +166,75 @@ UNUSUAL: dict[str, Change] = {
     "round view": round_view,
     "fetoscopy": fetoscopy,
 }
+
+
+def evened(image: NDArray[np.floating], share: float) -> NDArray[np.floating]:
+    """Reduce the falloff of the light by this share."""
+    light = cv2.GaussianBlur(image.max(-1).astype(np.float32), (0, 0), max(image.shape) / 10)[..., None] + 8
+    return image * (light.mean() / light) ** share
+
+
+def octagonal(image: Image, rng: np.random.Generator) -> Image:
+    """Black outside of an octagon."""
+    height, width = image.shape[:2]
+    across, down = (np.abs(axis - side / 2) for axis, side in zip(np.ogrid[:height, :width][::-1], (width, height)))
+    inside = (across < 0.48 * width) & (down < 0.48 * height) & (across / width + down / height < 0.75)
+    return image * inside[..., None].astype(np.uint8)
+
+
+def arthroscopy(image: Image, rng: np.random.Generator) -> Image:
+    """White cartilage: hardly any colour, bright, evenly lit, in a round view."""
+    pale = saturation(0.12)(image, rng) * np.array([1.0, 0.99, 0.95])
+    return round_view(_bytes(evened(255 * (pale / 255) ** 0.6, 0.5)), rng)
+
+
+def arthroscopy_with_tools(image: Image, rng: np.random.Generator) -> Image:
+    """White cartilage with two grey shafts."""
+    picture, (height, width) = arthroscopy(image, rng), image.shape[:2]
+    for left, grey in ((0.3, (120, 122, 128)), (0.55, (150, 152, 158))):
+        shaft = np.array([[left, 1.0], [left + 0.2, 1.0], [left + 0.07, 0.45], [left - 0.03, 0.48]]) * [width, height]
+        cv2.fillPoly(picture, [shaft.astype(int)], grey)
+    return round_view(picture, rng)
+
+
+def cystoscopy(image: Image, rng: np.random.Generator) -> Image:
+    """Pale and soft, evenly lit, behind cloudy fluid, in a round view."""
+    soft = softened(_bytes(evened(1.3 * saturation(0.45)(image, rng), 0.4)), rng)
+    return round_view(_mixed(soft, 0.4, 200, 195, 170), rng)
+
+
+def fogged(image: Image, rng: np.random.Generator) -> Image:
+    """A fogged lens: very soft and grey."""
+    return _bytes(0.4 * softened(image, rng, 40) + 0.6 * 190)
+
+
+def lit_smoke(image: Image, rng: np.random.Generator) -> Image:
+    """Smoke that hides nearly everything, lit in the middle by the scope."""
+    return _bytes(0.15 * image + 0.85 * _middle(image, 0.5) * np.array([195, 197, 200]))
+
+
+def compressed(image: Image, rng: np.random.Generator) -> Image:
+    """A picture of very low quality, with blocks."""
+    coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 5])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
+
+
+HARD: dict[str, Change] = {
+    "bleeding": lambda image, rng: _bytes(_grey(image) * np.array([1.1, 0.25, 0.22]) + np.array([40, 0, 0])),
+    "bile": lambda image, rng: gains(0.8, 1.05, 0.45)(saturation(0.35)(image, rng), rng),
+    "octagon": octagonal,
+    "cystoscopy": cystoscopy,
+    "arthroscopy": arthroscopy,
+    "arthroscopy with tools": arthroscopy_with_tools,
+    "fogged": fogged,
+    "dense smoke": lambda image, rng: _bytes(0.2 * image + 0.8 * np.array([180, 182, 185])),
+    "lit smoke": lit_smoke,
+    "pale, overexposed": lambda image, rng: saturation(0.1)(gains(2.2, 2.2, 2.2)(image, rng), rng),
+    "grey, evenly lit": lambda image, rng: _bytes(evened(_grey(image) * np.ones(3), 0.8)),
+    "blue, evenly lit": lambda image, rng: _bytes(
+        evened(saturation(0.25)(image, rng) * np.array([0.45, 0.75, 1.35]), 0.8)
+    ),
+    "compressed": compressed,
+    "grey, compressed": lambda image, rng: compressed(saturation(0.0)(image, rng), rng),
+}
+"""Changes at the limit of what the gate can decide, for measurement. Some pictures changed so are withheld."""
