@@ -19,8 +19,10 @@ LEAST_TISSUE = 0.02
 """Share of tissue below which a frame is not trained on."""
 LOST_TOOL_SHARE = 0.05
 """Share of tool pixels in the previous mask from which a mask without any tool counts as lost."""
-LOST_S = 0.15
-"""Duration of a lost mask in seconds after which the tool counts as withdrawn."""
+LOST_FRAMES, LOST_S = 5, 0.15
+"""Largest number of consecutive frames with a lost mask, and their duration in seconds. After that the tool counts as
+withdrawn.
+"""
 FARTHEST_MM = 2000.0
 """Largest plausible depth for an endoscope, in millimetres."""
 WRONG_DEPTH_SHARE = 0.2
@@ -36,6 +38,7 @@ class MaskCheck:
 
     def __init__(self) -> None:
         self._tool_share = 0.0
+        self._lost = 0
         self._seen_ns = 0
         """Time of the newest mask that was not lost."""
 
@@ -46,9 +49,11 @@ class MaskCheck:
         if tissue < LEAST_TISSUE:
             return "no tissue"
         lost_s = (pts_ns - self._seen_ns) * 1e-9
-        if tissue == 1.0 and self._tool_share >= LOST_TOOL_SHARE and 0 <= lost_s <= LOST_S:
+        gone = tissue == 1.0 and self._tool_share >= LOST_TOOL_SHARE
+        if gone and self._lost < LOST_FRAMES and 0 <= lost_s <= LOST_S:
+            self._lost += 1
             return "tool mask lost"
-        self._tool_share, self._seen_ns = 1 - tissue, pts_ns
+        self._tool_share, self._seen_ns, self._lost = 1 - tissue, pts_ns, 0
         return None
 
 

@@ -177,7 +177,9 @@ def evened(image: NDArray[np.floating], share: float) -> NDArray[np.floating]:
 def octagonal(image: Image, rng: np.random.Generator) -> Image:
     """Black outside of an octagon."""
     height, width = image.shape[:2]
-    across, down = (np.abs(axis - side / 2) for axis, side in zip(np.ogrid[:height, :width][::-1], (width, height)))
+    across, down = (
+        np.abs(axis - side / 2) for axis, side in zip(np.ogrid[:height, :width][::-1], (width, height), strict=True)
+    )
     inside = (across < 0.48 * width) & (down < 0.48 * height) & (across / width + down / height < 0.75)
     return image * inside[..., None].astype(np.uint8)
 
