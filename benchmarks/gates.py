@@ -8,7 +8,7 @@ With --margins, one line per alteration, also the hard ones, with the number of 
 their middle quarters; one line per sample from outside, with crops and reduced copies; and one line per threshold of the out-of-body gate: the most extreme value of frames from inside whose other measure exceeds its own threshold, by
 recording; and the number of frames of each recording withheld by a threshold chosen on the others alone, half-way to the pictures from outside.
 
-Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--margins]
+Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--change NAME] [--margins]
 """
 
 from __future__ import annotations
@@ -97,6 +97,7 @@ def main() -> int:
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--only", choices=sorted(INSIDE))
+    parser.add_argument("--change", choices=sorted(UNUSUAL), help="only this alteration, and no pictures from outside")
     parser.add_argument("--margins", action="store_true")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -105,11 +106,11 @@ def main() -> int:
         report_margins(arguments.recordings, names, arguments.frames)
         return 0
     for name in names:
-        for change in UNUSUAL:
+        for change in [arguments.change] if arguments.change else UNUSUAL:
             count = None if change == "unchanged" else arguments.frames
             pictures = islice(frames(arguments.recordings / INSIDE[name]), count)
             say({"recording": name, "change": change, **withheld(changed(pictures, UNUSUAL[change]))})
-    if arguments.only is None:
+    if arguments.only is None and arguments.change is None:
         for number in FROM_OUTSIDE:
             (picture,) = frames(arguments.recordings / f"out_of_body/{number}.png")
             say({"outside": number, "evidence": evidence_words(picture[0])})

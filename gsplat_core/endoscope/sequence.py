@@ -39,6 +39,10 @@ FROZEN_FRAMES = 8
 """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
 TORN_SHARE = 0.08
 """Share of rows, up to the lower edge, equal to the previous picture from which a picture is torn."""
+CHANGED_SHARE = 0.01
+"""Share of pixels of a row from which it has changed."""
+LEAST_CHANGED, ABRUPT_SHARE = 0.03, 0.5
+"""Median of this share over the rows above a tear, and part of it that the rows next to the tear must have."""
 TORN_FRAMES = 5
 """Largest number of consecutive torn pictures. After that the layout counts as changed, as by an overlay."""
 MOVING_SHARE = 0.9
@@ -80,8 +84,8 @@ class SequenceCheck:
         if share.mean() <= 1 - SAME_SHARE:
             return self._unusable(image, small) or self._repeated(pts_ns)
         self._new_since_ns, self._same_run = pts_ns, 0
-        changed = share > 0.01
-        torn = self._torn(small, changed)
+        changed = share > CHANGED_SHARE
+        torn = self._torn(small, share)
         self._torn_run = self._torn_run + 1 if torn else 0
         if self._torn_run > TORN_FRAMES:
             torn, self._torn_run, self._frames_seen = False, 0, 0
@@ -126,10 +130,11 @@ class SequenceCheck:
         long = self._same_run >= 2 and without_new_s >= FROZEN_S
         return "frozen" if long or self._same_run >= FROZEN_FRAMES else "duplicate"
 
-    def _torn(self, small: NDArray[np.uint8], changed: NDArray[np.bool_]) -> bool:
+    def _torn(self, small: NDArray[np.uint8], share: NDArray[np.float32]) -> bool:
         """Return True if the lowest rows are those of the previous picture or single-coloured,
-        while rows above changed as usual.
+        while rows above changed as usual. `share` is the share of changed pixels of each row.
         """
+        changed = share > CHANGED_SHARE
         if self._frames_seen < 5:
             return False
         moving = np.flatnonzero(self._row_moves >= MOVING_SHARE)
@@ -145,7 +150,11 @@ class SequenceCheck:
             fresh = np.flatnonzero(~stale[rows])
             below = len(rows) if len(fresh) == 0 else int(fresh[0])
             above = rows[below:]
-            if below >= least and len(above) >= least and changed[above].mean() > 0.5 and not flat[above].all():
+            # A tear is abrupt, and of no consequence in a still picture. At the edge of a soft view changes fade.
+            usual = float(np.median(share[above])) if len(above) else 0.0
+            abrupt = usual >= LEAST_CHANGED and share[above[:3]].mean() >= ABRUPT_SHARE * usual
+            enough = below >= least and len(above) >= least
+            if enough and abrupt and changed[above].mean() > 0.5 and not flat[above].all():
                 return True
         return False
 
