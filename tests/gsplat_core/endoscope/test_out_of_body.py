@@ -27,7 +27,7 @@ from gsplat_core.endoscope.out_of_body import (
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import open_recording
 from tests.gsplat_core.endoscope.outside import OUTSIDE, SIZE, WITHOUT_EVIDENCE, cloth, plain, room, tissue
-from tests.gsplat_core.endoscope.unusual import UNUSUAL, gains, round_view, softened
+from tests.gsplat_core.endoscope.unusual import HARD, HARD_TISSUE, UNUSUAL, gains, round_view, softened
 
 SEEDS = range(6)
 VIDEOS = {
@@ -103,7 +103,7 @@ def test_pictures_without_evidence_pass(rng, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", UNUSUAL)
+@pytest.mark.parametrize("change", [*UNUSUAL, *HARD_TISSUE])
 def test_unusual_tissue_passes(change):
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ def test_unusual_tissue_passes(change):
         image = np.clip(tissue(rng) * (vessels * folds * (0.25 + 0.9 * fall))[..., None], 0, 255).astype(np.uint8)
         for _ in range(12):
             cv2.circle(image, (int(rng.integers(width)), int(rng.integers(height))), 2, (255, 255, 255), -1)
-        assert outside_of(UNUSUAL[change](image, rng)) is None, seed
+        assert outside_of({**UNUSUAL, **HARD}[change](image, rng)) is None, seed
 
 
 @pytest.mark.recordings
@@ -137,6 +137,8 @@ def test_no_frame_of_a_changed_recording_is_withheld(recordings_dir, name):
             picture = UNUSUAL[change](small, rng)
             assert outside_of(picture) is None, change
             assert outside_of(softened(picture, rng)) is None, f"{change}, out of focus"
+        for change in HARD_TISSUE:
+            assert outside_of(HARD[change](small, np.random.default_rng(0))) is None, change
 
 
 @pytest.mark.recordings

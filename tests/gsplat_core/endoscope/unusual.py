@@ -240,3 +240,5 @@ HARD: dict[str, Change] = {
     "grey, compressed": lambda image, rng: compressed(saturation(0.0)(image, rng), rng),
 }
 """Changes at the limit of what the gate can decide, for measurement. Some pictures changed so are withheld."""
+HARD_TISSUE = ("bleeding", "bile", "octagon", "cystoscopy", "arthroscopy", "pale, overexposed", "compressed")
+"""Those of which no whole picture is withheld."""
