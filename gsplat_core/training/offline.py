@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from statistics import median
 
 import numpy as np
 import torch
@@ -78,6 +79,19 @@ scaled by the learning rates' factor. It is reduced for fast motion by the root 
 def rate_at(share: float) -> float:
     """Return the factor of the learning rates after this share of the steps."""
     return FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+SPACING_INTERVALS = 1.5
+"""Smallest temporal resolution of motion, in intervals between frames."""
+
+
+def least_spacing_s(times_s: Sequence[float]) -> float:
+    """Return the smallest useful temporal resolution of motion in seconds, for frames at `times_s`; 0 for one frame.
+
+    A finer field has parameters that no frame trains. Between frames they would let the scene return to its rest state.
+    """
+    intervals = [after - before for before, after in pairwise(times_s) if after > before]
+    return SPACING_INTERVALS * median(intervals) if intervals else 0.0
 
 
 def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observation]) -> list[Observation]:

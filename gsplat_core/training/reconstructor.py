@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -28,7 +28,7 @@ from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.growth.start_on_device import StartOnDevice
 from gsplat_core.training.motion.prior import Following, continued, newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.offline import OfflineTraining, ToFit, to_fit
+from gsplat_core.training.offline import OfflineTraining, ToFit, least_spacing_s, to_fit
 from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
 from gsplat_core.training.places import LeftScenes
 from gsplat_core.training.right_eye import BothEyes, for_eyes
@@ -315,7 +315,7 @@ class Reconstructor:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
         given = frames if isinstance(frames, ToFit) else self.prepared(frames)
         frames, seen, self.depth_doubts = given.frames, given.seen, given.doubts
-        self._start(frames[0], seen[0], end_s=seen[-1].time_s)
+        self._start(frames[0], seen[0], times_s=[one.time_s for one in seen])
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
         self._step.frames = lambda: seen
@@ -402,17 +402,20 @@ class Reconstructor:
         by = self._step.trained_by()
         return dict(version=self._version, camera=self.camera, unseen_s=unseen_s, trained_by=by, **known)
 
-    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        """Create the scene from its first frame. Offline, `end_s` is the time of the last frame in seconds."""
+    def _start(self, frame: Frame, observation: Observation, times_s: Sequence[float] | None = None) -> None:
+        """Create the scene from its first frame. Offline, `times_s` are the times of all frames in seconds."""
         if self._growth is not None:
             self._growth.begin(observation.camera)
         gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
-        if end_s is None:
+        if times_s is None:
             self._step = self._left.restarted(gaussians, observation)
             if self._step is not None:
                 self._motion.restart()
                 return
-        wanted = NewField(gaussians, observation.time_s, end_s, self.config.motion_spacing_s, self.config.history_s)
+        spacing_s, end_s = self.config.motion_spacing_s, None
+        if times_s is not None:
+            spacing_s, end_s = max(spacing_s, least_spacing_s(times_s)), times_s[-1]
+        wanted = NewField(gaussians, observation.time_s, end_s, spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # fields initialise planes and layers randomly
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)

@@ -54,7 +54,9 @@ class ChosenSteps:
     steps: int
     trials: tuple[Trial, ...]
     reason: str
-    """`best`, `limit` (the time limit ended the search), `most` (largest number tried) or `few frames`."""
+    """`given`, `best`, `limit` (the time limit ended the search), `most` (largest number tried) or `few frames`."""
+    keeps_trial: bool = False
+    """True if the time limit leaves no time to train on all frames, so that the best trial is the result."""
 
     @property
     def sentence(self) -> str:
@@ -68,7 +70,8 @@ class ChosenSteps:
         if self.reason == "few frames":
             return f"{self.steps} training steps, the usual number: too few frames to keep some for validation"
         found = f" (validation frames: {tried})" if tried else ""
-        return f"{self.steps} training steps were chosen{found}: {reasons[self.reason]}"
+        kept = ". There was no time left to train on the validation frames too" if self.keeps_trial else ""
+        return f"{self.steps} training steps were chosen{found}: {reasons[self.reason]}{kept}"
 
 
 def validating(count: int) -> list[int]:
@@ -105,7 +108,8 @@ def choose_steps(
 ) -> ChosenSteps:
     """Find the number of steps with the best validation score, by trials of doubling length.
 
-    The search leaves enough of the time limit for the training on all frames.
+    The search leaves enough of the time limit for the training on all frames. The first trial is made in any case; if it
+    takes too long for a second training, it is the result.
 
     Args:
         train: trains from the start with a number of steps and returns the validation PSNR in dB.
@@ -122,7 +126,10 @@ def choose_steps(
         left_s = limit_s - (clock() - begin)
         # A trial is followed by a training of the same length on all frames.
         if 2 * steps * step_s > left_s:
-            return ChosenSteps(max(1, min(steps, int(left_s / step_s))), tuple(trials), "limit")
+            longest = int(left_s / step_s)
+            if longest < best.steps:
+                return ChosenSteps(best.steps, tuple(trials), "limit", keeps_trial=True)
+            return ChosenSteps(min(steps, longest), tuple(trials), "limit")
         trial = trial_of(train, steps, clock)
         trials.append(trial)
         if trial.psnr_db < best.psnr_db + LEAST_GAIN_DB:

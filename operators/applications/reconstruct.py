@@ -226,10 +226,11 @@ class _Fitting:
         settings = self._settings
         with seeded(settings.seed, settings.device):
             inputs = _Inputs(self._source, settings)
-            chosen = ChosenSteps(steps, (), "given")
             if steps is None:
                 inputs, chosen = self._chosen(inputs)
-            if not self._is_stopped:
+            else:
+                chosen = ChosenSteps(steps, (), "given")
+            if not self._is_stopped and not chosen.keeps_trial:
                 self._train(inputs, inputs.given, chosen.steps, "train")
         learning = self._learning
         assert learning is not None
@@ -245,6 +246,7 @@ class _Fitting:
             return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
         first = trial_of(self._trial(inputs), validation.FIRST_STEPS, self._clock)
+        learned = self._learning
         for reason, change in _alternatives(inputs):
             if self._is_stopped or first.seconds > ALTERNATIVE_SHARE * limit_s:
                 break
@@ -254,8 +256,12 @@ class _Fitting:
                 self._notes.append(
                     f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"
                 )
-                inputs, first = other, trial
-        return inputs, choose_steps(self._trial(inputs), limit_s, self._clock, self._clock() - self._begin_s, first)
+                inputs, first, learned = other, trial, self._learning
+        spent_s = self._clock() - self._begin_s
+        chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
+        if len(chosen.trials) == 1 and not self._is_stopped:
+            self._learning = learned
+        return inputs, chosen
 
     def _trial(self, inputs: _Inputs) -> Callable[[int], float]:
         """Return a function that trains without the validation frames and returns their score."""

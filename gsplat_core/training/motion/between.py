@@ -111,7 +111,7 @@ def _interpolated(before: _Picture, after: _Picture, flows: bool) -> _Picture:
     """Return the picture half-way between two; its tissue is where both show tissue."""
     if flows and min(before.tissue.shape) >= SMALLEST_PX:
         before, after = _half_way(before, after), _half_way(after, before)
-    return _Picture((before.image + after.image) / 2, before.tissue * after.tissue)
+    return _Picture((before.image + after.image) * np.float32(0.5), before.tissue * after.tissue)
 
 
 def _half_way(one: _Picture, other: _Picture) -> _Picture:

@@ -1,6 +1,8 @@
-"""Pictures interpolated at the times of missing frames."""
+"""Times of missing frames and between frames: interpolated pictures, and the state of the scene."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,9 +10,12 @@ import pytest
 import torch
 
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion.between import between_frames
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.reconstructor import Reconstructor
 
 WIDTH, HEIGHT = 96, 64
 CAMERA = Camera(K=np.array([[80.0, 0, WIDTH / 2], [0, 80.0, HEIGHT / 2], [0, 0, 1]]), width_px=WIDTH, height_px=HEIGHT)
@@ -50,3 +55,32 @@ def test_a_missing_frame_is_better_than_its_neighbour(px_per_frame, noise, least
 @pytest.mark.parametrize("numbers", [[0, 1, 2, 3], [0, 1, 2, 3, 9], [0]], ids=["none missing", "many missing", "one"])
 def test_other_intervals_are_left_alone(numbers):
     assert between_frames(seen(pictures(10, 1.0, 0.0), numbers)) == []
+
+
+@pytest.fixture(scope="module", params=[5, 30], ids=["5 frames/s", "30 frames/s"])
+def moved(request):
+    """A model of texture that moves by 1 px per frame and gets brighter: its frame rate, and the model."""
+    fps, images = request.param, pictures(12, 1.0, 0.0)
+    frames = [
+        Frame(n, round(n * 1e9 / fps), (image * (0.5 + 0.04 * n)).astype(np.uint8)) for n, image in enumerate(images)
+    ]
+    config = replace(ReconstructorConfig.offline(), gaussians=300, max_gaussians=400)
+    learning = Reconstructor(config, CAMERA)
+    learning.fit(frames, 100)
+    return fps, learning.snapshot()
+
+
+@pytest.mark.parametrize("value", ["means", "sh"])
+def test_between_frames_the_scene_is_between_its_states_at_the_frames(moved, value):
+    fps, model = moved
+    at = lambda number: getattr(model.at(number / fps), value).flatten(1)
+    changed = (at(11) - at(0)).norm(dim=1).median()
+    for number in range(1, 10):
+        off = (at(number + 0.5) - (at(number) + at(number + 1)) / 2).norm(dim=1).median()
+        assert off < 0.1 * changed
+
+
+def test_before_the_first_and_after_the_last_frame_the_scene_holds(moved):
+    fps, model = moved
+    assert torch.equal(model.at(-5.0).means, model.at(0.0).means)
+    assert torch.equal(model.at(60.0).means, model.at(11 / fps).means)

@@ -44,9 +44,17 @@ def test_search_and_training_stay_within_the_time_limit(limit_s):
     assert chosen.steps >= training.steps[-1]
 
 
+def test_without_time_for_a_second_training_the_trial_is_the_result():
+    training = Training([30.0], step_s=1.0)
+    chosen = choose_steps(training, 60, training.clock)
+    assert training.steps == [500]
+    assert (chosen.steps, chosen.reason, chosen.keeps_trial) == (500, "limit", True)
+
+
 def test_time_that_was_spent_before_counts():
     training = Training([30.0 + k for k in range(20)], step_s=0.01)
     late = choose_steps(training, 60, training.clock, spent_s=40.0)
+    assert not late.keeps_trial
     assert training.now_s + 40 + late.steps * training.step_s <= 60
 
 

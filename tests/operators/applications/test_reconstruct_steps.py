@@ -35,5 +35,7 @@ def test_the_chosen_steps_and_their_reason_are_reported(settings, monkeypatch):
 def test_the_time_limit_ends_the_search(settings, monkeypatch):
     monkeypatch.setattr(validation, "FIRST_STEPS", 2)
     seconds = iter(range(0, 10_000, 25))
-    outcome = reconstruct(settings, clock=lambda: float(next(seconds)))
+    trained = set()
+    outcome = reconstruct(settings, progress=lambda each: trained.add(each.stage), clock=lambda: float(next(seconds)))
     assert any("the time limit ended the search" in note for note in outcome.notes)
+    assert trained == {"validate", "evaluate"}
