@@ -90,7 +90,7 @@ struct GradientRows {
 };
 
 struct Kernels {
-  // Fills the records of splats [begin, end).
+  // Prepares the splats [begin, end) for blending, in `records`.
   void (*records)(const Inputs& in, int64_t begin, int64_t end, SplatRecord* records);
   // Returns the floats of scratch memory (64-byte aligned) that one thread needs for either pass.
   int64_t (*scratch_floats)(int channels);

@@ -1,4 +1,4 @@
-// Front-to-back alpha compositing.
+// CUDA kernel of front-to-back alpha compositing.
 #include "../blending/blend_forward.cuh"
 #include "composite_windows.cuh"
 

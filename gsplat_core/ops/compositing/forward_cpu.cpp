@@ -1,4 +1,4 @@
-// Splat records, and front-to-back blending.
+// CPU kernels of alpha compositing: splat records and front-to-back blending.
 #include "blocks.h"
 
 namespace GSPLAT_ISA::compositing {

@@ -8,7 +8,7 @@
 
 namespace gsplat::covariance {
 
-// CPU kernels for rows `begin` to `end` - 1.
+// CPU kernels of the covariances and their gradients, for rows `begin` to `end` - 1.
 struct Kernels {
   // Computes R S^p S^p R^T with p = 1, or p = -1 if `inverse`, as rows of 6 (upper triangle) or 9 floats.
   void (*forward)(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t begin, int64_t end);

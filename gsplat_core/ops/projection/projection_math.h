@@ -17,7 +17,7 @@ constexpr float kHuge = 1e30f;  // larger numbers count as infinite, because the
 // Also false for NaN.
 GSPLAT_INLINE vint finite(vfloat x) { return (x > -kHuge) & (x < kHuge); }
 
-// Camera parameters shared by forward and backward.
+// Camera parameters that the projection and its gradient both use.
 template <CameraModel model>
 struct View {
   Matrix3 w;  // rotation of the camera, identical in every lane

@@ -1,4 +1,4 @@
-// Tile lists, and the image.
+// CUDA kernels that sort the tile lists and blend the image, for rasterize.
 #include "../blending/blend_forward.cuh"
 #include "../frame/tile_sort.cuh"
 #include "dependent_launch.cuh"

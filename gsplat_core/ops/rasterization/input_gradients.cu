@@ -103,7 +103,7 @@ __device__ inline void store_row(float* to, int64_t row, const float* v) {
   for (int k = 0; k < columns; ++k) to[columns * row + k] = v[k];
 }
 
-// A warp's coefficients, later overwritten by their gradients.
+// Spherical-harmonics coefficients of a warp's Gaussians, later overwritten by their gradients.
 template <int degree>
 struct WarpColors {
   StagedHarmonics<degree> coefficients;

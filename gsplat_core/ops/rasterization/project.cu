@@ -9,7 +9,7 @@ namespace {
 using namespace blending;
 using namespace frame;
 
-// A warp's coefficients; empty for plain colours.
+// Spherical-harmonics coefficients of a warp's Gaussians; empty for plain colours.
 template <int degree>
 struct WarpColors {
   StagedHarmonics<degree> coefficients;

@@ -61,7 +61,7 @@ struct GradientRows {
 };
 
 struct Kernels {
-  // Fills the records of splats [begin, end).
+  // Prepares the splats [begin, end) for blending, in `records`.
   void (*records)(const Inputs& in, int64_t begin, int64_t end, compositing::SplatRecord* records);
   void (*tile)(const Inputs& in, const compositing::SplatRecord* records, int64_t tile, const Pixels& out);
   void (*tile_backward)(const Inputs& in, const compositing::SplatRecord* records, int64_t tile, const PixelGradients& from,

@@ -19,7 +19,7 @@ struct SphericalHarmonicsInput {
   int64_t bases;  // K
 };
 
-// CPU kernels for directions `begin` to `end` - 1 of one row.
+// CPU kernels of the colours and their gradients, for directions `begin` to `end` - 1 of one row.
 struct Kernels {
   void (*forward)(const SphericalHarmonicsInput&, float* colors, int64_t begin, int64_t end);
   // Computes the gradients of directions and coefficients. `v_dirs` [N, 3] may be null. `v_coeffs` [N, K, 3] is added

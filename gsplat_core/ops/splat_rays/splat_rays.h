@@ -26,7 +26,7 @@ struct Gradients {
   float* v_scales;         // [count, 3]
 };
 
-// CPU kernels for rows `begin` to `end` - 1.
+// CPU kernels of the ray coefficients and their gradients, for rows `begin` to `end` - 1.
 struct Kernels {
   void (*forward)(const Inputs& in, float* rays, float* normals, int64_t begin, int64_t end);
   void (*backward)(const Inputs& in, const Gradients& gradients, int64_t begin, int64_t end);

@@ -50,7 +50,7 @@ struct Rows {
 constexpr int64_t kRowPadding = 16;
 
 struct Kernels {
-  // Fills the records of splats [begin, end).
+  // Prepares the splats [begin, end) for evaluation, in `records`.
   void (*records)(const Inputs& in, int64_t begin, int64_t end, Splat* records);
   // Writes f at the points [begin, end), multiples of kRowPadding, to `out` [channels, stride].
   void (*forward)(const Inputs& in, const Rows& rows, int64_t begin, int64_t end, float* out);

@@ -90,7 +90,7 @@ struct GradientRows {
 };
 
 struct Kernels {
-  // Fills the records, bounds and values of surfels [begin, end).
+  // Prepares the surfels [begin, end) for blending: their records, bounds and values.
   void (*records)(const Inputs& in, int64_t begin, int64_t end, Record* records, compositing::SplatRecord* bounds, float* values);
   void (*tile)(const Surfels& in, int64_t tile, const Pixels& out);
   void (*tile_backward)(const Surfels& in, int64_t tile, const PixelGradients& from, const GradientRows& out);

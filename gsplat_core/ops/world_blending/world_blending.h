@@ -65,7 +65,7 @@ struct GradientRows {
 
 struct Kernels {
   void (*tile)(const Inputs& in, int64_t tile, const Pixels& out, float* scratch);  // scratch: channels * kMostLanes
-  // scratch: backward_scratch(channels) floats
+  // Adds the gradients of a tile's pixels to its rows. `scratch` has backward_scratch(channels) floats.
   void (*tile_backward)(const Inputs& in, int64_t tile, const PixelGradients& from, const GradientRows& out, float* scratch);
   // Sums the rows [first[i], first[i + 1]) of each Gaussian of an image and converts them to gradients, for [begin, end).
   void (*gather)(const Inputs& in, const GradientRows& from, const int32_t* first, int64_t begin, int64_t end,
