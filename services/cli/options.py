@@ -315,7 +315,8 @@ def _value(each: Declared, given: Any) -> Any:
     if given == each.option.word:
         return None
     try:
-        return plain_float(given)
+        number = plain_float(given)
+        return int(number) if each.plain is int and number.is_integer() else number
     except ValueError:
         raise InvalidSetting(f"{each.name} is {given!r:.60}; give {each.option.word}, or a number") from None
 

@@ -121,6 +121,11 @@ def test_a_number_in_place_of_a_word_is_plain(number, capsys, tmp_path):
     assert "budget_ms is" in capsys.readouterr().err
 
 
+def test_a_whole_number_in_place_of_a_word_is_whole(capsys, tmp_path):
+    assert run(["reconstruct", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"), "--steps", "5"]) == BAD_INPUT
+    assert "there is no such file" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("number", ["1_0", "１０", " 10"])
 def test_numbers_inside_texts_are_plain_too(number):
     from datetime import datetime
