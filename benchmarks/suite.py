@@ -106,6 +106,10 @@ BENCHMARKS = (
     Benchmark("training", "benchmarks/training_cpu.py", "cpu", runs=1),
     Benchmark("deformation", "benchmarks/deformation_cpu.py", "cpu", runs=1),
     Benchmark("tool_mask", "benchmarks/tool_mask.py {recordings}/cutting", "cpu", runs=1),
+    Benchmark("tool_mask_annotated", "benchmarks/tool_mask.py {recordings} --annotations", "cpu", runs=1),
+    Benchmark(
+        "tool_mask_classical", "benchmarks/tool_mask.py {recordings} --annotations --method classical", "cpu", runs=1
+    ),
     *(
         Benchmark(f"breathing_{name}", f"benchmarks/geometry_moving.py --seeds 0 1 {options}".rstrip(), "cpu", runs=1)
         for name, options in {

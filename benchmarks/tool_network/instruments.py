@@ -7,6 +7,7 @@ position along and across the body.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -56,7 +57,9 @@ def material(rng: Generator, canvas: Canvas, kind: str | None = None) -> Materia
     ambient = rng.uniform(0.1, 0.5)
     shade = ambient + (1 - ambient) * diffuse
     gloss = np.exp(-(((v - lit_from * rng.uniform(0.5, 1)) / rng.uniform(0.06, 0.35)) ** 2)) * rng.uniform(0, 1.4)
-    tint = 1 + rng.normal(0, 0.055, 3)
+    tint = 1 + rng.normal(0, 0.05, 3)
+    if rng.random() < 0.3:
+        tint = tint * (1 + rng.uniform(0, 0.14) * np.array([1, 0.4, -1]))
     opacity = 1.0
     if kind == "metal":
         albedo = rng.uniform(0.2, 0.75) * tint
@@ -93,10 +96,15 @@ def material(rng: Generator, canvas: Canvas, kind: str | None = None) -> Materia
         )[0, 0]
         colour = shade[:, None] * hue + 0.5 * gloss[:, None]
     elif kind == "tissue":
-        hue = cv2.cvtColor(
-            np.float32([[[rng.uniform(-30, 55) % 360, rng.uniform(0.2, 0.9), rng.uniform(0.5, 1.1)]]]),
-            cv2.COLOR_HSV2RGB,
-        )[0, 0]
+        if rng.random() < 0.5:
+            hue = canvas.surround / max(0.05, float(canvas.surround.max())) * rng.uniform(0.6, 1.1) + rng.normal(
+                0, 0.07, 3
+            )
+        else:
+            degrees = rng.uniform(-30, 55) % 360
+            hue = cv2.cvtColor(
+                np.float32([[[degrees, rng.uniform(0.2, 0.9), rng.uniform(0.5, 1.1)]]]), cv2.COLOR_HSV2RGB
+            )[0, 0]
         colour = shade[:, None] * hue + 0.6 * gloss[:, None]
         opacity = rng.uniform(0.75, 1)
     else:
@@ -112,7 +120,7 @@ def material(rng: Generator, canvas: Canvas, kind: str | None = None) -> Materia
     return Material(
         np.asarray(colour, np.float32),
         np.asarray(rings, np.float32),
-        float(rng.uniform(0, 0.18) if rng.random() < 0.6 else 0.02),
+        float(rng.uniform(0, 0.3) if rng.random() < 0.65 else 0.02),
         opacity,
     )
 
@@ -135,6 +143,7 @@ def body(
     y, x = np.mgrid[low[1] : high[1], low[0] : high[0]].astype(np.float32)
     cover = np.zeros(x.shape, np.float32)
     cv2.fillPoly(cover, [np.round((outline - low) * 16).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
+    cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), 0.7), np.float32)
     # Position along and across of the nearest segment.
     u, v = np.zeros_like(x), np.zeros_like(x)
     nearest = np.full(x.shape, np.inf, np.float32)
@@ -157,12 +166,24 @@ def body(
     colour = surface.profile[across_at] * surface.rings[along_at][..., None]
     tone_along = tone * (1 + rng.uniform(-0.35, 0.35) * (u - 0.5))
     if surface.grain > 0.02:
-        rough = rng.standard_normal((max(2, x.shape[0] // 3), max(2, x.shape[1] // 3))).astype(np.float32)
-        tone_along = tone_along * (1 + surface.grain * cv2.resize(rough, x.shape[::-1], interpolation=cv2.INTER_LINEAR))
+        tone_along = tone_along * (
+            1 + surface.grain * rough(rng, u, v, float(np.linalg.norm(line[-1] - line[0])), float(width.mean()))
+        )
     colour = np.clip(colour * tone_along[..., None], 0, 1.6)
     alpha = cover * surface.opacity
     canvas.image[box] += alpha[..., None] * (colour - canvas.image[box])
     canvas.mask[box] = np.maximum(canvas.mask[box], cover)
+
+
+def rough(rng: Generator, u: Plane, v: Plane, length: float, half: float) -> Plane:
+    """Return texture on a body, mean near 0: grain, or streaks along or across it. `u` and `v` are positions on it."""
+    cell_u, cell_v = np.exp(rng.uniform(np.log(1.5), np.log(25), 2))
+    texture = rng.standard_normal((64, 64), np.float32)
+    texture = np.asarray(cv2.GaussianBlur(texture, (0, 0), 0.8), np.float32)
+    texture /= texture.std()
+    along = (u * np.float32(length / cell_u)) % 63
+    across = ((v + 1) * np.float32(half / cell_v) + rng.uniform(0, 60)) % 63
+    return np.asarray(cv2.remap(texture, along, np.asarray(across, np.float32), cv2.INTER_LINEAR), np.float32)
 
 
 def straight(start: NDArray, end: NDArray, first: float, last: float) -> tuple[Points, NDArray[np.float64]]:
@@ -194,8 +215,11 @@ def entry(rng: Generator, height: int, width: int) -> NDArray[np.float64]:
     return np.array(point) * (width, height)
 
 
-def instrument(rng: Generator, canvas: Canvas) -> None:
-    """Draw one random instrument that enters from the border."""
+def instrument(rng: Generator, canvas: Canvas, accessories: float) -> None:
+    """Draw one random instrument that enters from the border; with chance `accessories` one of a flexible endoscope."""
+    if rng.random() < accessories:
+        catheter(rng, canvas)
+        return
     height, width = canvas.mask.shape
     start = entry(rng, height, width)
     target = np.array([width, height]) * rng.uniform(0.15, 0.85, 2)
@@ -205,11 +229,8 @@ def instrument(rng: Generator, canvas: Canvas) -> None:
     half = height * float(np.exp(rng.uniform(np.log(0.025), np.log(0.26))))
     taper = rng.uniform(0.45, 1.0)
     tone = canvas.light * rng.uniform(0.6, 1.3)
-    kinds = ["shaft", "wrist", "tube", "plate", "box", "needle", "blob", "catheter"]
-    kind = rng.choice(kinds, p=[0.24, 0.33, 0.11, 0.06, 0.08, 0.04, 0.04, 0.10])
-    if kind == "catheter":
-        catheter(rng, canvas)
-        return
+    kinds = ["shaft", "wrist", "tube", "plate", "box", "needle", "blob"]
+    kind = rng.choice(kinds, p=[0.3, 0.36, 0.11, 0.055, 0.085, 0.045, 0.045])
     if kind == "tube":
         end = tip if rng.random() < 0.5 else entry(rng, height, width)
         line, widths = curved(rng, start, end, half * 0.6, half * 0.6 * rng.uniform(0.7, 1), rng.uniform(-0.35, 0.35))
@@ -243,7 +264,7 @@ def instrument(rng: Generator, canvas: Canvas) -> None:
     places = [0.0, *cuts, 1.0]
     surface = material(rng, canvas)
     last = half
-    for index, (a, b) in enumerate(zip(places[:-1], places[1:], strict=True)):
+    for index, (a, b) in enumerate(pairwise(places)):
         first, last = (half * (1 - t * (1 - taper)) for t in (a, b))
         if index:
             surface = material(rng, canvas)
@@ -317,7 +338,7 @@ def catheter(rng: Generator, canvas: Canvas) -> None:
     first = height * rng.uniform(0.06, 0.24)
     last = max(1.0, first * rng.uniform(0.08, 0.6))
     kinds = ["tissue", "white", "colour", "grey", "metal", "chrome", "black"]
-    surface = material(rng, canvas, str(rng.choice(kinds, p=[0.42, 0.1, 0.14, 0.08, 0.1, 0.1, 0.06])))
+    surface = material(rng, canvas, str(rng.choice(kinds, p=[0.4, 0.12, 0.14, 0.1, 0.1, 0.09, 0.05])))
     tone = canvas.light * rng.uniform(0.8, 1.8)
     line, widths = curved(rng, start, tip, first, last, rng.uniform(-0.12, 0.12))
     body(rng, canvas, line, widths, surface, tone)
@@ -506,7 +527,7 @@ def box(rng: Generator, canvas: Canvas, start: NDArray, tip: NDArray, half: floa
         surface_fill(rng, canvas, inner + side * wide * rng.uniform(-0.2, 0.2), tone)
 
 
-def with_instruments(rng: Generator, image: Picture, count: int) -> tuple[Picture, Plane]:
+def with_instruments(rng: Generator, image: Picture, count: int, accessories: float) -> tuple[Picture, Plane]:
     """Return the picture with instruments and their coverage [h, w], 0..1."""
     height, width = image.shape[:2]
     surround = image.reshape(-1, 3).mean(0)
@@ -517,7 +538,7 @@ def with_instruments(rng: Generator, image: Picture, count: int) -> tuple[Pictur
     total = np.zeros((height, width), np.float32)
     for _ in range(count):
         layer = Canvas(canvas.image.copy(), np.zeros((height, width), np.float32), canvas.surround, canvas.light)
-        instrument(rng, layer)
+        instrument(rng, layer, accessories)
         if rng.random() < 0.6:
             move = np.float32([[1, 0, rng.normal(0, 6)], [0, 1, rng.uniform(1, 12)]])
             cast = cv2.warpAffine(layer.mask, move, (width, height))

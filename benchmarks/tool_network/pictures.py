@@ -8,29 +8,34 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from benchmarks.tool_network.instruments import clips, with_instruments
-from benchmarks.tool_network.tissue import Picture, Plane, TissuePool, falloff, noise, smooth
+from benchmarks.tool_network.tissue import Picture, Plane, TissuePool, falloff, lumen, noise, smooth
 
 SIZE_PX = (128, 160)
 """Height and width of a training picture."""
 DRAWN_PX = (192, 240)
 WITHOUT_TOOLS = 0.15
 """Share of pictures without instruments."""
+HOLLOW = 0.13
+"""Share of pictures from inside a hollow organ, in addition to those among the tissues."""
+ACCESSORIES = (0.09, 0.85)
+"""Share of accessories of flexible endoscopes among the instruments, elsewhere and inside of hollow organs."""
 
 
 def training_picture(rng: Generator, pool: TissuePool) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return a picture uint8 RGB [128, 160, 3] and the coverage by tools, uint8 [128, 160], 255 = tool."""
     height, width = DRAWN_PX
-    image = pool.draw(rng, height, width)
+    hollow = rng.random() < HOLLOW
+    image = lumen(rng, height, width) if hollow else pool.draw(rng, height, width)
     light = falloff(rng, height, width)
     mask = np.zeros((height, width), np.float32)
     inner_light = rng.random() < 0.5
     if not inner_light:
         image = image * light[..., None]
-    if rng.random() < 0.12:
+    if rng.random() < 0.06:
         image = clips(rng, np.asarray(image, np.float32))
     if rng.random() >= WITHOUT_TOOLS:
         count = int(rng.choice([1, 2, 3, 4], p=[0.4, 0.33, 0.17, 0.1]))
-        image, mask = with_instruments(rng, np.asarray(image, np.float32), count)
+        image, mask = with_instruments(rng, np.asarray(image, np.float32), count, ACCESSORIES[hollow])
     if inner_light:
         image = image * light[..., None]
     if rng.random() < 0.18:
@@ -73,7 +78,7 @@ def photographed(rng: Generator, image: Picture, mask: Plane) -> tuple[NDArray[n
         image = image ** np.float32(np.exp(rng.normal(0, 0.25)))
     image = image * np.exp(rng.normal(0, 0.07, 3)).astype(np.float32)
     grey = image.mean(-1, keepdims=True)
-    image = grey + (image - grey) * np.float32(np.exp(rng.normal(0.1, 0.2)))
+    image = grey + (image - grey) * np.float32(np.exp(rng.normal(0.15, 0.17)))
     blur = float(rng.choice([0, 0.5, 1, 2], p=[0.35, 0.3, 0.22, 0.13]))
     if blur:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), np.float32)

@@ -36,7 +36,7 @@ PALETTES = np.array(
 )
 
 
-LIKELY = np.array([1.5, 1.5, 0.8, 1.2, 1.0, 1.0, 0.8, 0.7, 0.5, 1.5, 0.35, 0.25])
+LIKELY = np.array([1.5, 1.5, 0.8, 1.2, 1.0, 1.0, 0.8, 0.6, 0.35, 1.5, 0.15, 0.12])
 """Relative frequency of the palettes."""
 LIKELY /= LIKELY.sum()
 
@@ -328,7 +328,7 @@ def tissue(rng: Generator, height: int, width: int, photographs: Photographs | N
     if rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 4))):
             image = loop(rng, image)
-    if rng.random() < 0.12:
+    if rng.random() < 0.07:
         image = cloth(rng, image)
     if rng.random() < 0.3:
         image = blood(rng, image)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import averaged
-from gsplat_core.endoscope.tools import SMALLEST_PX
+from gsplat_core.endoscope.tools import SMALLEST_PX, field_of_view
 from gsplat_core.errors import InvalidInput
 
 NETWORK = Path(__file__).with_name("tool_network.onnx")
@@ -20,8 +20,10 @@ INPUT_PX = (96, 80)
 """Width and height of the network's input; pictures of any aspect are resized to it."""
 LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
 """Logarithm of a byte in 0..1, with an offset because ratios are noise where it is dark. As in training."""
-LEVELS_PER_LOGIT = 16.0
-"""Resolution of logits in a byte around 128."""
+CERTAIN = 2.0
+"""Logit to which larger ones are reduced before they are smoothed along edges."""
+EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
+"""Radius of the guided filter and its squared contrast, of logarithms of colours, above which edges are kept."""
 
 
 class NetworkToolFinder:
@@ -46,12 +48,31 @@ class NetworkToolFinder:
         tissue = np.ones((height, width), np.uint8)
         if min(height, width) < SMALLEST_PX:
             return tissue
-        self._network.setInput(features(averaged(image, INPUT_PX)))
-        logits = self._network.forward()[0, 0]
-        levels = np.clip(logits * LEVELS_PER_LOGIT + 128, 0, 255).astype(np.uint8)
+        small = averaged(image, INPUT_PX)
+        planes = features(small)
+        self._network.setInput(planes)
+        smoothed = along_edges(self._network.forward()[0, 0], planes[0])
+        levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
+        levels *= field_of_view(np.asarray(small.max(axis=2), np.uint8))
         cv2.resize(levels, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
         cv2.threshold(tissue, 128, 1, cv2.THRESH_BINARY_INV, dst=tissue)
         return tissue
+
+
+def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return logits [h, w], limited to ±`CERTAIN`, with the edges of the picture.
+
+    The guided filter (He, Sun and Tang, "Guided image filtering", 2013) moves outlines to edges of colour and removes specks.
+
+    Args:
+        logits: output of the network, [h / 2, w / 2].
+        planes: `features` of the picture, [5, h, w].
+    """
+    height, width = planes.shape[1:]
+    coarse = np.empty((height, width), np.float32)
+    cv2.resize(logits.clip(-CERTAIN, CERTAIN), (width, height), dst=coarse, interpolation=cv2.INTER_LINEAR)
+    guide = cv2.merge([planes[3], planes[4], 0.5 * planes[1]])
+    return np.asarray(cv2.ximgproc.guidedFilter(guide, coarse, EDGE_RADIUS_PX, EDGE_CONTRAST), np.float32)
 
 
 def features(small: NDArray[np.uint8]) -> NDArray[np.float32]:
