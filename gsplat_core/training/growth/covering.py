@@ -21,7 +21,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
+from gsplat_core.training.growth.initialisation import colours_beside_tools, gaussians_at_pixels, tissue_depth
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy
@@ -159,7 +159,7 @@ def gaussians_beside(
     """Create one Gaussian at each of the given pixels, or at an even subset of them.
 
     Args:
-        wanted: pixel positions [M, 2].
+        wanted: pixel positions [M, 2] on tissue.
         frame: frame that provides colours.
         depth_mm: depth [H, W], 0 = unknown. Unknown pixels get extrapolated depth.
         observation: the same view as tensors; determines camera and device.
@@ -176,7 +176,7 @@ def gaussians_beside(
     added = gaussians_at_pixels(
         wanted[:: math.ceil(len(wanted) / most)],
         grid_spacing(height * width, config.gaussians),
-        tissue_colours(frame),
+        colours_beside_tools(frame),
         depth,
         observation.camera,
         sh_degree=config.sh_degree,

@@ -26,6 +26,9 @@ FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
 """Width in pixels of the margin around tools that is in-painted together with them, since masks end slightly early."""
 
+NEAR_TOOL_CELLS = 5
+"""Width in cells of four pixels of the neighbourhood whose tissue gives the colours at the edge of a tool."""
+
 MAX_ANGLE_RAD = math.radians(85)
 """Largest angle to the axis at which a fisheye pixel is placed; larger ones are clamped."""
 
@@ -164,6 +167,27 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     if tool.all():  # dilation would leave no tissue
         tool = bare_tool
     return inpaint_quarter_size(frame.image, np.asarray(tool, np.uint8))
+
+
+def colours_beside_tools(frame: Frame) -> NDArray[np.uint8]:
+    """Return the picture with the edges of tools replaced by colours of the tissue around, RGB uint8 [H, W, 3].
+
+    It suffices for Gaussians on tissue and takes a tenth of the time of `tissue_colours`, which fills whole tools.
+    """
+    if frame.mask is None or frame.mask.all() or not frame.mask.any():
+        return frame.image
+    height, width = frame.mask.shape
+    bare_tool = (frame.mask == 0).astype(np.uint8)
+    tool = cv2.dilate(bare_tool, np.ones((2 * TOOL_MARGIN_PX + 1,) * 2, np.uint8))
+    small = (max(1, width // 4), max(1, height // 4))
+    tissue = np.asarray(1 - tool, np.uint8)
+    colours = cv2.resize(cv2.copyTo(frame.image, tissue), small, interpolation=cv2.INTER_AREA).astype(np.float32)
+    weight = cv2.resize(tissue.astype(np.float32), small, interpolation=cv2.INTER_AREA)
+    total, share = (cv2.blur(each, (NEAR_TOOL_CELLS, NEAR_TOOL_CELLS)) for each in (colours, weight))
+    filled = np.clip(np.rint(total / np.maximum(share, 1e-3)[..., None]), 0, 255).astype(np.uint8)
+    large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
+    near = cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) > 1e-3
+    return np.asarray(cv2.copyTo(large, tool & near.astype(np.uint8), frame.image.copy()), np.uint8)
 
 
 def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> NDArray[np.uint8]:

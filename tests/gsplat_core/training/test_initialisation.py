@@ -7,7 +7,14 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training.growth.initialisation import facing, gaussians_from_frame, tissue_colours, tissue_depth
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.growth.initialisation import (
+    colours_beside_tools,
+    facing,
+    gaussians_from_frame,
+    tissue_colours,
+    tissue_depth,
+)
 from gsplat_core.training.metrics import psnr_frame_db
 
 TURNED = np.array([[0.0, 0, 1, 5], [0, 1, 0, -3], [-1, 0, 0, 80], [0, 0, 0, 1]])
@@ -137,3 +144,17 @@ def test_quaternions_of_rotations_in_all_four_branches():
         np.testing.assert_allclose(rotation_of(q), rotation, atol=1e-12)
         branches.add(int(np.argmax([np.trace(rotation), *np.diag(rotation)])))
     assert branches == {0, 1, 2, 3}
+
+
+def test_colours_beside_a_tool_are_those_of_the_tissue_around():
+    """Only tissue and its edge count: the tool's own colours stay where no Gaussian is created."""
+    image = np.full((64, 80, 3), (180, 60, 50), np.uint8)
+    mask = np.ones((64, 80), np.uint8)
+    mask[20:60, 30:70] = 0
+    image[mask == 0] = 255
+    frame = Frame(0, 0, image, mask=mask)
+    found = colours_beside_tools(frame)
+    assert np.abs(found[mask > 0].astype(int) - (180, 60, 50)).max() <= 1
+    assert np.abs(found[20:22, 40:60].astype(int) - (180, 60, 50)).max() <= 1
+    assert (image[mask == 0] == 255).all()
+    assert colours_beside_tools(Frame(0, 0, image)) is image
