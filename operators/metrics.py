@@ -385,7 +385,7 @@ class MetricsOp(Operator):
             self._digest.add(shown.rendered)
 
     def _take(self, prediction: Prediction | None) -> None:
-        """Score a prediction. On a slow machine it arrives after its frame was scored."""
+        """Score the prediction of a frame. On a slow machine it arrives after its frame was scored."""
         value = prediction_db(prediction)
         if prediction is None or not math.isfinite(value):
             return

@@ -46,7 +46,7 @@ class MaskFinder(Protocol):
         ...
 
     def reset(self) -> None:
-        """Clear temporal state, at the start of a new scene."""
+        """Discard what the detector keeps of earlier pictures, at the start of a new scene."""
         ...
 
 

@@ -110,7 +110,7 @@ RELEASE_ZONE = 0.04
 SETTLED_CHANGE = 0.02
 """Change from frame to frame below which a gain counts as settled."""
 SETTLED_FRAMES = 6
-"""Number of settled frames after which the gain is held again."""
+"""Number of settled frames after which a changing exposure gain is held constant again."""
 MOST_REFERENCES = 12
 """Largest number of reference pictures kept."""
 REFERENCE_EVERY = 4

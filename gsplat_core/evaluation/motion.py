@@ -102,7 +102,7 @@ class Tracking:
     """Baseline without motion: each point keeps the pixel and the true depth of its first frame."""
     points: int
     compared: int
-    """Number of compared positions."""
+    """Number of point positions that were compared with the true ones."""
 
 
 class TrackSums:
@@ -120,7 +120,7 @@ class TrackSums:
 
     @property
     def count(self) -> int:
-        """Number of compared positions."""
+        """Number of point positions that were compared with the true ones."""
         return sum(len(each) for each in self._mm)
 
     @property

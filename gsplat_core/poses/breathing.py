@@ -289,7 +289,7 @@ class BreathingTrajectory:
     in units of the median depth.
     """
     error: float
-    """Median ray error (x / z)."""
+    """Median distance of the observed rays from those of the moving points, as x / z."""
 
 
 @one_thread()

@@ -216,7 +216,7 @@ class Reconstructor:
         return True
 
     def rehearse(self, steps: int) -> None:
-        """Train on frames of the window.
+        """Make `steps` training steps on frames of the training window.
 
         Raises:
             InvalidInput: before the first frame.

@@ -153,7 +153,7 @@ def measure_geometry(
     truth: GroundTruth,
     poses: Path | None = None,
 ) -> Geometry:
-    """Run `evaluate_geometry` with the poses that the model was made with.
+    """Measure a model's geometry (`evaluate_geometry`) with the poses that the model was trained with.
 
     Args:
         frames: frames of the recording.

@@ -164,7 +164,7 @@ class StreamSnapshots:
         self._streams, self._registry, self._store = streams, registry, store
 
     async def take(self, stream: str, model: str | None, by: str) -> tuple[Snapshot, VersionRecord | None]:
-        """Write the current live model of a stream.
+        """Store the current live model of a stream as a snapshot.
 
         Args:
             stream: name of the stream.

@@ -192,7 +192,7 @@ class PoolProcess:
 
     @classmethod
     def of_line(cls, line: str) -> PoolProcess:
-        """Parse the configuration from a line of `line`."""
+        """Return the pool's configuration from the line of standard input that `line` returned."""
         values: dict[str, Any] = json.loads(line)
         return cls(**{**values, "pool": PoolSettings(**values["pool"])})
 

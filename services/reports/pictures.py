@@ -41,7 +41,7 @@ class KeyframePictures:
 
 
 def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
-    """Return the four pictures of one frame."""
+    """Return a frame's picture, its reconstruction, the error and the depth, for the report's table."""
     rendered = scored.rendered
     return KeyframePictures(
         scored,

@@ -40,7 +40,7 @@ class StepInputs:
         self.mask = torch.ones(shape, dtype=torch.uint8, device=device)
         self.depth = torch.zeros(shape, device=device) if with_depth else None
         self.target: ResidualTarget | None = None
-        """Residual target, created when colours are first corrected."""
+        """Buffers of the target picture for colour corrections, created when colours are first corrected."""
         self._taken: Observation | None = None
         self._corrects = False
 
