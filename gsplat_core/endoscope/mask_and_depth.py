@@ -19,7 +19,7 @@ LEAST_TISSUE = 0.02
 """Share of tissue below which a frame is not trained on."""
 LOST_TOOL_SHARE = 0.05
 """Share of tool pixels in the previous mask from which a mask without any tool counts as lost."""
-LOST_FRAMES, LOST_S = 5, 0.15
+LOST_FRAMES, LOST_S = 5, 0.19
 """Largest number of consecutive frames with a lost mask, and their duration in seconds. After that the tool counts as
 withdrawn.
 """

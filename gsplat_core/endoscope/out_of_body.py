@@ -160,7 +160,10 @@ class BodyGate:
     """
 
     def __init__(self) -> None:
-        self.reset()
+        self._inside = True
+        self._tissue = self._without = 0
+        self._recent: deque[bool] = deque(maxlen=RECENT_FRAMES)
+        """Evidence of the outside in recent pictures."""
 
     def reset(self) -> None:
         """Reset for another stream."""
@@ -208,9 +211,8 @@ class BodyGate:
 
     def _open(self) -> None:
         self._inside = True
-        self._recent: deque[bool] = deque(maxlen=RECENT_FRAMES)
-        """Evidence of the outside in recent pictures."""
         self._tissue = self._without = 0
+        self._recent.clear()
 
 
 def _size(image: NDArray[np.uint8], long_side_px: int) -> tuple[int, int]:

@@ -130,7 +130,7 @@ class SequenceCheck:
         long = self._same_run >= 2 and without_new_s >= FROZEN_S
         return "frozen" if long or self._same_run >= FROZEN_FRAMES else "duplicate"
 
-    def _torn(self, small: NDArray[np.uint8], share: NDArray[np.float32]) -> bool:
+    def _torn(self, small: NDArray[np.uint8], share: NDArray[Any]) -> bool:
         """Return True if the lowest rows are those of the previous picture or single-coloured,
         while rows above changed as usual. `share` is the share of changed pixels of each row.
         """

@@ -21,7 +21,7 @@ def test_a_frame_full_of_tool_has_no_tissue():
     assert [check.fault(mask(columns), 0) for columns in (8, 40, 8)] == [None, "no tissue", None]
 
 
-@pytest.mark.parametrize(("fps", "lost"), [(60, 5), (30, 4), (5, 0)])
+@pytest.mark.parametrize(("fps", "lost"), [(60, 5), (30, 5), (25, 4), (5, 0)])
 def test_a_tool_that_is_gone_at_once_is_a_lost_mask_for_some_frames_only(fps, lost):
     check = MaskCheck()
     found = [check.fault(mask(columns), round(k * 1e9 / fps)) for k, columns in enumerate((12, 12, *[0] * 12, 12))]
