@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.sessions import SessionReader, WriterOptions
 from gsplat_core.io.sessions.records import DepthTaken, Observed, Rehearsed, SceneBegun
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training.placement import LateDepth
 from operators.applications.live import live_graph, warm_up
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings, replay
@@ -30,18 +32,19 @@ from operators.sources.source import SourceDescription, ThreadedSource
 FRAMES = 14
 
 
-SHOWN_S = 1.0
+SHOWN_S, FOUND_S = 1.0, 60.0
 
 
 class _Scope(ThreadedSource):
     """Frames of a recording in real time, with what happens to a scope.
 
     A frame waits until a picture was shown since the last one, at most `SHOWN_S`. A busy machine then drops none.
+    Frames with a number in `waits_for` also wait for an event, at most `FOUND_S`.
     """
 
-    def __init__(self, recording, change, pause_s) -> None:
+    def __init__(self, recording, change, waits_for) -> None:
         super().__init__(ahead=1)
-        self._recording, self._change, self._pause_s = recording, change, pause_s
+        self._recording, self._change, self._waits_for = recording, change, waits_for
         self.shown = threading.Event()
         self.description = SourceDescription(
             "scope", recording.width_px, recording.height_px, 20.0, recording.camera, recording.fields
@@ -49,9 +52,11 @@ class _Scope(ThreadedSource):
 
     def frames(self) -> Iterator[Frame]:
         for frame in self._recording:
-            time.sleep(self._pause_s)
+            time.sleep(0.05)
             if frame.seq > 0:
                 self.shown.wait(SHOWN_S)
+            if frame.seq in self._waits_for:
+                self._waits_for[frame.seq].wait(FOUND_S)
             self.shown.clear()
             yield self._change(frame.with_fields(arrived_ns=time.monotonic_ns()))
 
@@ -86,7 +91,7 @@ def of_two_eyes(frame: Frame) -> Frame:
     return frame.with_fields(image=image, right_image=right, right_camera=eye, mask=mask)
 
 
-def record(folder: Path, change, options: WriterOptions | None = None, pause_s: float = 0.05) -> RunOutcome:
+def record(folder: Path, change, options: WriterOptions | None = None, waits_for=MappingProxyType({})) -> RunOutcome:
     recording = open_recording(synthesize(folder / "synthetic", frames=FRAMES, width_px=64, height_px=48))
     (folder / "live").mkdir()
     settings = LiveSettings(
@@ -97,7 +102,7 @@ def record(folder: Path, change, options: WriterOptions | None = None, pause_s: 
         seed=3,
         eyes="both",
     )
-    source = _Scope(recording, change, pause_s)
+    source = _Scope(recording, change, waits_for)
     graph = live_graph(source, settings, warm_up(settings, source), on_shown=lambda picture: source.shown.set())
     return Session(graph, settings.stated(), command="live").execute()
 
@@ -141,9 +146,24 @@ def test_every_picture_comes_out_again(tmp_path, change):
     assert any("byte for byte" in note for note in outcome.notes)
 
 
+@pytest.fixture
+def depth_found(monkeypatch):
+    """Let frame 5 wait for the depth of a frame before the cut, and frame 10 for that of one after it."""
+    before, after = threading.Event(), threading.Event()
+    made = LateDepth.of
+
+    def of(frame, *arguments, **options):
+        late = made(frame, *arguments, **options)
+        (before if frame.seq < 6 else after).set()
+        return late
+
+    monkeypatch.setattr(LateDepth, "of", of)
+    return {5: before, 10: after}
+
+
 @pytest.mark.slow
-def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path):
-    live = record(tmp_path, of_two_eyes, pause_s=0.2)
+def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path, depth_found):
+    live = record(tmp_path, of_two_eyes, waits_for=depth_found)
     found, taken = live.find(FoundDepth), live.find(TakenDepth)
     assert found.frames.get("stereo", 0) >= taken.frames >= 2 and found.metric
     reader = SessionReader(tmp_path / "session")
@@ -156,9 +176,9 @@ def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_without_the_late_depth_the_pictures_are_others(tmp_path):
+def test_without_the_late_depth_the_pictures_are_others(tmp_path, depth_found):
     """The comparison can fail: without one of the depths it does, and the replay says which is not there."""
-    assert record(tmp_path, of_two_eyes, pause_s=0.2).find(TakenDepth).frames >= 2
+    assert record(tmp_path, of_two_eyes, waits_for=depth_found).find(TakenDepth).frames >= 2
     log = next((tmp_path / "session/segments").glob("*/log.jsonl"))
     first = re.search(r'"event":"take_depth","seq":(\d+),[^\n]*"tracks":(\{[^}]*\})', log.read_text())
     log.write_text(log.read_text().replace(first[2], '{"depth":999999}', 1))
