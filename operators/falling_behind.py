@@ -19,9 +19,10 @@ from operators.checks import tissue_of
 
 PREVIOUS_MARGIN_DB = 1.0
 """Difference in dB from which a picture counts as worse than the previous frame shown again."""
-FIRST_MARGIN_DB = 3.0
-"""Difference in dB from which a picture counts as worse than the first one of its scene: twice its squared error. A new
-scene discards the past, which a smaller gain is not worth.
+FIRST_MARGIN_DB = 6.0
+"""Difference in dB from which a picture counts as worse than the first one of its scene: four times its squared error. A
+new scene discards the past, which a smaller gain is not worth. While the scope rests for a few frames, the previous frame
+is better than a model that follows well.
 """
 RENEW_AFTER = 2
 """Number of consecutive pictures worse than trivial ones (`BehindGuard`) after which the model is started anew. The
