@@ -243,7 +243,8 @@ def _points_in_both(
     """
     shown = np.asarray(cv2.erode((left < SATURATED).astype(np.uint8), np.ones((7, 7), np.uint8)), np.uint8)
     if usable is not None:  # a border of the picture that the window contains has no disparity
-        shown *= cv2.erode(usable, np.ones((FLOW_WINDOW_PX, FLOW_WINDOW_PX), np.uint8))
+        window = np.ones((FLOW_WINDOW_PX, FLOW_WINDOW_PX), np.uint8)
+        shown &= np.asarray(cv2.erode(usable, window), np.uint8)
     corners = cv2.goodFeaturesToTrack(_levelled(left), CORNERS, CORNER_QUALITY, CORNER_APART_PX, mask=shown)
     none = np.zeros((0, 2), np.float32)
     if corners is None:
@@ -469,9 +470,10 @@ class StereoDepth(Estimator):
             off_px = _off_along_rows(rows, frame.height_px, frame.width_px, self._device)
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
             depth = torch.where(known, reach_of(frame, camera) / torch.where(known, shift, 1), 0)
-            confidence = torch.where(known, 1 / (1 + variance), 0)
-            planes = HostCopy(torch.stack([depth, confidence * _has_company(confidence, shrink)]))
-        return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is scarce
+            planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
+        both = planes.numpy().copy()  # frames may be kept for long, and page-locked memory is scarce
+        both[1] *= _has_company(both[1], shrink)
+        return both
 
     def _inside_both(self, usable: NDArray[np.uint8], disparity_px: Tensor, shrink: int) -> Tensor:
         """Return the pixels, bool [H, W], whose windows are inside of the field of view of both eyes.
@@ -623,15 +625,17 @@ def reach_of(frame: Frame, camera: Camera) -> float:
     return float(camera.K[0, 0] * baseline)
 
 
-def _has_company(confidence: Tensor, shrink: int) -> Tensor:
+def _has_company(confidence: NDArray[np.float32], shrink: int) -> NDArray[np.bool_]:
     """Return the pixels, bool [H, W], around which at least half of the pixels are confident.
 
     Wrong matches in occluded areas form islands between pixels that do not match.
     """
     side = 2 * (shrink * COMPANY_PX // 2) + 1
-    confident = (confidence >= BELIEVED).float()[None, None]
-    share = torch.nn.functional.avg_pool2d(confident, side, 1, side // 2, count_include_pad=False)
-    return share[0, 0] >= 0.5
+    count = lambda plane: cv2.boxFilter(
+        plane, cv2.CV_32F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    confident = (confidence >= BELIEVED).astype(np.uint8)
+    return np.asarray(2 * count(confident) >= count(np.ones_like(confident)))
 
 
 def _tensors_of(pictures: list[NDArray[np.uint8]], device: torch.device) -> list[Tensor]:
