@@ -43,6 +43,7 @@ def test_draws_cover_their_ranges() -> None:
     assert not any(scene.stereo and any(scene.lens) for scene in scenes)
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     folders = [synthesize(tmp_path / name, drawn=draw_scene(seed), **SMALL) for name, seed in (("a", 1), ("b", 1))]
     first, second = (
