@@ -263,12 +263,12 @@ def test_the_training_program_in_the_guide_works(tmp_path):
 
 def test_guides_state_no_measured_quality():
     """Measured figures belong in RESULTS.md, which is generated from logs, or in benchmarks/results. methods.md is a
-    table of figures, each with its log.
+    table of figures, each with its log. tuned_constants.md lists the measurements behind constants.
     """
     found = []
     for document in GUIDES:
         is_guide = "docs" in document.relative_to(ROOT).parts and "adr" not in document.parts
-        if is_guide and document.name != "methods.md":
+        if is_guide and document.name not in ("methods.md", "tuned_constants.md"):
             for figure in re.findall(r"\d+(?:\.\d+)? dB\b", document.read_text(encoding="utf-8")):
                 if figure != "100 dB":  # the score of equal pictures
                     found.append(f"{document.name}: {figure}")
