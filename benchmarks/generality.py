@@ -3,8 +3,8 @@
     python benchmarks/generality.py ../shared/recordings --device cuda
     python benchmarks/generality.py MY_RECORDINGS --parts live --runs 1 --out /tmp/mine.jsonl
 
-Recordings are found by their files, so that the script runs on recordings that nobody chose. It then runs the benchmarks
-of gates, tool masks and random geometry. Each run is a line of the log. `publish.py` generates results/generality.md from
+Recordings are found by their files, so the script also runs on unknown recordings.
+Each run is a line of the log. `publish.py` generates results/generality.md from
 the logs in `logs/generality`.
 """
 

@@ -31,7 +31,7 @@ from gsplat_core.scene.frames import Frame
 
 
 class SourceState(Enum):
-    """Whether a source delivers frames."""
+    """State of a source: it delivers frames or not."""
 
     LIVE = "live"
     """Frames arrive as expected."""

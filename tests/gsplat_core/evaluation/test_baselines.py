@@ -178,7 +178,7 @@ def test_the_protocols_figures_on_the_cutting_recording():
 @pytest.mark.recordings
 @pytest.mark.slow
 def test_the_baselines_by_flow_and_by_older_frames(recordings_dir):
-    """Of the first frames, because optical flow takes long."""
+    """Baselines of the first frames only, because optical flow takes long."""
     cutting = measure_baselines(CuttingRecording(42), ages=AGES, flow=True)
     assert cutting.heldout["half_way_flow"].psnr_tissue_db == pytest.approx(41.26, abs=0.05)
     assert cutting.heldout_neighbour_mean_db == pytest.approx(40.85, abs=0.05)

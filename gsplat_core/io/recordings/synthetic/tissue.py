@@ -108,7 +108,7 @@ class TissueLook:
     grain: float = 0.10
     """Standard deviation of the fine texture, relative to the colour."""
     creases: float = 0.20
-    """How much darker the creases of the tissue are."""
+    """Darkness of the tissue's creases."""
     roughness: float = 1.0
     """Factor on the slopes of the tissue's fine relief."""
     wetness: float = 0.12
