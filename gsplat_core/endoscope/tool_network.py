@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.reduced import averaged
-from gsplat_core.endoscope.tools import SMALLEST_PX, field_of_view
-from gsplat_core.errors import InvalidInput
+from gsplat_core.endoscope.tools import SMALLEST_PX, field_of_view, size_of
 
 NETWORK = Path(__file__).with_name("tool_network.onnx")
 INPUT_PX = (96, 80)
@@ -42,9 +41,7 @@ class NetworkToolFinder:
         Raises:
             InvalidInput: for any other array.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
-        height, width = image.shape[:2]
+        height, width = size_of(image)
         tissue = np.ones((height, width), np.uint8)
         if min(height, width) < SMALLEST_PX:
             return tissue

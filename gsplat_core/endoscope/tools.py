@@ -239,6 +239,13 @@ class View:
     """Histogram of brightness inside the field of view, [256]."""
 
 
+def size_of(image: NDArray[np.uint8]) -> tuple[int, int]:
+    """Return the height and width of a picture, RGB uint8 [H, W, 3]. Raises InvalidInput for any other array."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+    return image.shape[0], image.shape[1]
+
+
 class ToolFinder:
     """Tool segmentation of one stream, called for each frame in order. Deterministic, with constant memory.
 
@@ -264,9 +271,7 @@ class ToolFinder:
         Raises:
             InvalidInput: for any other array.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
-        height, width = image.shape[:2]
+        height, width = size_of(image)
         if min(height, width) < SMALLEST_PX:
             return np.ones((height, width), np.uint8)
         view = view_of(image)

@@ -51,12 +51,15 @@ from gsplat_core.scene.cameras import Camera
 GENERATOR = "intrasplat synthesize"
 _FRAME = r"frame-\d{6}\."
 _WRITTEN = re.compile(
-    rf"(views/third/)?(images/{_FRAME}color|masks/{_FRAME}mask|depth/{_FRAME}depth)\.png"
+    rf"(views/third/|behind/)?(images/{_FRAME}color|depth/{_FRAME}depth)\.png|(views/third/)?masks/{_FRAME}mask\.png"
     rf"|images_right/{_FRAME}color\.png|true_depth/{_FRAME}depth\.png|(scene_)?flow/\d{{6}}\.npy"
     r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json|valid_mask\.png"
 )
 """Pattern of the files written by `synthesize`."""
 _FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for name in ("images", "masks", "depth")) | {
+    "behind",
+    "behind/images",
+    "behind/depth",
     "images_right",
     "true_depth",
     "flow",

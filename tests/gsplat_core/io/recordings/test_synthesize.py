@@ -10,6 +10,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
+from gsplat_core.io.recordings.synthetic.extras import Extras
 
 
 def _bytes(folder: Path) -> dict[str, bytes]:
@@ -75,6 +76,14 @@ def test_replaces_its_own_work_and_nothing_else(tmp_path: Path) -> None:
     assert (folder / "thesis.txt").read_text() == "mine"
     with pytest.raises(InvalidSetting, match="is a file"):
         synthesize(folder / "thesis.txt", frames=1, **arguments)
+
+
+def test_replaces_a_recording_with_every_extra(tmp_path: Path) -> None:
+    extras = Extras(third=True, flow=True, tracks=True, behind=True, depth_noise_mm=0.1)
+    arguments = {"frames": 1, "width_px": 32, "height_px": 32, "extras": extras}
+    first = _bytes(synthesize(tmp_path / "x", **arguments))
+    assert any(name.startswith("behind/depth/") for name in first)
+    assert _bytes(synthesize(tmp_path / "x", **arguments)) == first
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
