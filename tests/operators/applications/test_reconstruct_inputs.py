@@ -1,0 +1,34 @@
+"""Inputs of an offline reconstruction are left out where validation frames are clearly better without them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gsplat_core.io.recordings import synthesize
+from gsplat_core.training import validation
+from operators.applications import reconstruct as module
+from services.reports.build import write_reports
+
+
+@pytest.mark.parametrize(
+    ("gain_db", "dropped"), [(2 * validation.INPUT_GAIN_DB, True), (0.5 * validation.INPUT_GAIN_DB, False)]
+)
+def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypatch, gain_db, dropped):
+    """The scores of the validation frames are the test's; each input that is left out gains the same."""
+    folder = synthesize(tmp_path / "take", frames=12, width_px=48, height_px=40)
+    monkeypatch.setattr(validation, "FIRST_STEPS", 1)
+    monkeypatch.setattr(validation, "MOST_STEPS", 1)
+
+    def score(learned, frames):
+        without = (learned.snapshot().depth_source is None) + (learned.config.eyes == "left")
+        return 30.0 + gain_db * without
+
+    monkeypatch.setattr(module, "validation_psnr_db", score)
+    settings = module.ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=(), eyes="both")
+    outcome = module.reconstruct(settings, clock=lambda: 0.0, report=write_reports)
+    assert any("depth was not used" in note for note in outcome.notes) == dropped
+    assert any("right eye was not used" in note for note in outcome.notes) == dropped
+    run = json.loads((tmp_path / "out" / "report.json").read_text())["run"]
+    assert run["eyes"] == ("left" if dropped else "both")
