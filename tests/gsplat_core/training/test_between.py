@@ -15,6 +15,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion.between import between_frames
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.offline import SPACING_INTERVALS
 from gsplat_core.training.reconstructor import Reconstructor
 
 WIDTH, HEIGHT = 96, 64
@@ -84,3 +85,11 @@ def test_before_the_first_and_after_the_last_frame_the_scene_holds(moved):
     fps, model = moved
     assert torch.equal(model.at(-5.0).means, model.at(0.0).means)
     assert torch.equal(model.at(60.0).means, model.at(11 / fps).means)
+
+
+def test_motion_is_resolved_no_finer_than_the_frames(moved):
+    fps, model = moved
+    finest_s = ReconstructorConfig.offline().motion_spacing_s
+    # Columns are placed so that a whole number of them covers the recording.
+    assert model.field.spacing_s == pytest.approx(max(SPACING_INTERVALS / fps, finest_s), rel=0.1)
+    assert (model.field.spacing_s > 2 * finest_s) == (fps == 5)
