@@ -23,7 +23,6 @@ from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.neighbours import nearest_others
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.motion.between import between_frames
 from gsplat_core.training.motion.surface_tracks import SurfaceTracks
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
@@ -128,11 +127,6 @@ class ToFit:
         """Trajectories of the surface through the frames."""
         return SurfaceTracks(self.frames, self.seen, self.at_rest)
 
-    @cached_property
-    def between(self) -> list[Observation]:
-        """Interpolated pictures at the times of missing frames."""
-        return between_frames(self.seen)
-
 
 def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], depth: str | None) -> ToFit:
     """Prepare frames for offline training; `frames` is modified.
@@ -174,7 +168,6 @@ class OfflineTraining:
         step: TrainingStep,
         observations: Sequence[Observation],
         *,
-        between: Sequence[Observation] = (),
         most_gaussians: int,
         seed: int,
         strategy: str = "streaming",
@@ -184,7 +177,6 @@ class OfflineTraining:
         rights = [one.right for one in observations if one.right is not None]
         self._observations = [*observations, *rights]
         """Observations of both eyes."""
-        self._between = between
         self._most_gaussians, self._seed = most_gaussians, seed
         steady = steadiness(observations)
         # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
@@ -217,9 +209,8 @@ class OfflineTraining:
     def _next(self) -> Observation:
         """Return the next observation in a random order of all."""
         if not self._order:
-            self._order = self._random.permutation(len(self._observations) + len(self._between)).tolist()
-        number = self._order.pop() - len(self._observations)
-        return self._between[number] if number >= 0 else self._observations[number]
+            self._order = self._random.permutation(len(self._observations)).tolist()
+        return self._observations[self._order.pop()]
 
     def _smooth(self) -> None:
         """Smooth in time and space, in proportion to the number of steps since the last call."""

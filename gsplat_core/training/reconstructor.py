@@ -327,7 +327,6 @@ class Reconstructor:
         training = OfflineTraining(
             self._step,
             seen,
-            between=given.between,
             most_gaussians=self.config.max_gaussians,
             seed=self._seed,
             strategy=self.config.strategy,

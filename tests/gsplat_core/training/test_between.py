@@ -1,4 +1,4 @@
-"""Times of missing frames and between frames: interpolated pictures, and the state of the scene."""
+"""State of an offline reconstruction between its frames and beyond its ends."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.motion.between import between_frames
-from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import SPACING_INTERVALS
 from gsplat_core.training.reconstructor import Reconstructor
 
@@ -34,28 +31,6 @@ def pictures(count: int, px_per_frame: float, noise: float) -> list[np.ndarray]:
         moved = cv2.remap(texture.astype(np.float32), *np.broadcast_arrays(x, y), cv2.INTER_LINEAR)
         found.append((moved + noise * random.standard_normal(moved.shape)).clip(0, 255).astype(np.uint8))
     return found
-
-
-def seen(images: list[np.ndarray], numbers: list[int]) -> list[Observation]:
-    tissue = torch.ones(HEIGHT, WIDTH, dtype=torch.uint8)
-    return [Observation(n, n / 30, CAMERA, torch.from_numpy(images[n]), tissue, None) for n in numbers]
-
-
-@pytest.mark.parametrize(
-    "px_per_frame, noise, least_gain_db", [(2.0, 1.0, 3.0), (0.0, 8.0, 1.0)], ids=["moves", "still"]
-)
-def test_a_missing_frame_is_better_than_its_neighbour(px_per_frame, noise, least_gain_db):
-    images = pictures(10, px_per_frame, noise)
-    (found,) = between_frames(seen(images, [0, 1, 2, 3, 4, 6, 7, 8, 9]))
-    assert found.time_s == pytest.approx(5 / 30)
-    shown = found.image.numpy()
-    copied = psnr_tissue_db(images[4], images[5])
-    assert psnr_tissue_db(shown, images[5]) > copied + least_gain_db
-
-
-@pytest.mark.parametrize("numbers", [[0, 1, 2, 3], [0, 1, 2, 3, 9], [0]], ids=["none missing", "many missing", "one"])
-def test_other_intervals_are_left_alone(numbers):
-    assert between_frames(seen(pictures(10, 1.0, 0.0), numbers)) == []
 
 
 @pytest.fixture(scope="module", params=[5, 30], ids=["5 frames/s", "30 frames/s"])
