@@ -33,7 +33,11 @@ def project(given, dtype, **options):
     out = fully_fused_projection_with_ut(**cast, width=W, height=H, calc_compensations=True)
     total = 0
     for values, size in zip(out[1:], (1, 1, 10, 10), strict=True):
-        total = total + size * (values * torch.cos(torch.arange(values.numel())).reshape(values.shape)).sum()
+        total = (
+            total
+            + size
+            * (values * torch.cos(torch.arange(values.numel(), device=values.device)).reshape(values.shape)).sum()
+        )
     return out, torch.autograd.grad(total, leaves)
 
 
