@@ -37,6 +37,7 @@ from operators.applications.replay import ReplaySettings
 from operators.graph import Application
 from operators.ingest import SourceOp
 from operators.pipeline import analysis_operator
+from operators.rasterize import without_surround
 from operators.sinks.callback import CallbackSinkOp
 from operators.sources.registry import SourceOptions, open_source
 
@@ -65,8 +66,8 @@ class Shown:
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         image = self._renderer.render(camera, frame.time_s, ("image",)).result().image
         image = image * image.new_tensor(frame.exposure)
-        shown = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        return psnr_tissue_db(shown, frame.image, frame.mask)
+        shown = without_surround((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy(), frame)
+        return psnr_tissue_db(shown, frame.image, frame.tissue)
 
 
 def with_settings(config: Any, settings: list[str]) -> Any:
@@ -139,7 +140,7 @@ class Run:
             self.series["next_db"].append(self._shown.psnr_db(frame) if scored and is_shown else nothing)
             copied = scored and before is not None
             self.series["copy_db"].append(
-                psnr_tissue_db(before.image, frame.image, frame.mask) if copied and before is not None else nothing
+                psnr_tissue_db(before.image, frame.image, frame.tissue) if copied and before is not None else nothing
             )
             self._learn(frame)
             self.series["shown_db"].append(self._shown.psnr_db(frame) if scored else nothing)

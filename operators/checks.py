@@ -131,13 +131,6 @@ class StageOp(Operator):
             outcome.add(stage.counts())
 
 
-def tissue_of(frame: Frame) -> NDArray[np.uint8] | None:
-    """Return the intersection of tool mask and loss mask, uint8 [H, W], 0 = excluded; None if the frame has neither."""
-    if frame.mask is None or frame.loss_mask is None:
-        return frame.mask if frame.loss_mask is None else frame.loss_mask
-    return np.minimum(frame.mask, frame.loss_mask)
-
-
 def left_out(frame: Frame, kept: NDArray[np.uint8]) -> Frame:
     """Return the frame with further pixels excluded from the loss.
 
@@ -474,7 +467,7 @@ class ExposureStage(Stage):
         if frame.new_scene is not None:
             self._estimator.start_scene()
         if frame.unusable is None:
-            self._estimator.observe(frame.image, tissue_of(frame), frame.pts_ns)
+            self._estimator.observe(frame.image, frame.tissue, frame.pts_ns)
             self.found["changing"] += self._estimator.following
         self.found["other than the scene's"] += self._estimator.gains != UNCHANGED
         return self.carried(frame)
@@ -505,7 +498,7 @@ class SharpnessStage(Stage):
             return frame
         if frame.new_scene is not None:
             self._gate.start_scene()
-        fault = self._gate.fault(frame.image, frame.pts_ns, tissue_of(frame))
+        fault = self._gate.fault(frame.image, frame.pts_ns, frame.tissue)
         return frame if fault is None else self.withhold(frame, fault)
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import psnr_tissue_db
-from operators.checks import tissue_of
 
 PREVIOUS_MARGIN_DB = 1.0
 """Difference in dB from which a picture counts as worse than the previous frame shown again."""
@@ -99,5 +98,5 @@ class BehindGuard:
 def _db(image: NDArray[np.uint8], frame: Frame) -> float:
     """Return the tissue PSNR of a picture against a frame in dB, over some of the rows; NaN without tissue."""
     every = max(1, image.shape[0] // COMPARED_ROWS)
-    mask = tissue_of(frame)
+    mask = frame.tissue
     return psnr_tissue_db(image[::every], frame.image[::every], None if mask is None else mask[::every])

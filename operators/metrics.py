@@ -98,7 +98,7 @@ def prediction_db(prediction: Prediction | None) -> float:
     """Return the tissue PSNR of a prediction against its frame, in dB; NaN without a prediction."""
     if prediction is None or prediction.image is None:
         return math.nan
-    return psnr_tissue_db(prediction.image, prediction.frame.image, prediction.frame.mask)
+    return psnr_tissue_db(prediction.image, prediction.frame.image, prediction.frame.tissue)
 
 
 @dataclass(frozen=True)
@@ -430,9 +430,9 @@ class MetricsOp(Operator):
         self.frames += 1
         quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
         if frame.unusable is None:
-            quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask, similarity=similarity)
+            quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.tissue, similarity=similarity)
             if previous is not None and previous.image.shape == frame.image.shape:
-                before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
+                before_db = psnr_tissue_db(previous.image, frame.image, frame.tissue)
         return ScoredFrame(rendered, quality, before_db, self._next_frame_db(frame, before_db))
 
     def _log(self, entry: Mapping[str, Value]) -> None:

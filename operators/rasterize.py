@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any, cast
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions, standard_outputs
+from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
 from operators.messages import DeformedScene, Prediction, Reconstruction, RenderedFrame
@@ -56,6 +58,16 @@ def _displayed(image: torch.Tensor) -> HostCopy:
     return HostCopy((image.clamp(0, 1) * 255).round().to(torch.uint8))
 
 
+def without_surround(picture: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
+    """Return a picture of a frame's view, black outside of the field of view and under a recorder's overlay.
+
+    Nothing is trained there, so a rendered picture has arbitrary colours.
+    """
+    if frame.loss_mask is None or frame.withheld is not None:
+        return picture
+    return np.asarray(cv2.bitwise_and(picture, picture, mask=frame.loss_mask), np.uint8)
+
+
 class Rasterizer:
     """Renders colour, depth and opacity. Not thread-safe.
 
@@ -87,7 +99,7 @@ class Rasterizer:
             made_from = scene.reconstruction
             return RenderedFrame(
                 frame=scene.frame,
-                image=image.numpy(),
+                image=without_surround(image.numpy(), scene.frame),
                 depth=depth.numpy(),
                 alpha=alpha.numpy(),
                 model_version=scene.model.version,
@@ -102,7 +114,7 @@ class Rasterizer:
     def picture(self, scene: DeformedScene) -> NDArray[np.uint8]:
         """Render only the picture of a scene, uint8 RGB [H, W, 3]."""
         with torch.inference_mode(), self._own_stream(scene.model):
-            return _displayed(self._render(scene, ("image",))[0]).numpy()
+            return without_surround(_displayed(self._render(scene, ("image",))[0]).numpy(), scene.frame)
 
     def _render(self, scene: DeformedScene, outputs: Iterable[str]) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
         """Render a scene. Return the image scaled by the frame's exposure, and the outputs as rendered."""

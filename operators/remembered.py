@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.checks import tissue_of
 from operators.messages import RenderedFrame
 
 COVERED = 0.1
@@ -45,7 +44,7 @@ class RememberedTissue:
         Returns:
             uint8 [H, W], 255 = remembered, 0 elsewhere; None if no pixel is.
         """
-        seen = tissue_of(rendered.content or rendered.frame)
+        seen = (rendered.content or rendered.frame).tissue
         if whole or (seen is not None and seen.shape != rendered.alpha.shape):
             layer = np.asarray(cv2.inRange(rendered.alpha, COVERED, np.inf), np.uint8)
         elif seen is None:

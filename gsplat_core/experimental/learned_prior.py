@@ -25,7 +25,7 @@ from gsplat_core.deformation.field import displaced
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import COLOUR, POSITION, RAW_COLUMNS
 from gsplat_core.training.motion.image_motion import CELL_PX, Flow, SurfaceMotion
-from gsplat_core.training.motion.prior import AT_FIRST, HORIZON_S, FlowPrior, followed
+from gsplat_core.training.motion.prior import AT_FIRST, HORIZON_S, FlowPrior
 from gsplat_core.training.steps.colour_correction import colour_change
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
@@ -354,9 +354,9 @@ class LearnedPrior(FlowPrior):
         motion, guesses = self._usable_motion(), self._guesses
         self._expected, self._guesses = None, []
         if flow is None or motion is None or motion.before != motion.after:
-            self._picture.take(frame.image, followed(frame), None)
+            self._picture.take(frame.image, frame.tissue, None)
             return
-        self._picture.take(frame.image, followed(frame), flow)
+        self._picture.take(frame.image, frame.tissue, flow)
         ahead, others = self._next_motion(flow, guesses)
         picture = self._picture.after(ahead, others)
         if picture is not None:

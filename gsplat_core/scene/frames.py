@@ -87,6 +87,13 @@ class Frame:
             return self.withheld
         return "damaged" if self.status is FrameStatus.DAMAGED else None
 
+    @property
+    def tissue(self) -> NDArray[np.uint8] | None:
+        """Intersection of `mask` and `loss_mask`, uint8 [H, W], 0 = excluded; None if the frame has neither."""
+        if self.mask is None or self.loss_mask is None:
+            return self.mask if self.loss_mask is None else self.loss_mask
+        return np.minimum(self.mask, self.loss_mask)
+
     def __post_init__(self) -> None:
         if self.depth is not None and self.depth_origin is None:
             object.__setattr__(self, "depth_origin", MEASURED)

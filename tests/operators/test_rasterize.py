@@ -41,6 +41,18 @@ def test_further_outputs_are_those_of_the_renderer(frame, model, camera, compute
     np.testing.assert_array_equal(shown.depth, plain.depth)
 
 
+def test_pictures_are_black_where_nothing_is_trained(frame, model, camera, compute):
+    kept = np.ones(frame().image.shape[:2], np.uint8)
+    kept[:, :6] = 0
+    plain, limited, unseen = (
+        compute(RasterizeOp(None), scene=DeformedScene(frame(**fields), model(4), camera, True))[0]
+        for fields in ({}, {"loss_mask": kept}, {"loss_mask": 0 * kept, "withheld": "blur"})
+    )
+    assert plain.image[:, :6].any() and not limited.image[:, :6].any()
+    np.testing.assert_array_equal(limited.image[:, 6:], plain.image[:, 6:])
+    np.testing.assert_array_equal(unseen.image, plain.image)
+
+
 def test_displayed_clips_and_rounds_to_nearest():
     image = torch.tensor([[[-1.0, 0.0, 0.5 / 255 + 1e-4], [1.0, 2.0, 0.4 / 255]]])
     np.testing.assert_array_equal(displayed(image), [[[0, 0, 1], [255, 255, 0]]])

@@ -9,7 +9,6 @@ import pytest
 
 from gsplat_core.io.sessions.tracks import TrackWriter
 from gsplat_core.training.metrics import psnr_tissue_db
-from operators.checks import tissue_of
 from operators.remembered import COVERED, RememberedTissue, marked
 from tests.operators.conftest import make_frame, make_rendered
 
@@ -34,7 +33,7 @@ def test_what_the_frame_does_not_show_is_remembered_and_all_else_stays(rng, size
     tissue = RememberedTissue()
     for _ in range(2):
         rendered = picture_of(rng, size, **{name: blobs(rng, size) for name in masks})
-        seen = np.ones(size, np.uint8) if not masks else tissue_of(rendered.frame)
+        seen = np.ones(size, np.uint8) if not masks else rendered.frame.tissue
         expected = (seen == 0) & (rendered.alpha >= COVERED)
         layer = tissue.layer(rendered)
         assert (layer is None) == (not expected.any())

@@ -263,7 +263,7 @@ class FlowPrior:
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
         last, last_interval_s, self._motion = self._usable_motion(), self._interval_s, None
-        flow = self._image_motion.follow(frame.image, followed(frame))
+        flow = self._image_motion.follow(frame.image, frame.tissue)
         if flow is None or before is None or camera.model != "pinhole":
             self._take(frame, None, step.gaussians.device)
             return
@@ -328,13 +328,6 @@ def widened(log_scales: Tensor, moved: Tensor) -> Tensor:
     """
     variance = UNCERTAINTY * moved.square().sum(dim=1, keepdim=True)
     return (0.5 * torch.log1p(variance * torch.exp(-2 * log_scales))).clamp(max=MOST_WIDENED)
-
-
-def followed(frame: Frame) -> NDArray[np.uint8] | None:
-    """Return the mask of trackable tissue, or None if all pixels are."""
-    if frame.mask is None or frame.loss_mask is None:
-        return frame.mask if frame.loss_mask is None else frame.loss_mask
-    return frame.mask & frame.loss_mask
 
 
 def no_prior(config: ReconstructorConfig) -> None:

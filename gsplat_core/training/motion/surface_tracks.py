@@ -23,7 +23,6 @@ from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.motion.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
-from gsplat_core.training.motion.prior import followed
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
@@ -217,7 +216,7 @@ def steady_course(values: Tensor, times: Tensor) -> Tensor:
 def _flows(frames: Sequence[Frame]) -> list[Flow]:
     """Return the flow from each frame to the next."""
     motion = ImageMotion()
-    flows = [motion.follow(frame.image, followed(frame)) for frame in frames]
+    flows = [motion.follow(frame.image, frame.tissue) for frame in frames]
     return [flow for flow in flows[1:] if flow is not None]
 
 

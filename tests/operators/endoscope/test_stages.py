@@ -31,7 +31,6 @@ from operators.checks import (
     StripStage,
     left_out,
     new_stages,
-    tissue_of,
 )
 from operators.outcome import OutcomeBuilder
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
@@ -228,10 +227,10 @@ def test_masks_of_the_loss_add_up():
     one[:10], other[-10:] = 0, 0
     both = left_out(left_out(frame, one), other)
     assert np.array_equal(both.loss_mask, one & other)
-    assert tissue_of(frame) is None and tissue_of(both) is both.loss_mask
+    assert frame.tissue is None and both.tissue is both.loss_mask
     masked = dataclasses.replace(both, mask=other)
-    assert np.array_equal(tissue_of(masked), one & other)
-    assert tissue_of(dataclasses.replace(masked, loss_mask=None)) is other
+    assert np.array_equal(masked.tissue, one & other)
+    assert dataclasses.replace(masked, loss_mask=None).tissue is other
 
 
 @pytest.mark.recordings
