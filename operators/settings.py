@@ -124,8 +124,8 @@ class DepthSection(Section):
         Poses,
         Option(
             "Poses of the scope: given by the recording, or estimated from the pictures (relative; moving tissue looks like a"
-            " moving scope)",
-            ("replay", "batch", "job", *LIVE),
+            " moving scope). With given, reconstruct estimates missing poses where that helps",
+            (*TRAINING_RUNS, *LIVE),
         ),
     ] = "given"
 

@@ -87,12 +87,13 @@ class Trajectory:
         return 1 - (self.error_px / max(self.still_error_px, 1e-9)) ** 2
 
 
-def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
+def trajectory_of(frames: Iterable[Frame], camera: Camera, *, separate_breathing: bool = True) -> Trajectory:
     """Estimate the poses of a recording's frames.
 
     Args:
         frames: frames in temporal order, read once.
         camera: intrinsics of all frames; must be a pinhole.
+        separate_breathing: model periodic tissue motion. If False, it is part of the poses.
 
     Raises:
         InvalidInput: for another camera model, fewer than 3 or more than `MOST_FRAMES` frames, or
@@ -116,7 +117,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
         raise InvalidInput(
             f"only {len(seen.frame)} observations of tissue could be tracked over {count} frames: the pictures contain too few recognisable points"
         )
-    return _Odometry(seen, camera, times_s).run()
+    return _Odometry(seen, camera, times_s).run(separate_breathing)
 
 
 def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
@@ -148,7 +149,7 @@ class _Odometry:
         self._lost: list[int] = []
 
     @one_thread()
-    def run(self) -> Trajectory:
+    def run(self, separate_breathing: bool) -> Trajectory:
         """Process all frames in order, then place the frames between key frames again with the final points."""
         self._take_up(0)
         keys, next_adjustment = 1, 3
@@ -166,7 +167,7 @@ class _Odometry:
         for frame in range(1, self._count):
             if not self._is_key[frame]:
                 self._place(frame)
-        moving = self._refined_for_breathing()
+        moving = self._refined_for_breathing() if separate_breathing else None
         if moving is not None:
             self._poses = moving.poses
         for frame in self._lost:

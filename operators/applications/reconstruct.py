@@ -6,17 +6,21 @@ The protocol's held-out frames are excluded from training. The evaluation uses t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from gsplat_core.depth.registry import DepthFinder, of_recording
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings import is_heldout
+from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.models.model import Model
+from gsplat_core.poses.camera_path import MOVING_SHARE, camera_path_of, rigid_share
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training import validation
 from gsplat_core.training.budget import Budget, ObserveReport
@@ -49,7 +53,9 @@ from operators.applications.session import (
 )
 from operators.errors import NothingShown
 from operators.settings import OfflineSection, check_option
+from operators.sources.derived import PosedSource
 from operators.sources.source import FrameSource
+from operators.storage import storage_errors
 
 MINUTES_ON_GPU, MINUTES_ON_CPU = 1.0, 10.0
 """Time limits of a training with an automatic number of steps, in minutes."""
@@ -116,14 +122,10 @@ def reconstruct(
     check_option("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
-        if inside.poses != "given":
-            raise InvalidSetting(
-                f"poses is {inside.poses!r}; reconstruct sees all frames at once, so write their poses with `intrasplat poses` first"
-            )
         source = prepare(inside, notes, offline=True)
         start = Start.now()
         fitted = _Fitting(source, inside, progress, stop_requested, notes, clock).done(steps)
-        model, inside = fitted.model, fitted.settings
+        model, inside, source = fitted.model, fitted.settings, fitted.source
         graph = replay_graph(
             source,
             inside,
@@ -141,6 +143,7 @@ def reconstruct(
             finish=[
                 lambda session: session.reached.add(fitted.steps),
                 saves_model(inside.out, model),
+                *([_saves_poses(source, inside.out)] if isinstance(source, PosedSource) else []),
                 measures_baselines(source),
             ],
             notes=notes,
@@ -162,6 +165,8 @@ class Fitted(NamedTuple):
     eyes: BothEyes
     """Eyes that were trained on."""
     steps: ChosenSteps
+    source: FrameSource
+    """Source of the frames; with estimated poses if they were chosen."""
     settings: ReplaySettings
     """Settings with the inputs that were chosen."""
 
@@ -170,7 +175,7 @@ class _Inputs:
     """Settings of a training with the frames that it gets."""
 
     def __init__(self, source: FrameSource, settings: ReplaySettings) -> None:
-        self.settings, self._source = settings, source
+        self.settings, self.source = settings, source
         learning = self.new()
         self.eyes = learning.eyes
         frames = self._frames()
@@ -181,11 +186,11 @@ class _Inputs:
 
     def new(self) -> Reconstructor:
         """Create an untrained reconstructor."""
-        return new_reconstructor(self.settings, self._source, offline=True)
+        return new_reconstructor(self.settings, self.source, offline=True)
 
     def _frames(self) -> list[Frame]:
         """Return the training frames with their depth."""
-        description, settings = self._source.description, self.settings
+        description, settings = self.source.description, self.settings
         if description.digest is None or description.frame_count is None:
             raise InvalidSetting(
                 f"{description.name} can be read only once; reconstruct needs a recording, or use replay"
@@ -193,7 +198,7 @@ class _Inputs:
         # `fit` estimates depth that needs all frames at once.
         choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
         finder = DepthFinder(choice, description.camera, device=settings.device)
-        frames = FirstFrames(self._source, description.frame_count)
+        frames = FirstFrames(self.source, description.frame_count)
         chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
         if not chosen:
             raise NothingShown(
@@ -220,12 +225,19 @@ class _Fitting:
         self._begin_s = clock()
         self._learning: Reconstructor | None = None
         self._is_stopped = False
+        self._posed_inputs: _Inputs | None = None
+        """Inputs with estimated poses, if they were tried."""
 
     def done(self, steps: int | None) -> Fitted:
         """Train with a number of steps; None chooses the number and the inputs first."""
         settings = self._settings
         with seeded(settings.seed, settings.device):
             inputs = _Inputs(self._source, settings)
+            if settings.poses == "estimated":
+                try:
+                    inputs = _posed(inputs)
+                except InvalidInput as error:
+                    raise InvalidSetting(f"poses is 'estimated', but {error}") from error
             if steps is None:
                 inputs, chosen = self._chosen(inputs)
             else:
@@ -238,7 +250,7 @@ class _Fitting:
             self._notes.append(chosen.sentence)
         for doubt, count in sorted(learning.depth_doubts.items()):
             self._notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
-        return Fitted(learning.snapshot(), inputs.eyes, chosen, inputs.settings)
+        return Fitted(learning.snapshot(), inputs.eyes, chosen, inputs.source, inputs.settings)
 
     def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
         """Return the inputs and the number of steps that are best for validation frames."""
@@ -247,10 +259,16 @@ class _Fitting:
         limit_s = 60 * self._minutes
         first = trial_of(self._trial(inputs), validation.FIRST_STEPS, self._clock)
         learned = self._learning
-        for reason, change in _alternatives(inputs):
+        for reason, other_than in (
+            ("the scope moves, and its poses were estimated from the training frames", self._with_poses),
+            ("the scope moves, and its poses were estimated from the training frames", self._with_poses_only),
+            ("depth was not used, because it makes the pictures worse", _without_depth),
+            ("the right eye was not used, because it makes the pictures of the left one worse", _left_eye),
+        ):
             if self._is_stopped or first.seconds > ALTERNATIVE_SHARE * limit_s:
                 break
-            other = _Inputs(self._source, replace(inputs.settings, **change))
+            if (other := other_than(inputs)) is None:
+                continue
             trial = trial_of(self._trial(other), validation.FIRST_STEPS, self._clock)
             if trial.psnr_db >= first.psnr_db + INPUT_GAIN_DB and not self._is_stopped:
                 self._notes.append(
@@ -263,9 +281,30 @@ class _Fitting:
             self._learning = learned
         return inputs, chosen
 
+    def _with_poses(self, inputs: _Inputs) -> _Inputs | None:
+        """Return inputs with estimated poses; None if there are poses, the scope is at rest or they cannot be estimated."""
+        if inputs.have_poses or rigid_share(inputs.given.frames) < MOVING_SHARE:
+            return None
+        try:
+            self._posed_inputs = _posed(inputs)
+        except InvalidInput as error:
+            self._notes.append(f"no poses of the scope were estimated: {error}")
+        return self._posed_inputs
+
+    def _with_poses_only(self, inputs: _Inputs) -> _Inputs | None:
+        """Return inputs with estimated poses and without the depth that they give; None if they were not tried with it."""
+        posed = self._posed_inputs
+        if posed is None or inputs is posed or inputs.have_depth:
+            return None
+        return _without_depth(posed)
+
     def _trial(self, inputs: _Inputs) -> Callable[[int], float]:
         """Return a function that trains without the validation frames and returns their score."""
         part, kept = split(inputs.given)
+        if isinstance(inputs.source, PosedSource):
+            # Held-out frames have interpolated poses too.
+            path = inputs.source.path
+            kept = [frame.with_fields(pose=path.interpolated(frame.time_s)) for frame in kept]
 
         def train(steps: int) -> float:
             if self._is_stopped:
@@ -303,9 +342,33 @@ class _Fitting:
         return learning
 
 
-def _alternatives(inputs: _Inputs) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield other inputs to try, each as a sentence for the report and changed options."""
-    if inputs.have_depth and inputs.settings.depth != "none":
-        yield "depth was not used, because it makes the pictures worse", {"depth": "none"}
-    if inputs.settings.eyes == "both":
-        yield "the right eye was not used, because it makes the pictures of the left one worse", {"eyes": "left"}
+def _posed(inputs: _Inputs) -> _Inputs:
+    """Return inputs with poses estimated from the training frames. Raises InvalidInput as `camera_path_of`."""
+    path = camera_path_of(inputs.given.frames, inputs.source.description.camera)
+    return _Inputs(PosedSource(inputs.source, path), inputs.settings)
+
+
+def _without_depth(inputs: _Inputs) -> _Inputs | None:
+    """Return inputs without depth; None if there is none."""
+    if not inputs.have_depth or inputs.settings.depth == "none":
+        return None
+    return _Inputs(inputs.source, replace(inputs.settings, depth="none"))
+
+
+def _left_eye(inputs: _Inputs) -> _Inputs | None:
+    """Return inputs without the right eye; None if it is not used."""
+    if inputs.settings.eyes != "both":
+        return None
+    return _Inputs(inputs.source, replace(inputs.settings, eyes="left"))
+
+
+def _saves_poses(source: PosedSource, out: Path) -> Callable[[Session], None]:
+    """Return a step that saves the poses of all frames to `out/poses.npy`."""
+
+    def save(session: Session) -> None:
+        frames = FirstFrames(source, source.description.frame_count or 0)
+        with storage_errors(out):
+            write_poses(out / POSES_FILE, np.stack([source.path.at(frame.time_s) for frame in frames]))
+        session.reached.output("poses", out / POSES_FILE)
+
+    return save

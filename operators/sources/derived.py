@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.io.recordings.frame_files import resized_frame
+from gsplat_core.poses.camera_path import CameraPath
 from gsplat_core.scene.frames import Frame
 from operators.sources.address import StereoLayout
 from operators.sources.live import LiveSource
@@ -90,6 +91,23 @@ class ScaledSource(DerivedSource):
         scale = own.width_px / read.width_px
         sides = (max(1, round(side * scale)) for side in (frame.width_px, frame.height_px))
         return resized_frame(frame, *sides)
+
+
+class PosedSource(DerivedSource):
+    """`FrameSource` that gives the frames of another source the poses of a camera path."""
+
+    def __init__(self, source: FrameSource, path: CameraPath) -> None:
+        """Create a source with the frames of `source`.
+
+        Args:
+            source: opened and closed together with this one. Its poses, if any, are replaced.
+            path: poses of the scope by time.
+        """
+        super().__init__(source, replace(source.description, fields=source.description.fields | {"pose"}))
+        self.path = path
+
+    def _derived(self, frame: Frame) -> Frame:
+        return frame.with_fields(pose=self.path.at(frame.time_s))
 
 
 MOST_KEPT = 8

@@ -1,15 +1,18 @@
-"""Inputs of an offline reconstruction are left out where validation frames are clearly better without them."""
+"""Inputs of an offline reconstruction are left out or estimated where validation frames are clearly better by that."""
 
 from __future__ import annotations
 
 import json
 
+import cv2
+import numpy as np
 import pytest
 
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.training import validation
 from operators.applications import reconstruct as module
 from services.reports.build import write_reports
+from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
 
 
 @pytest.mark.parametrize(
@@ -32,3 +35,27 @@ def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypa
     assert any("right eye was not used" in note for note in outcome.notes) == dropped
     run = json.loads((tmp_path / "out" / "report.json").read_text())["run"]
     assert run["eyes"] == ("left" if dropped else "both")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("gain_db", "kept"), [(2 * validation.INPUT_GAIN_DB, True), (0.5 * validation.INPUT_GAIN_DB, False)]
+)
+def test_poses_of_a_moving_scope_are_used_where_they_help(tmp_path, monkeypatch, gain_db, kept):
+    """The scores of the validation frames are the test's; estimated poses gain."""
+    folder = tmp_path / "take"
+    folder.mkdir()
+    for number, frame in enumerate(video(12, SIDEWAYS)[0]):
+        cv2.imwrite(str(folder / f"{number:03}.png"), cv2.resize(frame.image[..., ::-1], (80, 64)))
+    monkeypatch.setattr(validation, "FIRST_STEPS", 1)
+    monkeypatch.setattr(validation, "MOST_STEPS", 1)
+    monkeypatch.setattr(
+        module, "validation_psnr_db", lambda learned, frames: 30.0 + gain_db * (frames[0].pose is not None)
+    )
+    settings = module.ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=())
+    outcome = module.reconstruct(settings, clock=lambda: 0.0)
+    assert any("the scope moves" in note for note in outcome.notes) == kept
+    assert ("poses" in outcome.outputs) == kept
+    if kept:
+        places = np.load(outcome.outputs["poses"])[:, :3, 3]
+        assert places.shape == (12, 3) and np.linalg.norm(places[-1]) > 5 * np.linalg.norm(places[1])
