@@ -226,6 +226,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // fy, cx, cy, width, height. CPU only.
   m.def("surface_motion(Tensor points, Tensor flow, float[] before, float[] after, bool arrived) -> Tensor");
 
+  // Positions [N, T, 3] of points [N, 3] after each of the flows [T, h, w, 2] between images seen by `views` [T + 1, 18].
+  m.def("surface_path(Tensor points, Tensor flows, Tensor views) -> Tensor");
+
   // Affine motion [N, 3, 3] around points from their neighbours (int32 [N, K]) at two times, for the CPU.
   m.def("neighbour_motion(Tensor before, Tensor after, Tensor turned, Tensor neighbours, float stiffness) -> Tensor");
   m.def(

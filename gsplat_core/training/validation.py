@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
+from typing import NamedTuple
 
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import psnr_tissue_db
@@ -36,6 +37,19 @@ Clock = Callable[[], float]
 """Function that returns the time in seconds, for measuring durations."""
 
 
+class Trained(NamedTuple):
+    """Result of one training without the validation frames."""
+
+    psnr_db: float
+    """Mean tissue PSNR of the validation frames, in dB."""
+    setup_s: float = 0.0
+    """Time before the first step, in seconds."""
+
+
+Train = Callable[[int], Trained]
+"""Function that trains from the start with a number of steps."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """Training with some number of steps, and its score on the validation frames."""
@@ -43,8 +57,14 @@ class Trial:
     steps: int
     psnr_db: float
     """Mean tissue PSNR of the validation frames, in dB."""
+    setup_s: float = 0.0
+    """Time before the first step, in seconds."""
     seconds: float = 0.0
-    """Duration of the training and its validation."""
+    """Duration of the training and its validation, without the time before the first step."""
+
+    def duration_s(self, steps: int) -> float:
+        """Return the expected duration in seconds of a training with another number of steps."""
+        return self.setup_s + steps * self.seconds / self.steps
 
 
 @dataclass(frozen=True)
@@ -96,15 +116,15 @@ def validation_psnr_db(learned: Reconstructor, frames: Sequence[Frame]) -> float
     return fmean([each for each in scores if math.isfinite(each)] or [0.0])
 
 
-def trial_of(train: Callable[[int], float], steps: int, clock: Clock) -> Trial:
+def trial_of(train: Train, steps: int, clock: Clock) -> Trial:
     """Train with a number of steps and return the score and the duration."""
     began = clock()
-    psnr_db = train(steps)
-    return Trial(steps, psnr_db, clock() - began)
+    trained = train(steps)
+    return Trial(steps, trained.psnr_db, trained.setup_s, max(0.0, clock() - began - trained.setup_s))
 
 
 def choose_steps(
-    train: Callable[[int], float], limit_s: float, clock: Clock, spent_s: float = 0.0, first: Trial | None = None
+    train: Train, limit_s: float, clock: Clock, spent_s: float = 0.0, first: Trial | None = None
 ) -> ChosenSteps:
     """Find the number of steps with the best validation score, by trials of doubling length.
 
@@ -112,7 +132,7 @@ def choose_steps(
     takes too long for a second training, it is the result.
 
     Args:
-        train: trains from the start with a number of steps and returns the validation PSNR in dB.
+        train: trains without the validation frames.
         limit_s: time for the search and the training on all frames, in seconds.
         clock: source of the time.
         spent_s: part of the limit that is already spent, in seconds.
@@ -122,11 +142,11 @@ def choose_steps(
     best = first or trial_of(train, FIRST_STEPS, clock)
     trials = [best]
     while 2 * best.steps <= MOST_STEPS:
-        steps, step_s = 2 * best.steps, best.seconds / best.steps
+        steps = 2 * best.steps
         left_s = limit_s - (clock() - begin)
         # A trial is followed by a training of the same length on all frames.
-        if 2 * steps * step_s > left_s:
-            longest = int(left_s / step_s)
+        if 2 * best.duration_s(steps) > left_s:
+            longest = int((left_s - best.setup_s) * best.steps / best.seconds) if best.seconds else 0
             if longest < best.steps:
                 return ChosenSteps(best.steps, tuple(trials), "limit", keeps_trial=True)
             return ChosenSteps(min(steps, longest), tuple(trials), "limit")

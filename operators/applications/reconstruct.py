@@ -33,6 +33,8 @@ from gsplat_core.training.validation import (
     USUAL_STEPS,
     ChosenSteps,
     Clock,
+    Train,
+    Trained,
     choose_steps,
     split,
     trial_of,
@@ -183,6 +185,7 @@ class _Inputs:
         self.have_poses = any(frame.pose is not None for frame in frames)
         self.given = learning.prepared(frames)
         self.have_depth |= any(one.depth is not None for one in self.given.seen)
+        self.part, self.validating = split(self.given)
 
     def new(self) -> Reconstructor:
         """Create an untrained reconstructor."""
@@ -227,6 +230,8 @@ class _Fitting:
         self._is_stopped = False
         self._posed_inputs: _Inputs | None = None
         """Inputs with estimated poses, if they were tried."""
+        self._setup_s = 0.0
+        """Time before the first step of the last training, in seconds."""
 
     def done(self, steps: int | None) -> Fitted:
         """Train with a number of steps; None chooses the number and the inputs first."""
@@ -254,7 +259,7 @@ class _Fitting:
 
     def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
         """Return the inputs and the number of steps that are best for validation frames."""
-        if len(split(inputs.given)[1]) < LEAST_FRAMES:
+        if len(inputs.validating) < LEAST_FRAMES:
             return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
         first = trial_of(self._trial(inputs), validation.FIRST_STEPS, self._clock)
@@ -265,7 +270,7 @@ class _Fitting:
             ("depth was not used, because it makes the pictures worse", _without_depth),
             ("the right eye was not used, because it makes the pictures of the left one worse", _left_eye),
         ):
-            if self._is_stopped or first.seconds > ALTERNATIVE_SHARE * limit_s:
+            if self._is_stopped or first.duration_s(first.steps) > ALTERNATIVE_SHARE * limit_s:
                 break
             if (other := other_than(inputs)) is None:
                 continue
@@ -298,18 +303,19 @@ class _Fitting:
             return None
         return _without_depth(posed)
 
-    def _trial(self, inputs: _Inputs) -> Callable[[int], float]:
-        """Return a function that trains without the validation frames and returns their score."""
-        part, kept = split(inputs.given)
+    def _trial(self, inputs: _Inputs) -> Train:
+        """Return a function that trains without the validation frames."""
+        kept = inputs.validating
         if isinstance(inputs.source, PosedSource):
             # Held-out frames have interpolated poses too.
             path = inputs.source.path
             kept = [frame.with_fields(pose=path.interpolated(frame.time_s)) for frame in kept]
 
-        def train(steps: int) -> float:
+        def train(steps: int) -> Trained:
             if self._is_stopped:
-                return -math.inf  # ends the search
-            return validation_psnr_db(self._train(inputs, part, steps, "validate"), kept)
+                return Trained(-math.inf)  # ends the search
+            learning = self._train(inputs, inputs.part, steps, "validate")
+            return Trained(validation_psnr_db(learning, kept), self._setup_s)
 
         return train
 
@@ -323,10 +329,12 @@ class _Fitting:
     def _train(self, inputs: _Inputs, given: ToFit, steps: int, stage: str) -> Reconstructor:
         """Train until the last step or a stop request."""
         learning = self._learning = inputs.new()
-        done = 0
+        begin_s, done = self._clock(), 0
 
         def after_step(step: int, loss: Tensor) -> None:
             nonlocal done
+            if not done:
+                self._setup_s = self._clock() - begin_s
             done = step
             if self._progress is not None:
                 self._progress(Progress(stage, step, steps, unit="steps"))

@@ -97,6 +97,25 @@ void ahead(const View& before, const View& after, const Flow& flow, const float*
   for_points(points, motion, begin, end, [&](const vfloat* at, vfloat* world) { ahead_of(before, after, flow, at, world); });
 }
 
+void path(const Flows& flows, const float* points, float* positions, int64_t begin, int64_t end) {
+  const int64_t cells = 2 * flows.height * flows.width;
+  for (int64_t first = begin; first < end; first += kLanes) {
+    const int count = int(end - first < kLanes ? end - first : kLanes);
+    vfloat at[3], moved[3];
+    load_rows<3>(points, first, count, at);
+    View before = view_of(flows.views);
+    for (int64_t step = 0; step < flows.steps; ++step) {
+      const View after = view_of(flows.views + (step + 1) * kViewNumbers);
+      ahead_of(before, after, {flows.cells + step * cells, flows.height, flows.width, after.height, after.width}, at, moved);
+      for (int c = 0; c < 3; ++c) at[c] += moved[c];
+      for (int i = 0; i < count; ++i) {
+        for (int c = 0; c < 3; ++c) positions[((first + i) * flows.steps + step) * 3 + c] = at[c][i];
+      }
+      before = after;
+    }
+  }
+}
+
 void arrived(const View& before, const View& after, const Flow& flow, const float* points, float* motion, int64_t begin,
              int64_t end) {
   for_points(points, motion, begin, end, [&](const vfloat* at, vfloat* world) { arrived_at(before, after, flow, at, world); });
@@ -104,6 +123,6 @@ void arrived(const View& before, const View& after, const Flow& flow, const floa
 
 }  // namespace
 
-extern const Kernels kernels = {ahead, arrived};
+extern const Kernels kernels = {ahead, arrived, path};
 
 }  // namespace GSPLAT_ISA::surface_motion

@@ -8,15 +8,9 @@ namespace {
 
 constexpr int64_t kGrain = 2048;  // minimum points per task
 
-View view_of(const std::vector<double>& numbers, const char* name) {
+View checked_view(const std::vector<double>& numbers, const char* name) {
   check(int64_t(numbers.size()) == kViewNumbers, name, " must have ", kViewNumbers, " numbers, got ", numbers.size());
-  View v;
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) v.rotation[3 * row + column] = float(numbers[4 * row + column]);
-    v.translation[row] = float(numbers[4 * row + 3]);
-  }
-  v.fx = float(numbers[12]), v.fy = float(numbers[13]), v.cx = float(numbers[14]), v.cy = float(numbers[15]);
-  v.width = float(numbers[16]), v.height = float(numbers[17]);
+  const View v = view_of(numbers.data());
   check(v.fx > 0 && v.fy > 0 && v.width > 0 && v.height > 0, name, " must have positive focal lengths and sizes");
   return v;
 }
@@ -26,7 +20,7 @@ Tensor surface_motion(Tensor points, Tensor flow, std::vector<double> before, st
   const Tensor at = call.floats(points, "points"), cells = call.floats(flow, "flow");
   check(at.dim() == 2 && at.size(1) == 3, "points must be [N, 3]");
   check(cells.dim() == 3 && cells.size(2) == 2 && cells.numel() > 0, "flow must be [h, w, 2] with at least one cell");
-  const View first = view_of(before, "before"), second = view_of(after, "after");
+  const View first = checked_view(before, "before"), second = checked_view(after, "after");
   const Flow f = {data(cells), cells.size(0), cells.size(1), second.height, second.width};
   Tensor motion = call.empty({at.size(0), 3});
   const auto kernel = arrived ? kernels().arrived : kernels().ahead;

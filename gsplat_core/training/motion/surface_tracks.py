@@ -9,6 +9,7 @@ large motion by changing colours, which are wrong between the frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -21,6 +22,8 @@ from torch import Tensor
 
 from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
+from gsplat_core.ops.surface_motion.surface_motion import surface_path
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.motion.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
 from gsplat_core.training.observations import Observation
@@ -29,8 +32,10 @@ from gsplat_core.transfers import tensor_of
 
 EDGE_PX = 1
 """Margin in pixels around tools and holes where depth is not read, since tracked positions are inaccurate."""
-ROWS_AT_ONCE = 1 << 14
-"""Number of trajectories computed at once, to limit memory."""
+POSITIONS_AT_ONCE = 1 << 22
+"""Number of positions of trajectories that are computed at once, to limit memory."""
+FEWEST_ROWS = 64
+"""Smallest number of trajectories computed at once, for very long recordings."""
 
 
 class SurfaceTracks:
@@ -63,8 +68,9 @@ class SurfaceTracks:
             return
         times = [one.time_s for one in self._seen]
         with torch.no_grad():
-            for start in range(first_row, step.gaussians.count, ROWS_AT_ONCE):
-                rows = slice(start, min(start + ROWS_AT_ONCE, step.gaussians.count))
+            at_once = max(FEWEST_ROWS, POSITIONS_AT_ONCE // len(times))
+            for start in range(first_row, step.gaussians.count, at_once):
+                rows = slice(start, min(start + at_once, step.gaussians.count))
                 points = step.gaussians.means[rows]
                 follow(rows, times, self.trajectories(points, number) - points[:, None])
 
@@ -88,12 +94,10 @@ class SurfaceTracks:
         """Return trajectories with motion across the picture only. Depth differences of static tissue are errors. They
         would move points in front of other points.
         """
-        after, before = [points], [points]
-        for motion in self._ahead[number:]:
-            after.append(after[-1] + motion.ahead(after[-1]))
-        for motion in self._back[:number][::-1]:
-            before.append(before[-1] + motion.ahead(before[-1]))
-        return torch.stack(before[:0:-1] + after, dim=1)
+        cameras = [one.camera for one in self._seen]
+        after = _path(points, self._flows_ahead[number:], cameras[number:])
+        before = _path(points, self._flows_back[:number].flip(0), cameras[number::-1])
+        return torch.cat([before.flip(1), points[:, None], after], dim=1)
 
     @cached_property
     def _show_motion(self) -> bool:
@@ -116,29 +120,27 @@ class SurfaceTracks:
         ]
 
     @cached_property
-    def _ahead(self) -> list[SurfaceMotion]:
-        """Surface motion from each frame to the next one."""
-        return self._motions(_flows(self._frames), self._seen)
+    def _flows_ahead(self) -> Tensor:
+        """Flow from each frame to the next one, [T - 1, h, w, 2]."""
+        return self._stacked(_flows(list(pairwise(self._frames))))
 
     @cached_property
-    def _back(self) -> list[SurfaceMotion]:
-        """Surface motion from each frame except the first to the previous frame."""
-        return self._motions(_flows(self._frames[::-1]), self._seen[::-1])[::-1]
+    def _flows_back(self) -> Tensor:
+        """Flow from each frame except the first to the previous frame, [T - 1, h, w, 2]."""
+        return self._stacked(_flows([(after, before) for before, after in pairwise(self._frames)]))
 
-    def _motions(self, flows: Sequence[Flow], seen: Sequence[Observation]) -> list[SurfaceMotion]:
-        return [
-            SurfaceMotion(tensor_of(flow, self._device), one.camera, following.camera)
-            for flow, (one, following) in zip(flows, pairwise(seen), strict=True)
-        ]
+    def _stacked(self, flows: Sequence[Flow]) -> Tensor:
+        return tensor_of(np.stack(flows), self._device)
 
     def _pixels(self, points: Tensor, number: int) -> list[Tensor]:
         """Return the points' positions in each frame: T times [N, 2]."""
         here = Seen(self._seen[number].camera, points).pixels
         after, before = [here], [here]
-        for motion in self._ahead[number:]:
-            after.append(after[-1] + motion.at(after[-1]))
-        for motion in self._back[:number][::-1]:
-            before.append(before[-1] + motion.at(before[-1]))
+        cameras = [one.camera for one in self._seen]
+        for flow, camera in zip(self._flows_ahead[number:], cameras[number:], strict=False):
+            after.append(after[-1] + SurfaceMotion(flow, camera, camera).at(after[-1]))
+        for flow, camera in zip(self._flows_back[:number].flip(0), cameras[number:0:-1], strict=True):
+            before.append(before[-1] + SurfaceMotion(flow, camera, camera).at(before[-1]))
         return before[:0:-1] + after
 
 
@@ -213,11 +215,28 @@ def steady_course(values: Tensor, times: Tensor) -> Tensor:
     return middle + (1 - noise / found.clamp(min=torch.finfo(found.dtype).tiny)).clamp(0, 1) * (values - middle)
 
 
-def _flows(frames: Sequence[Frame]) -> list[Flow]:
-    """Return the flow from each frame to the next."""
+def _path(points: Tensor, flows: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """Return the positions [N, T, 3] of points [N, 3] after each of the flows [T, h, w, 2] between the cameras' frames."""
+    if points.dtype == torch.float32:
+        return surface_path(points, flows, cameras)
+    positions = [points]
+    for flow, (before, after) in zip(flows, pairwise(cameras), strict=True):
+        positions.append(positions[-1] + SurfaceMotion(flow.to(points), before, after).ahead(positions[-1]))
+    return torch.stack(positions[1:], dim=1) if len(positions) > 1 else points.new_empty(len(points), 0, 3)
+
+
+def _flows(pairs: Sequence[tuple[Frame, Frame]]) -> list[Flow]:
+    """Return the flow from the first to the second frame of each pair."""
+    with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="flow") as pool:
+        return list(pool.map(_flow, pairs))
+
+
+def _flow(pair: tuple[Frame, Frame]) -> Flow:
     motion = ImageMotion()
-    flows = [motion.follow(frame.image, frame.tissue) for frame in frames]
-    return [flow for flow in flows[1:] if flow is not None]
+    for frame in pair:
+        flow = motion.follow(frame.image, frame.tissue)
+    assert flow is not None  # pictures of one size, large enough
+    return flow
 
 
 def _world(pixels: Tensor, depth: Tensor, one: Observation) -> Tensor:

@@ -1,4 +1,4 @@
-"""The compiled motion of surface points against the same in plain torch (`SurfaceMotion` in float64)."""
+"""The compiled motion and path of surface points against the same in plain torch (`SurfaceMotion` in float64)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.surface_motion.surface_motion import surface_motion
+from gsplat_core.ops.surface_motion.surface_motion import surface_motion, surface_path
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.motion.image_motion import SurfaceMotion
 
@@ -104,3 +104,51 @@ def test_what_it_cannot_take_is_refused() -> None:
     for wrong_points, wrong_flow in ((points[:, :2], flow), (points, flow[..., :1]), (points, flow[:0])):
         with pytest.raises(RuntimeError, match="must be"):
             surface_motion(wrong_points, wrong_flow, BEFORE, BEFORE, arrived=False)
+
+
+def path_scene(steps: int, count: int, cells: tuple[int, int] = (12, 16)) -> tuple[Tensor, Tensor, list[Camera]]:
+    points, _ = scene(count, dtype=torch.float32)
+    flows = torch.randn(steps, *cells, 2, generator=torch.Generator().manual_seed(steps))
+    cameras = [Camera(BEFORE.K, 64, 48, pose(0.02 * k, (0.3 * k, -0.2 * k, 0.1 * k))) for k in range(steps + 1)]
+    return points, flows, cameras
+
+
+def exact_path(points: Tensor, flows: Tensor, cameras: list[Camera]) -> Tensor:
+    positions = [points.double()]
+    for k, flow in enumerate(flows):
+        positions.append(positions[-1] + SurfaceMotion(flow.double(), cameras[k], cameras[k + 1]).ahead(positions[-1]))
+    return torch.stack(positions[1:], dim=1) if len(flows) else points.double().new_empty(len(points), 0, 3)
+
+
+@pytest.mark.parametrize(("steps", "count"), [(0, 5), (1, 0), (1, 1), (3, 17), (20, 3000)])
+@pytest.mark.parametrize("cells", [(1, 1), (12, 16)])
+def test_a_path_is_the_motion_through_each_picture(steps: int, count: int, cells: tuple[int, int]) -> None:
+    points, flows, cameras = path_scene(steps, count, cells)
+    found, wanted = surface_path(points, flows, cameras), exact_path(points, flows, cameras)
+    assert found.shape == (count, steps, 3)
+    # A point within rounding of the picture's edge may be on either side of it.
+    close = torch.isclose(found.double(), wanted, rtol=1e-4, atol=1e-3).all(dim=2).all(dim=1)
+    assert int((~close).sum()) <= count // 100
+    assert steps < 20 or (found - points[:, None]).abs().amax(dim=(1, 2)).median() > 0.1
+
+
+def test_points_that_no_picture_shows_stay_on_their_path() -> None:
+    _, flows, cameras = path_scene(3, 1)
+    points = torch.tensor([[0, 0, -50], [math.nan, 0, 50], [900, 0, 50]], dtype=torch.float32)
+    found = surface_path(points, flows, cameras)
+    torch.testing.assert_close(found, points[:, None].expand(-1, 3, -1), equal_nan=True)
+
+
+def test_the_path_passes_opcheck_and_refuses_other_input() -> None:
+    points, flows, cameras = path_scene(2, 20)
+    views = torch.rand(3, 18) + 1
+    torch.library.opcheck(torch.ops.gsplat_core.surface_path.default, (points, flows, views))
+    for wrong in (flows[..., :1], flows[:, :0], flows[0], flows[:1]):
+        with pytest.raises(InvalidInput, match="flows"):
+            surface_path(points, wrong, cameras)
+    with pytest.raises(InvalidInput, match="pinhole"):
+        surface_path(points, flows, [*cameras[:2], Camera(BEFORE.K, 64, 48, model="ortho")])
+    with pytest.raises(InvalidInput, match="float32"):
+        surface_path(points.double(), flows, cameras)
+    with pytest.raises(RuntimeError, match="must be"):
+        surface_path(points[:, :2], flows, cameras)

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from gsplat_core.training.validation import choose_steps, validating
+from gsplat_core.training.validation import Trained, choose_steps, validating
 
 
 class Training:
-    """Trainings whose scores are given, at a fixed time per step."""
+    """Trainings whose scores are given, at a fixed time per step after a fixed time before the first step."""
 
-    def __init__(self, scores, step_s=0.0):
-        self.scores, self.step_s, self.now_s, self.steps = scores, step_s, 0.0, []
+    def __init__(self, scores, step_s=0.0, setup_s=0.0):
+        self.scores, self.step_s, self.setup_s, self.now_s, self.steps = scores, step_s, setup_s, 0.0, []
 
     def __call__(self, steps):
         self.steps.append(steps)
-        self.now_s += steps * self.step_s
-        return self.scores[len(self.steps) - 1]
+        self.now_s += self.setup_s + steps * self.step_s
+        return Trained(self.scores[len(self.steps) - 1], self.setup_s)
 
     def clock(self):
         return self.now_s
@@ -35,12 +35,13 @@ def test_a_worse_trial_is_not_chosen():
     assert choose_steps(training, 60, training.clock).steps == 1000
 
 
+@pytest.mark.parametrize("setup_s", [0.0, 3.0])
 @pytest.mark.parametrize("limit_s", [20.0, 60.0, 300.0])
-def test_search_and_training_stay_within_the_time_limit(limit_s):
-    training = Training([30.0 + k for k in range(20)], step_s=0.01)
+def test_search_and_training_stay_within_the_time_limit(limit_s, setup_s):
+    training = Training([30.0 + k for k in range(20)], 0.01, setup_s)
     chosen = choose_steps(training, limit_s, training.clock)
     assert chosen.reason == "limit" and "--minutes" in chosen.sentence
-    assert training.now_s + chosen.steps * training.step_s <= limit_s
+    assert training.now_s + setup_s + chosen.steps * training.step_s <= limit_s
     assert chosen.steps >= training.steps[-1]
 
 
@@ -49,6 +50,11 @@ def test_without_time_for_a_second_training_the_trial_is_the_result():
     chosen = choose_steps(training, 60, training.clock)
     assert training.steps == [500]
     assert (chosen.steps, chosen.reason, chosen.keeps_trial) == (500, "limit", True)
+
+
+def test_time_before_the_first_step_does_not_count_as_steps():
+    training = Training([30.0 + k for k in range(20)], step_s=0.002, setup_s=6.0)
+    assert choose_steps(training, 60, training.clock).steps >= 4000
 
 
 def test_time_that_was_spent_before_counts():
