@@ -8,7 +8,9 @@ With --annotations, RECORDING is the folder of all recordings, and the frames in
 and threads that stay in the body are no tools. `unsure` regions are left out. `missed` are tools of more than 2 % of the picture of which less than 30 % is found;
 `false_share` is the share of tissue called tool. The frames before an annotated one are given to the detector first.
 
-Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|classical|onnx:PATH] [--copies | --annotations]
+Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|classical|onnx:PATH|trained:FOLDER]
+    [--copies | --annotations]
+FOLDER is the output of `tool_network/train.py`.
 A picture file is a recording of one frame.
 """
 
@@ -48,6 +50,10 @@ def main() -> int:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     finder: MaskFinder = ToolFinder() if arguments.method == "classical" else NetworkToolFinder()
+    if arguments.method.startswith("trained:"):
+        trained = Path(arguments.method.removeprefix("trained:"))
+        height, width = json.loads((trained / "training.json").read_text())["input_px"]
+        finder = NetworkToolFinder(trained / "tool_network.onnx", (width, height))
     if arguments.method.startswith("onnx:"):
         finder = OnnxToolFinder(Path(arguments.method.removeprefix("onnx:")))
     if arguments.annotations:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-CHANNELS = (16, 32, 48, 80)
+CHANNELS = (16, 24, 48, 96)
 STRIDE = 16
 """Height and width of the network's input must be multiples of this."""
 
@@ -118,7 +118,7 @@ def twice(features: Tensor) -> Tensor:
     return nn.functional.interpolate(features, scale_factor=2.0, mode="nearest")
 
 
-def fused(network: ToolNetwork) -> ToolNetwork:
+def fused(network: nn.Module) -> nn.Module:
     """Return a copy for inference whose normalisations are part of the convolutions."""
     copied = copy.deepcopy(network).cpu().to(memory_format=torch.contiguous_format).eval()
     for part in copied.modules():

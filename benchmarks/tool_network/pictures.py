@@ -7,17 +7,18 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from benchmarks.tool_network.flexible import hollow_organ, narrow_band
 from benchmarks.tool_network.instruments import clips, with_instruments
-from benchmarks.tool_network.tissue import Picture, Plane, TissuePool, falloff, lumen, noise, smooth
+from benchmarks.tool_network.tissue import Picture, Plane, TissuePool, falloff, noise, smooth
 
 SIZE_PX = (128, 160)
 """Height and width of a training picture."""
 DRAWN_PX = (192, 240)
-WITHOUT_TOOLS = 0.15
-"""Share of pictures without instruments."""
-HOLLOW = 0.13
-"""Share of pictures from inside a hollow organ, in addition to those among the tissues."""
-ACCESSORIES = (0.09, 0.85)
+WITHOUT_TOOLS = (0.15, 0.22)
+"""Share of pictures without instruments, elsewhere and inside of hollow organs."""
+HOLLOW = 0.25
+"""Share of pictures by flexible endoscopes from inside a hollow organ."""
+ACCESSORIES = (0.08, 0.9)
 """Share of accessories of flexible endoscopes among the instruments, elsewhere and inside of hollow organs."""
 
 
@@ -25,22 +26,27 @@ def training_picture(rng: Generator, pool: TissuePool) -> tuple[NDArray[np.uint8
     """Return a picture uint8 RGB [128, 160, 3] and the coverage by tools, uint8 [128, 160], 255 = tool."""
     height, width = DRAWN_PX
     hollow = rng.random() < HOLLOW
-    image = lumen(rng, height, width) if hollow else pool.draw(rng, height, width)
+    image = hollow_organ(rng, height, width) if hollow else pool.draw(rng, height, width)
     light = falloff(rng, height, width)
+    if hollow:
+        light = light ** np.float32(0.5)
     mask = np.zeros((height, width), np.float32)
     inner_light = rng.random() < 0.5
     if not inner_light:
         image = image * light[..., None]
     if rng.random() < 0.06:
         image = clips(rng, np.asarray(image, np.float32))
-    if rng.random() >= WITHOUT_TOOLS:
-        count = int(rng.choice([1, 2, 3, 4], p=[0.4, 0.33, 0.17, 0.1]))
+    if rng.random() >= WITHOUT_TOOLS[hollow]:
+        shares = [0.75, 0.2, 0.05, 0] if hollow else [0.4, 0.33, 0.17, 0.1]
+        count = int(rng.choice([1, 2, 3, 4], p=shares))
         image, mask = with_instruments(rng, np.asarray(image, np.float32), count, ACCESSORIES[hollow])
     if inner_light:
         image = image * light[..., None]
     if rng.random() < 0.18:
         image = smoke(rng, image)
-    return photographed(rng, image, mask)
+    if hollow and rng.random() < 0.08:
+        image = narrow_band(rng, np.asarray(image, np.float32))
+    return photographed(rng, image, mask, rng.uniform(0.75, 1.3) if hollow else 0.8, 0.6 if hollow else 0.28)
 
 
 def smoke(rng: Generator, image: Picture) -> Picture:
@@ -68,12 +74,19 @@ def surround(rng: Generator, height: int, width: int) -> Plane:
     return 1 - smooth(np.asarray(away, np.float32), 1 - soft, 1.0)
 
 
-def photographed(rng: Generator, image: Picture, mask: Plane) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the picture as a scope's camera and a video codec give it."""
+def photographed(
+    rng: Generator, image: Picture, mask: Plane, exposure: float, framed: float
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the picture as a scope's camera and a video codec give it.
+
+    Args:
+        exposure: value that 90 % of the pixels do not exceed, before random changes of brightness.
+        framed: chance of a border around the field of view.
+    """
     height, width = mask.shape
     image = np.maximum(image, 0)
     level = float(np.quantile(image[::4, ::4].max(-1), 0.9)) + 1e-3
-    image = image * np.float32(np.exp(rng.normal(0, 0.25)) * min(3.0, 0.8 / level))
+    image = image * np.float32(np.exp(rng.normal(0, 0.25)) * min(3.0, exposure / level))
     if rng.random() < 0.5:
         image = image ** np.float32(np.exp(rng.normal(0, 0.25)))
     image = image * np.exp(rng.normal(0, 0.07, 3)).astype(np.float32)
@@ -88,7 +101,7 @@ def photographed(rng: Generator, image: Picture, mask: Plane) -> tuple[NDArray[n
         cv2.line(kernel, (0, int(rng.integers(length))), (length - 1, int(rng.integers(length))), 1.0, 1)
         kernel /= kernel.sum()
         image, mask = cv2.filter2D(image, -1, kernel), cv2.filter2D(mask, -1, kernel)
-    if rng.random() < 0.28:
+    if rng.random() < framed:
         view = surround(rng, height, width)
         image = image * view[..., None]
         mask = mask * (view > 0.05)

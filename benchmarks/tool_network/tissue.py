@@ -6,7 +6,9 @@ light, vessels, fat, folds, a lumen, blood, highlights and loops of bowel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -266,29 +268,45 @@ def blood(rng: Generator, image: Picture) -> Picture:
 class Photographs:
     """Crops of recordings whose terms allow training."""
 
-    def __init__(self, recordings: Path) -> None:
+    def __init__(self, recordings: Path, only: Sequence[str] = (), without: Sequence[str] = ()) -> None:
+        """Read pictures.
+
+        Args:
+            recordings: folder of all recordings.
+            only: beginnings of paths in it that are read; all if empty.
+            without: beginnings of paths that are not read.
+        """
+
+        def wanted(name: str) -> bool:
+            return (not only or name.startswith(tuple(only))) and not name.startswith(tuple(without))
+
         self.pictures: list[NDArray[np.uint8]] = []
         paths = [*(recordings / "others/organ_still").glob("images*/*"), *(recordings / "hamlyn_pair").glob("*.png")]
         for path in sorted(paths):
-            read = cv2.imread(str(path))
-            if read is not None:
-                self.pictures.append(_reduced(np.asarray(read[..., ::-1], np.uint8)))
-        capture = cv2.VideoCapture(str(recordings / "colon/video.mp4"))
-        while True:
-            there, read = capture.read()
-            if not there:
-                break
-            self.pictures.append(_reduced(np.asarray(read[..., ::-1], np.uint8)))
+            if wanted(str(path.relative_to(recordings))):
+                self._add(cv2.imread(str(path)))
+        if wanted("colon"):
+            capture = cv2.VideoCapture(str(recordings / "colon/video.mp4"))
+            while self._add(capture.read()[1]):
+                pass
         self.pictures = self.pictures[:: 1 + len(self.pictures) // 30]
         for name in ("0001", "0007"):
             read = cv2.imread(str(recordings / f"out_of_body/{name}.png"))
-            if read is not None:
+            if read is not None and wanted(f"out_of_body/{name}"):
                 # The instruments are painted green in these samples; they are filled with tissue.
                 picture = _reduced(np.asarray(read[30:960, 340:1560, ::-1], np.uint8))
                 wide = picture.astype(np.int16)
                 green = (wide[..., 1] > wide[..., 0] + 8).astype(np.uint8)
                 green = np.asarray(cv2.dilate(green, np.ones((9, 9), np.uint8)), np.uint8)
                 self.pictures.append(np.asarray(cv2.inpaint(picture, green, 5, cv2.INPAINT_TELEA), np.uint8))
+        if not self.pictures:
+            raise FileNotFoundError(f"no picture for training in {recordings}; give the folder of all recordings")
+
+    def _add(self, read: NDArray[Any] | None) -> bool:
+        """Keep a picture in OpenCV's order of colours. Returns false if it is None."""
+        if read is not None:
+            self.pictures.append(_reduced(np.asarray(read[..., ::-1], np.uint8)))
+        return read is not None
 
     def draw(self, rng: Generator, height: int, width: int) -> Picture:
         """Return a warped, recoloured crop."""
@@ -316,10 +334,16 @@ def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def tissue(rng: Generator, height: int, width: int, photographs: Photographs | None = None) -> Picture:
-    """Return a random picture of tissue, float32 RGB [h, w, 3], about 0..1, not clipped."""
+def tissue(
+    rng: Generator, height: int, width: int, photographs: Photographs | None = None, photographed: float = 0.18
+) -> Picture:
+    """Return a random picture of tissue, float32 RGB [h, w, 3], about 0..1, not clipped.
+
+    Args:
+        photographs: pictures of which a share of `photographed` is made.
+    """
     kind = rng.random()
-    if photographs is not None and kind < 0.18:
+    if photographs is not None and kind < photographed:
         image = photographs.draw(rng, height, width)
     elif kind < 0.36:
         image = lumen(rng, height, width)
@@ -341,15 +365,17 @@ def tissue(rng: Generator, height: int, width: int, photographs: Photographs | N
 class TissuePool:
     """Pictures of tissue that are used several times, mirrored and recoloured, because drawing them takes most of the time."""
 
-    def __init__(self, photographs: Photographs | None = None, size: int = 500, new: float = 0.3) -> None:
-        self.photographs = photographs
+    def __init__(
+        self, photographs: Photographs | None = None, size: int = 500, new: float = 0.3, photographed: float = 0.18
+    ) -> None:
+        self.photographs, self.photographed = photographs, photographed
         self.size, self.new = size, new
         self._pictures: list[NDArray[np.float16]] = []
 
     def draw(self, rng: Generator, height: int, width: int) -> Picture:
         """Return a random picture, float32 RGB [h, w, 3]."""
         if len(self._pictures) < 100 or rng.random() < self.new:
-            image = tissue(rng, height, width, self.photographs)
+            image = tissue(rng, height, width, self.photographs, self.photographed)
             if len(self._pictures) < self.size:
                 self._pictures.append(image.astype(np.float16))
             else:

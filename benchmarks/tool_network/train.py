@@ -1,207 +1,384 @@
 """Train the tool network on drawn pictures and export it for `gsplat_core/endoscope/tool_network.onnx`.
 
-One process draws pictures into a ring in a file; this process trains on random ones of them until the time is over. Backgrounds are drawn
-or come from recordings whose terms allow it: `colon` (CC BY 4.0), `organ_still` and `hamlyn_pair` (BSD-3), `out_of_body` (Apache-2.0).
+Worker processes draw pictures without pause. The main process keeps them on the device and trains on random ones, altered, until the time
+is over. Backgrounds are drawn or come from recordings whose terms allow it: `colon` (CC BY 4.0), `organ_still` and `hamlyn_pair`
+(BSD-3), `out_of_body` (Apache-2.0).
 
-The weights are averaged over the checkpoints of the whole run. Longer training on the same pictures lowers the loss on drawn pictures and
-finds less in real ones; the mean of checkpoints does not. Continue a run with --start if two cores are too few for one run.
+The weights are the mean over checkpoints, since long training on the same pictures finds less in real ones. How many of the last checkpoints are
+averaged is decided by validation pictures. They are drawn from other seeds, half of them over photographs that training does not see
+(`hamlyn_pair`, `out_of_body/0001`). No annotated recording is read.
 
-Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--minutes 30] [--start CHECKPOINT] [--seed 0]
-The folder receives `checkpoint.pt` every two minutes and `tool_network.onnx` at the end.
+Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0]
+    python -m benchmarks.tool_network.train FOLDER --export
+FOLDER receives `tool_network.onnx`, `checkpoint.pt` (from half the time on) and `training.json` (options, speed, validation).
+The second form writes `tool_network.onnx` from `checkpoint.pt`. Only torch, numpy and OpenCV are needed.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import json
 import math
 import multiprocessing as mp
+import queue
 import sys
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits
 
 from benchmarks.tool_network.network import ToolNetwork, features, fused
 from benchmarks.tool_network.pictures import SIZE_PX, training_picture
 from benchmarks.tool_network.tissue import Photographs, TissuePool
 
-RING = 8000
-"""Pictures that are kept; older ones are replaced."""
-BATCH = 16
-LEARNING_RATE = 2.5e-3
-INPUT_PX = (80, 96)
-"""Height and width of the network's input."""
-CHECKPOINT_S = 120
-"""Time between checkpoints."""
+INPUT_PX = (96, 112)
+"""Height and width of the network's input, multiples of 16."""
+LEARNING_RATE = 3e-3
+WEIGHT_DECAY = 0.01
+CHECKPOINTS = 24
+"""Checkpoints of a run, at equal times."""
+LAST_CHECKPOINTS = (1, 2, 4, 8, 12, 16)
+"""Numbers of last checkpoints of which a mean is validated."""
 AVERAGED = 0.998
 """Share of the weights' running mean that a step keeps."""
+PASTED = 0.4
+"""Share of pictures that get the tools of another one."""
+SENT_AT_ONCE = 8
+"""Pictures that a worker sends in one message."""
+FIRST_PICTURES = 100
+"""Training pictures of each worker before training begins."""
+VALIDATION_SHARE = 0.1
+"""Share of the time above which checkpoints are not validated."""
+VALIDATION_SEED = 1_000_000
+HELD_OUT = ("hamlyn_pair", "out_of_body/0001")
+"""Photographs that only validation pictures are drawn over."""
+
+Pictures = NDArray[np.uint8]
+"""RGB and coverage by tools, uint8 [N, h, w, 4]."""
 
 
-def ring_in(folder: Path, mode: str) -> np.memmap:
-    return np.memmap(folder / "ring.bin", np.uint8, mode, shape=(RING, *SIZE_PX, 4))
+def four_channels(rng: np.random.Generator, pool: TissuePool) -> Pictures:
+    image, mask = training_picture(rng, pool)
+    return np.concatenate([image, mask[..., None]], axis=2)
 
 
-def draw(folder: Path, recordings: Path | None, seed: int, count: mp.sharedctypes.Synchronized[int]) -> None:
-    """Draw pictures until the process is ended."""
+def draw(
+    worker: int, workers: int, seed: int, recordings: Path | None, validation: int, to: mp.Queue[tuple[bool, Pictures]]
+) -> None:
+    """Draw this worker's share of the validation pictures, then training pictures until the process is ended."""
     cv2.setNumThreads(1)
-    rng = np.random.default_rng(seed)
-    photographs = Photographs(recordings) if recordings is not None else None
-    pool = TissuePool(photographs)
-    ring = ring_in(folder, "r+")
+    held_out = Photographs(recordings, only=HELD_OUT) if recordings is not None else None
+    for index in range(worker, validation, workers):
+        # Each has its own seed, so that the set does not depend on the number of workers.
+        chosen = held_out if index % 2 else None
+        pool = TissuePool(chosen, new=1.0, photographed=1.0 if chosen else 0.0)
+        to.put((True, four_channels(np.random.default_rng(VALIDATION_SEED + index), pool)[None]))
+    rng = np.random.default_rng([seed, worker])
+    pool = TissuePool(Photographs(recordings, without=HELD_OUT) if recordings is not None else None)
     while True:
-        image, mask = training_picture(rng, pool)
-        at = count.value % RING
-        ring[at, ..., :3], ring[at, ..., 3] = image, mask
-        count.value += 1
+        to.put((False, np.stack([four_channels(rng, pool) for _ in range(SENT_AT_ONCE)])))
 
 
-def batch_of(rng: np.random.Generator, ring: np.memmap, there: int, pasted: float = 0.5) -> tuple[Tensor, Tensor]:
-    """Return pictures [N, 3, h, w] in 0..1, of `INPUT_PX`, and their coverage by tools [N, 1, h / 2, w / 2].
+class Store:
+    """Drawn pictures on the device; new ones replace the oldest."""
 
-    Random entries of the ring are mirrored, turned, scaled and recoloured, and a share of `pasted` gets the tools of another one.
+    def __init__(self, size: int, device: torch.device) -> None:
+        self.pictures = torch.zeros((size, *SIZE_PX, 4), dtype=torch.uint8, device=device)
+        self.count = 0
+
+    def add(self, pictures: Pictures) -> None:
+        at = (self.count + torch.arange(len(pictures), device=self.pictures.device)) % len(self.pictures)
+        self.pictures[at] = torch.from_numpy(pictures).to(self.pictures.device)
+        self.count += len(pictures)
+
+    def batch(self, size: int, chance: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return altered pictures [N, 3, h, w] in 0..1, of `INPUT_PX`, and their coverage by tools [N, 1, h / 2, w / 2]."""
+        there = min(self.count, len(self.pictures))
+        at = torch.randint(0, there, (size,), generator=chance, device=self.pictures.device)
+        return altered(reduced(self.pictures[at]), chance)
+
+
+def reduced(pictures: Tensor) -> Tensor:
+    """Return pictures uint8 [N, H, W, 4] as float32 [N, 4, h, w] in 0..1, of `INPUT_PX`."""
+    planes = pictures.permute(0, 3, 1, 2).float() / 255
+    return nn.functional.interpolate(planes, INPUT_PX, mode="bilinear", antialias=True)
+
+
+def altered(both: Tensor, chance: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return mirrored, turned, scaled, recoloured and blurred pictures, a share of them with the tools of another one.
+
     Drawing takes longer than training, so the pictures would be learned by heart otherwise.
     """
-    chosen = ring[rng.integers(0, min(there, RING), BATCH)]
-    chosen = np.stack([each[:: rng.choice([-1, 1], p=[0.2, 0.8]), :: rng.choice([-1, 1])] for each in chosen])
-    both = reduced(torch.from_numpy(chosen).permute(0, 3, 1, 2).float() / 255)
-    normal = lambda spread, *shape: torch.from_numpy(np.exp(rng.normal(0, spread, (BATCH, *shape, 1, 1)))).float()
-    pictures, cover = recoloured(both[:, :3], normal), both[:, 3:]
-    others = rng.permutation(BATCH)
-    layer = cover[others] * torch.from_numpy(rng.random((BATCH, 1, 1, 1)) < pasted)
+    count, device = len(both), both.device
+    uniform = lambda *shape: torch.rand((count, *shape, 1, 1), generator=chance, device=device)
+    normal = lambda *shape: torch.randn((count, *shape), generator=chance, device=device)
+    pictures, cover = recoloured(both[:, :3], chance), both[:, 3:]
+    others = torch.randperm(count, generator=chance, device=device)
+    layer = cover[others] * (uniform(1) < PASTED)
     pictures = pictures + layer * (pictures[others] - pictures)
     cover = torch.maximum(cover, layer)
-    angle, scale = rng.normal(0, 0.25, BATCH), np.exp(rng.normal(0, 0.2, BATCH))
+    angle, scale = 0.25 * normal(), torch.exp(0.2 * normal())
     aspect = INPUT_PX[1] / INPUT_PX[0]
-    turns = np.zeros((BATCH, 2, 3), np.float32)
-    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angle) * scale
-    turns[:, 0, 1], turns[:, 1, 0] = -np.sin(angle) * scale / aspect, np.sin(angle) * scale * aspect
-    turns[:, :, 2] = rng.normal(0, 0.12, (BATCH, 2))
-    grid = nn.functional.affine_grid(torch.from_numpy(turns), [BATCH, 4, *INPUT_PX], align_corners=False)
+    left = torch.where(uniform() < 0.5, -1.0, 1.0).flatten()
+    down = torch.where(uniform() < 0.2, -1.0, 1.0).flatten()
+    turns = torch.stack(
+        [
+            left * torch.cos(angle) * scale,
+            -torch.sin(angle) * scale / aspect,
+            0.12 * normal(),
+            torch.sin(angle) * scale * aspect,
+            down * torch.cos(angle) * scale,
+            0.12 * normal(),
+        ],
+        dim=1,
+    ).reshape(count, 2, 3)
+    grid = nn.functional.affine_grid(turns, [count, 4, *INPUT_PX], align_corners=False)
     moved = nn.functional.grid_sample(
         torch.cat([pictures, cover], 1), grid, padding_mode="reflection", align_corners=False
     )
-    return recoloured(moved[:, :3], normal), nn.functional.avg_pool2d(moved[:, 3:], 2)
+    pictures = recoloured(moved[:, :3], chance)
+    soft = avg_pool2d(nn.functional.pad(pictures, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    pictures = pictures + (uniform(1) < 0.25) * uniform(1) * (soft - pictures)
+    pictures = pictures + (uniform(1) < 0.3) * 0.03 * uniform(1) * normal(3, *INPUT_PX)
+    return pictures.clamp(0, 1), avg_pool2d(moved[:, 3:], 2)
 
 
-def recoloured(pictures: Tensor, normal: Callable[..., Tensor]) -> Tensor:
+def recoloured(pictures: Tensor, chance: torch.Generator) -> Tensor:
     """Return pictures with other white balance, brightness, gamma and saturation."""
-    pictures = (pictures * normal(0.06, 3) * normal(0.12, 1)).clamp(1e-4, 1) ** normal(0.15, 1)
+
+    def factor(spread: float, channels: int) -> Tensor:
+        shape = (len(pictures), channels, 1, 1)
+        return torch.exp(spread * torch.randn(shape, generator=chance, device=pictures.device))
+
+    pictures = (pictures * factor(0.06, 3) * factor(0.12, 1)).clamp(1e-4, 1) ** factor(0.15, 1)
     grey = pictures.mean(1, keepdim=True)
-    return (grey + (pictures - grey) * normal(0.12, 1)).clamp(0, 1)
+    return (grey + (pictures - grey) * factor(0.12, 1)).clamp(0, 1)
 
 
 def loss_of(logits: Tensor, cover: Tensor) -> Tensor:
     """Return the mean of cross-entropy and soft Dice."""
-    entropy = binary_cross_entropy_with_logits(logits, cover, pos_weight=torch.tensor(2.0))
+    entropy = binary_cross_entropy_with_logits(logits, cover, pos_weight=torch.tensor(2.0, device=logits.device))
     chance = torch.sigmoid(logits)
     both, sizes = (chance * cover).sum((1, 2, 3)), (chance + cover).sum((1, 2, 3))
     return entropy + 0.5 * (1 - (2 * both + 20) / (sizes + 20)).mean()
 
 
-def reduced(pictures: Tensor) -> Tensor:
-    return nn.functional.interpolate(pictures, INPUT_PX, mode="bilinear", antialias=True)
-
-
 def mean_of(states: list[dict[str, Tensor]]) -> ToolNetwork:
     """Return a network with the mean of weights."""
-    network = ToolNetwork()
-    network.load_state_dict(
-        {name: sum(state[name].float() for state in states) / len(states) for name in states[0]}  # type: ignore[misc]
-    )
+    network = ToolNetwork().to(next(iter(states[0].values())).device)
+    network.load_state_dict({name: sum(state[name].float() for state in states) / len(states) for name in states[0]})
     return network
 
 
-def settled(network: ToolNetwork, ring: np.memmap, there: int) -> ToolNetwork:
+def settled(network: nn.Module, store: Store, batch: int) -> nn.Module:
     """Return a copy whose normalisations have the statistics of the mean weights, which a mean of statistics is not."""
     copied = copy.deepcopy(network).train()
     for part in copied.modules():
         if isinstance(part, nn.BatchNorm2d):
             part.reset_running_stats()
             part.momentum = None
-    rng = np.random.default_rng(0)
+    chance = torch.Generator(store.pictures.device).manual_seed(0)
     with torch.no_grad():
         for _ in range(40):
-            pictures, _ = batch_of(rng, ring, there)
-            copied(features(pictures))
+            copied(features(store.batch(batch, chance)[0]))
     return copied.eval()
 
 
-def export(network: ToolNetwork, path: Path) -> None:
+@torch.no_grad()
+def validated(network: nn.Module, pictures: Tensor) -> dict[str, float]:
+    """Return figures of the validation pictures: score, mean IoU, recall and share of false pixels.
+
+    The score is the mean over all pictures of (intersection + s) / (union + s), with s = 0.5 % of the picture. It is 1 for
+    a picture without tools in which none is found.
+    """
+    scores, ious, recalls, false_shares = [], [], [], []
+    for part in pictures.split(100):
+        planes = reduced(part)
+        cover = avg_pool2d(planes[:, 3:], 2) > 0.5
+        found = network(features(planes[:, :3])) > 0
+        both, either = (found & cover).sum((1, 2, 3)), (found | cover).sum((1, 2, 3))
+        small = 0.005 * cover[0].numel()
+        scores.append((both + small) / (either + small))
+        with_tool = cover.sum((1, 2, 3)) > 2 * small
+        ious.append((both / either)[with_tool])
+        recalls.append((both / cover.sum((1, 2, 3)))[with_tool])
+        false_shares.append((found & ~cover).float().mean((1, 2, 3)))
+    named = {"score": scores, "iou": ious, "recall": recalls, "false_share": false_shares}
+    return {name: round(float(torch.cat(parts).mean()), 4) for name, parts in named.items()}
+
+
+def export(network: nn.Module, path: Path) -> None:
     """Write the network as ONNX with normalisation folded into the convolutions."""
-    torch.onnx.export(
-        fused(network),
-        (torch.zeros(1, 5, *INPUT_PX),),
-        str(path),
-        input_names=["features"],
-        output_names=["tool"],
-        dynamo=False,
+    # torch needs the package onnx only to add functions of onnxscript, of which there are none.
+    unchanged = mock.patch(
+        "torch.onnx._internal.torchscript_exporter.onnx_proto_utils._add_onnxscript_fn", lambda model, _: model
     )
+    with unchanged, warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            fused(network),
+            (torch.zeros(1, 5, *INPUT_PX),),
+            str(path),
+            input_names=["features"],
+            output_names=["tool"],
+            dynamo=False,
+        )
+
+
+def received(to: mp.Queue[tuple[bool, Pictures]], workers: list[BaseProcess]) -> Iterator[tuple[bool, Pictures]]:
+    """Yield pictures that are ready, at most 64 messages.
+
+    Raises:
+        RuntimeError: if a worker has ended.
+    """
+    for _ in range(64):
+        try:
+            yield to.get_nowait()
+        except queue.Empty:
+            break
+    for worker in workers:
+        if not worker.is_alive():
+            raise RuntimeError(f"a drawing process ended with exit code {worker.exitcode}; its traceback is above")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--recordings", type=Path)
-    parser.add_argument("--minutes", type=float, default=30)
-    parser.add_argument("--start", type=Path)
+    parser.add_argument("--minutes", type=float, default=30, help="time of the whole run, with first pictures")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--store", type=int, default=100_000, help="pictures that are kept, 82 kB each")
+    parser.add_argument("--validation", type=int, default=800, help="number of validation pictures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, default=LEARNING_RATE)
+    parser.add_argument("--export", action="store_true", help="only write the ONNX file of checkpoint.pt")
     arguments = parser.parse_args()
     folder: Path = arguments.folder
     folder.mkdir(parents=True, exist_ok=True)
+    if arguments.export:
+        network = ToolNetwork()
+        network.load_state_dict(torch.load(folder / "checkpoint.pt", map_location="cpu"))
+        export(network, folder / "tool_network.onnx")
+        return 0
+    if arguments.recordings is not None and not (arguments.recordings / "colon").is_dir():
+        parser.error(f"--recordings {arguments.recordings} has no folder 'colon'; give the folder of all recordings")
+    began = time.monotonic()
+    context = mp.get_context("fork")
+    to: mp.Queue[tuple[bool, Pictures]] = context.Queue(4 * arguments.workers)
+    shared = (arguments.workers, arguments.seed + 1, arguments.recordings, arguments.validation, to)
+    workers: list[BaseProcess] = [
+        context.Process(target=draw, args=(worker, *shared), daemon=True) for worker in range(arguments.workers)
+    ]
+    for worker in workers:
+        worker.start()
+    try:
+        return train(arguments, to, workers, began)
+    finally:
+        for worker in workers:
+            worker.terminate()
+
+
+def train(
+    arguments: argparse.Namespace, to: mp.Queue[tuple[bool, Pictures]], workers: list[BaseProcess], began: float
+) -> int:
+    """Train, validate, and write the files."""
+    folder, device, batch = arguments.folder, torch.device(arguments.device), arguments.batch
     torch.set_num_threads(1)
     torch.manual_seed(arguments.seed)
-    ring = ring_in(folder, "w+")
-    count = mp.get_context("fork").Value("q", 0, lock=False)
-    drawing = mp.get_context("fork").Process(
-        target=draw, args=(folder, arguments.recordings, arguments.seed + 1, count), daemon=True
-    )
-    drawing.start()
-    network = ToolNetwork().to(memory_format=torch.channels_last)
-    if arguments.start is not None:
-        network.load_state_dict(torch.load(arguments.start))
+    torch.backends.cudnn.benchmark = True
+    store = Store(arguments.store, device)
+    validation: list[Tensor] = []
+    while store.count < FIRST_PICTURES * len(workers) or len(validation) < arguments.validation:
+        time.sleep(0.05)
+        for validates, pictures in received(to, workers):
+            if validates:
+                validation.append(torch.from_numpy(pictures))
+            else:
+                store.add(pictures)
+    held_out = torch.cat(validation).to(device)
+    # The order in which workers finished decides nothing: figures are means over all pictures.
+    network = ToolNetwork().to(device).to(memory_format=torch.channels_last)
     averaged = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(AVERAGED)
     )
-    optimiser = torch.optim.AdamW(network.parameters(), arguments.rate, weight_decay=1e-3)
-    while count.value < 1200:
-        time.sleep(0.5)
-    rng = np.random.default_rng(arguments.seed)
-    began = saved = time.monotonic()
-    step, mean = 0, 0.0
+    optimiser = torch.optim.AdamW(network.parameters(), arguments.rate, weight_decay=WEIGHT_DECAY)
+    chance = torch.Generator(device).manual_seed(arguments.seed)
+    warmed = time.monotonic()
+    total = max(1.0, 60 * arguments.minutes - (warmed - began))
+    print(f"{store.count} pictures after {warmed - began:.0f} s, {total:.0f} s of training", flush=True)
     kept: list[dict[str, Tensor]] = []
-    while (share := (time.monotonic() - began) / (60 * arguments.minutes)) < 1:
-        rate = arguments.rate * min(1, (step + 1) / 100) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
+    log: list[dict[str, Any]] = []
+    step, spent = 0, 0.0
+    running = torch.zeros((), device=device)
+    while (share := (time.monotonic() - warmed) / total) < 1:
+        rate = arguments.rate * min(1, (step + 1) / 200) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
         for group in optimiser.param_groups:
             group["lr"] = rate
-        pictures, cover = batch_of(rng, ring, count.value)
-        loss = loss_of(network(features(pictures).contiguous(memory_format=torch.channels_last)), cover)
+        if step % 8 == 0:
+            for _, pictures in received(to, workers):
+                store.add(pictures)
+        batch_pictures, cover = store.batch(batch, chance)
+        loss = loss_of(network(features(batch_pictures).contiguous(memory_format=torch.channels_last)), cover)
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 2.0)
         optimiser.step()
         averaged.update_parameters(network)
         step += 1
-        mean += 0.02 * (float(loss.detach()) - mean)
-        if step % 100 == 0:
-            print(
-                f"{60 * arguments.minutes * share:.0f} s, step {step}, {count.value} pictures, loss {mean:.4f}",
-                flush=True,
-            )
-        if time.monotonic() - saved > CHECKPOINT_S:
-            saved = time.monotonic()
-            kept.append(copy.deepcopy(averaged.module.state_dict()))
-            torch.save(settled(mean_of(kept), ring, count.value).state_dict(), folder / "checkpoint.pt")
-    drawing.terminate()
-    final = settled(mean_of([*kept, averaged.module.state_dict()]), ring, count.value)
-    torch.save(final.state_dict(), folder / "checkpoint.pt")
-    export(final, folder / "tool_network.onnx")
+        running += 0.01 * (loss.detach() - running)
+        if share * CHECKPOINTS > len(kept) + 1:
+            kept.append({name: value.clone() for name, value in averaged.module.state_dict().items()})
+            if spent > VALIDATION_SHARE * (time.monotonic() - warmed):
+                continue
+            spent -= time.monotonic()
+            now = settled(averaged.module, store, batch)
+            entry: dict[str, Any] = {"s": round(time.monotonic() - began), "step": step, "pictures": store.count}
+            entry |= {"loss": round(float(running), 4), **validated(now, held_out)}
+            log.append(entry)
+            print(json.dumps(entry), flush=True)
+            if share > 0.5:
+                torch.save(now.state_dict(), folder / "checkpoint.pt")
+            spent += time.monotonic()
+    for worker in workers:
+        worker.terminate()
+    kept.append(averaged.module.state_dict())
+    candidates = {}
+    for count in LAST_CHECKPOINTS:
+        if count <= len(kept):
+            candidates[count] = settled(mean_of(kept[-count:]), store, batch)
+    figures = {count: validated(candidate, held_out) for count, candidate in candidates.items()}
+    best = max(figures, key=lambda count: figures[count]["score"])
+    torch.save(candidates[best].state_dict(), folder / "checkpoint.pt")
+    options = {name: value for name, value in vars(arguments).items() if name not in ("folder", "recordings", "export")}
+    summary = {
+        "options": options | {"with_photographs": arguments.recordings is not None},
+        "torch": torch.__version__,
+        "input_px": INPUT_PX,
+        "parameters": sum(part.numel() for part in network.parameters()),
+        "steps": step,
+        "pictures": store.count,
+        "minutes": round((time.monotonic() - began) / 60, 2),
+        "validation_pictures": len(held_out),
+        "checkpoints": log,
+        "mean_of_last": figures,
+        "chosen": best,
+    }
+    (folder / "training.json").write_text(json.dumps(summary, indent=1) + "\n")
+    print(f"chosen: mean of the last {best} checkpoints, {json.dumps(figures[best])}", flush=True)
+    export(candidates[best], folder / "tool_network.onnx")
     return 0
 
 

@@ -28,9 +28,15 @@ EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
 class NetworkToolFinder:
     """Tool segmentation of single pictures on the CPU. Deterministic, without state between pictures."""
 
-    def __init__(self) -> None:
-        """Load the network. Raises cv2.error if OpenCV cannot."""
-        self._network = cv2.dnn.readNetFromONNX(str(NETWORK))
+    def __init__(self, network: Path | None = None, input_px: tuple[int, int] = INPUT_PX) -> None:
+        """Load the network. Raises cv2.error if OpenCV cannot.
+
+        Args:
+            network: file written by `benchmarks/tool_network/train.py`; None for the one of this package.
+            input_px: width and height of its input.
+        """
+        self._network = cv2.dnn.readNetFromONNX(str(network or NETWORK))
+        self._input_px = input_px
 
     def reset(self) -> None:
         """Do nothing, since no state is kept between pictures."""
@@ -45,7 +51,7 @@ class NetworkToolFinder:
         tissue = np.ones((height, width), np.uint8)
         if min(height, width) < SMALLEST_PX:
             return tissue
-        small = averaged(image, INPUT_PX)
+        small = averaged(image, self._input_px)
         planes = features(small)
         self._network.setInput(planes)
         smoothed = along_edges(self._network.forward()[0, 0], planes[0])

@@ -1,0 +1,63 @@
+"""Drawn training pictures have exact masks, and OpenCV computes what the trained network computes."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+
+from benchmarks.tool_network.bodies import Canvas
+from benchmarks.tool_network.flexible import accessory, hollow_organ, narrow_band
+from benchmarks.tool_network.network import ToolNetwork, features
+from benchmarks.tool_network.train import INPUT_PX, Store, altered, export, reduced
+
+
+def test_accessories_change_a_hollow_organ_only_under_their_mask():
+    covered = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        organ = hollow_organ(rng, 96, 120)
+        canvas = Canvas(organ.copy(), np.zeros((96, 120), np.float32), organ.reshape(-1, 3).mean(0), 0.8)
+        accessory(rng, canvas)
+        assert organ.shape == (96, 120, 3) and np.isfinite(canvas.image).all()
+        np.testing.assert_array_equal(canvas.image[canvas.mask == 0], organ[canvas.mask == 0])
+        covered += bool((canvas.mask > 0.5).mean() > 0.005)
+    assert covered >= 6
+
+
+def test_narrow_band_light_has_no_red():
+    picture = np.zeros((4, 4, 3), np.float32)
+    picture[..., 0] = 1
+    assert not narrow_band(np.random.default_rng(0), picture).any()
+
+
+def test_new_pictures_replace_the_oldest():
+    store = Store(3, torch.device("cpu"))
+    pictures = np.stack([np.full((128, 160, 4), value, np.uint8) for value in range(1, 5)])
+    store.add(pictures[:2])
+    store.add(pictures[2:])
+    assert store.pictures[:, 0, 0, 0].tolist() == [4, 2, 3]
+
+
+def test_mirrored_and_turned_masks_follow_their_pictures():
+    """A picture that is bright exactly where the tool is stays so."""
+    plain = torch.zeros((8, *INPUT_PX, 4))
+    plain[:, 20:60, 30:80] = 1
+    pictures, cover = altered(plain.permute(0, 3, 1, 2), torch.Generator().manual_seed(0))
+    bright = torch.nn.functional.avg_pool2d(pictures.mean(1, keepdim=True), 2)
+    assert bright[cover > 0.99].min() > 0.4
+    assert bright[cover == 0].max() < 0.4
+
+
+def test_opencv_computes_what_the_network_computes(tmp_path):
+    torch.manual_seed(0)
+    network = ToolNetwork().eval()
+    picture = torch.randint(0, 256, (1, 128, 160, 4), dtype=torch.uint8)
+    planes = features(reduced(picture)[:, :3])
+    export(network, tmp_path / "network.onnx")
+    loaded = cv2.dnn.readNetFromONNX(str(tmp_path / "network.onnx"))
+    loaded.setInput(planes.numpy())
+    with torch.no_grad():
+        wanted = network(planes).numpy()
+    assert wanted.shape == (1, 1, INPUT_PX[0] // 2, INPUT_PX[1] // 2)
+    np.testing.assert_allclose(loaded.forward(), wanted, atol=1e-3 * float(np.abs(wanted).max()))
