@@ -17,6 +17,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -62,11 +63,10 @@ class FramePath:
             gated = through(chains.gate, frame)
         with self._timed("checks of the picture"):
             decided = through(chains.first, frame)
-        (beside,) = chains.beside
         with self._timed("tool mask and highlights"):
-            found = through(beside, frame)
+            found = [through(each, frame) for each in chains.beside]
         with self._timed("checks of the tissue"):
-            decided = with_findings(decided, found) if gated.withheld is None else gated
+            decided = reduce(with_findings, found, decided) if gated.withheld is None else gated
             decided = through(analysis.then, decided)
         self.spent["analysis"].append(1e3 * (time.thread_time() - start))
         before, self._before = self._before, decided

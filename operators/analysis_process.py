@@ -72,10 +72,8 @@ def new_chains(tool_mask: str, out_of_body: Policy, stream: OrdinaryStream, frag
         gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
         first=[PictureStagesOp(fragment, name="picture", stages=picture_stages, stream=stream)],
         beside=[
-            [
-                new_tool_mask(fragment, tool_mask),
-                StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others)),
-            ]
+            [new_tool_mask(fragment, tool_mask)],
+            [StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others))],
         ],
     )
 

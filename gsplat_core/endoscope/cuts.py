@@ -10,6 +10,7 @@ jump of the view, tools or exposure changes, *Structure* or *Moved* stays high. 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -29,28 +30,18 @@ RIM_PX = 2
 HUE_BINS, HUE_RANGE = 16, 0.8
 LEAST_CONTRAST = 0.02
 """Standard deviation of log levels below which a block is not searched."""
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """Similarity measures of two pictures."""
-
-    difference: float
-    """Median difference of the pictures' log levels: 0 for equal pictures, 0.3 and more between scenes."""
-    colours: float
-    """Overlap of the hue histograms: 1 for equal colours, 0 for none in common."""
-    structure: float
-    """Median correlation of blocks with the surroundings of their position in the other picture: 1 if every block is
-    found, 0.3 to 0.65 for unrelated pictures.
-    """
-    moved: float
-    """Best correlation of a quarter of one picture anywhere in the other: 1 if it is found, 0.4 to 0.8 for unrelated
-    pictures.
-    """
+BLOCK_PLACES = [
+    (top, left) for top in range(0, HEIGHT_PX, BLOCK_HEIGHT_PX) for left in range(0, WIDTH_PX, BLOCK_WIDTH_PX)
+]
+"""Upper left corners of the blocks: row and column."""
+QUARTER_PLACES = [(0, 0), (0, 32), (24, 0), (24, 32), (12, 16)]
+"""Upper left corners of four quarters and of the middle: row and column."""
+Part = tuple[int, int, NDArray[np.float32]]
+"""Row and column of a part's upper left corner, and the part of `View.detail`."""
 
 
 class View:
-    """Reduced picture with the features that `likeness` compares."""
+    """Reduced picture with the features that are compared."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
         """Prepare an RGB uint8 picture [H, W, 3] of any size."""
@@ -64,6 +55,8 @@ class View:
         self.logs: NDArray[np.float32] = logs
         """Log levels without gain, [3, HEIGHT_PX, WIDTH_PX]."""
         self._detail: NDArray[np.float32] | None = None
+        self._blocks: list[Part] | None = None
+        self._quarters: list[Part] | None = None
         self._hues: NDArray[np.float64] | None = None
 
     @property
@@ -80,6 +73,20 @@ class View:
         return self._detail
 
     @property
+    def blocks(self) -> list[Part]:
+        """Blocks of `detail` with enough contrast to be searched near their position."""
+        if self._blocks is None:
+            self._blocks = _parts(self.detail, BLOCK_PLACES, (BLOCK_HEIGHT_PX, BLOCK_WIDTH_PX))
+        return self._blocks
+
+    @property
+    def quarters(self) -> list[Part]:
+        """Quarters of `detail` with enough contrast to be searched in a whole picture."""
+        if self._quarters is None:
+            self._quarters = _parts(self.detail, QUARTER_PLACES, (HEIGHT_PX // 2, WIDTH_PX // 2))
+        return self._quarters
+
+    @property
     def hues(self) -> NDArray[np.float64]:
         """Normalised hue histogram, [HUE_BINS * HUE_BINS]."""
         if self._hues is None:
@@ -92,8 +99,8 @@ class View:
 
 
 def difference(one: View, other: View) -> float:
-    """Return the median brightness difference of two pictures (`Likeness.difference`); 1 if one picture is dark
-    everywhere.
+    """Return the median difference of the pictures' log levels: 0 for equal pictures, 0.3 and more between scenes, 1 if
+    one picture is dark everywhere.
     """
     either = one.bright & other.bright
     if either.sum() < either.size // 50:
@@ -101,47 +108,66 @@ def difference(one: View, other: View) -> float:
     return median_of(np.abs(one.logs - other.logs)[:, either].ravel())
 
 
-def likeness(one: View, other: View) -> Likeness:
-    """Compute all similarity measures of two pictures, in about a millisecond."""
-    colours = float(np.minimum(one.hues, other.hues).sum())
-    moved = max(_moved(one.detail, other.detail), _moved(other.detail, one.detail))
-    return Likeness(difference(one, other), colours, _structure(one.detail, other.detail), moved)
+def colours(one: View, other: View) -> float:
+    """Return the overlap of the hue histograms: 1 for equal colours, 0 for none in common."""
+    return float(np.minimum(one.hues, other.hues).sum())
 
 
-def _structure(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    found = []
-    for top in range(0, HEIGHT_PX, BLOCK_HEIGHT_PX):
-        for left in range(0, WIDTH_PX, BLOCK_WIDTH_PX):
-            block = one[top : top + BLOCK_HEIGHT_PX, left : left + BLOCK_WIDTH_PX]
-            if block.std() < LEAST_CONTRAST:
-                continue
-            above, before = max(0, top - SEARCH_PX), max(0, left - SEARCH_PX)
-            around = other[above : top + BLOCK_HEIGHT_PX + SEARCH_PX, before : left + BLOCK_WIDTH_PX + SEARCH_PX]
-            found.append(float(cv2.matchTemplate(around, block, cv2.TM_CCOEFF_NORMED).max()))
-    return float(np.median(found)) if found else 0.0
+def structure(one: View, other: View, least: float = -1.0) -> float:
+    """Return the median correlation of blocks with the surroundings of their position in the other picture.
+
+    It is 1 if every block is found, and 0.3 to 0.65 for unrelated pictures. The search ends with the result 0 when more than half of the correlations are below `least`.
+    """
+    found: list[float] = []
+    below = 0
+    for top, left, block in one.blocks:
+        rows = slice(max(0, top - SEARCH_PX), top + BLOCK_HEIGHT_PX + SEARCH_PX)
+        columns = slice(max(0, left - SEARCH_PX), left + BLOCK_WIDTH_PX + SEARCH_PX)
+        found.append(_best(other.detail[rows, columns], block))
+        below += found[-1] < least
+        if 2 * below > len(one.blocks):
+            return 0.0
+    found.sort()
+    middle = len(found) // 2
+    return 0.5 * (found[middle] + found[-1 - middle]) if found else 0.0
 
 
-def _moved(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    """Return the best correlation of five quarters of the first picture anywhere in the second."""
-    high, wide = HEIGHT_PX // 2, WIDTH_PX // 2
+def moved(one: View, other: View, enough: float = 1.0) -> float:
+    """Return the best correlation of a quarter of one picture anywhere in the other.
+
+    It is 1 if a quarter is found, and 0.4 to 0.8 for unrelated pictures. The search ends at a correlation of `enough`.
+    """
     best = 0.0
-    for top, left in ((0, 0), (0, wide), (high, 0), (high, wide), (high // 2, wide // 2)):
-        part = one[top : top + high, left : left + wide]
-        if part.std() >= LEAST_CONTRAST:
-            best = max(best, float(cv2.matchTemplate(other, part, cv2.TM_CCOEFF_NORMED).max()))
+    for parts, around in ((one.quarters, other.detail), (other.quarters, one.detail)):
+        for _, _, part in parts:
+            best = max(best, _best(around, part))
+            if best >= enough:
+                return best
     return best
 
 
+def _parts(detail: NDArray[np.float32], places: Iterable[tuple[int, int]], size: tuple[int, int]) -> list[Part]:
+    """Return the parts of this size, height and width, that have enough contrast."""
+    height, width = size
+    cut = [(top, left, detail[top : top + height, left : left + width]) for top, left in places]
+    return [(top, left, part) for top, left, part in cut if part.std() >= LEAST_CONTRAST]
+
+
+def _best(around: NDArray[np.float32], part: NDArray[np.float32]) -> float:
+    """Return the best correlation of a part anywhere in a picture."""
+    return cv2.minMaxLoc(cv2.matchTemplate(around, part, cv2.TM_CCOEFF_NORMED))[1]
+
+
 SAME_DIFFERENCE = 0.15
-"""Largest `Likeness.difference` at which two frames show the same scene without further tests."""
+"""Largest `difference` at which two frames show the same scene without further tests."""
 SAME_STRUCTURE = 0.72
-"""Smallest `Likeness.structure` at which two frames show the same scene."""
+"""Smallest `structure` at which two frames show the same scene."""
 SAME_MOVED = 0.83
 """Correlation of a quarter of the picture, searched over the whole other picture, from which
 two frames show the same scene.
 """
 SAME_AFTER_GAP_DIFFERENCE = 0.2
-"""Largest `Likeness.difference` at which frames before and after a gap of unusable frames may show the same scene, if
+"""Largest `difference` at which frames before and after a gap of unusable frames may show the same scene, if
 their colours agree as well.
 """
 SAME_AFTER_GAP_COLOURS = 0.65
@@ -237,13 +263,13 @@ class CutDetector:
         return interrupted and any(self._same(view, earlier, self._gap) for earlier in self._views)
 
     def _same(self, view: View, other: View, gap: bool) -> bool:
-        if difference(view, other) <= SAME_DIFFERENCE:
+        away = difference(view, other)
+        if away <= SAME_DIFFERENCE:
             return True
-        found = likeness(view, other)
-        if found.structure >= SAME_STRUCTURE or found.moved >= SAME_MOVED:
+        near = gap and away <= SAME_AFTER_GAP_DIFFERENCE
+        if near and colours(view, other) >= SAME_AFTER_GAP_COLOURS:
             return True
-        near = found.difference <= SAME_AFTER_GAP_DIFFERENCE
-        return gap and near and found.colours >= SAME_AFTER_GAP_COLOURS
+        return structure(view, other, SAME_STRUCTURE) >= SAME_STRUCTURE or moved(view, other, SAME_MOVED) >= SAME_MOVED
 
     def _accept(self, view: View, new_scene: str | None) -> SceneVerdict:
         self._since_view += 1
