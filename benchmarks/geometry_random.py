@@ -50,12 +50,18 @@ SIZES = {"stereo": (320, 256, 4, 2.0), "moving": (240, 192, 100, 10.0), "fixed":
 """Width, height, frames and frame rate of the recordings."""
 
 
+def folder_of(kind: str, seed: int, asked: argparse.Namespace) -> Path:
+    """Return the folder of a recording."""
+    width = 640 if asked.full else SIZES[kind][0]
+    return asked.work / f"{kind}-{seed}-{width}"
+
+
 def recording_of(kind: str, seed: int, asked: argparse.Namespace) -> FileRecording:
     """Render a recording unless it is there already."""
     width, height, frames, fps = SIZES[kind]
     if asked.full:
         width, height = 640, 512
-    folder = asked.work / f"{kind}-{seed}-{width}"
+    folder = folder_of(kind, seed, asked)
     if not folder.exists():
         drawn = draw_scene(seed, moving=kind == "moving", stereo=kind == "stereo")
         synthesize(folder, frames=frames, width_px=width, height_px=height, fps=fps, drawn=drawn)

@@ -1,9 +1,9 @@
 """Measurement of points, distances and lengths on a model's surface, each with a standard error.
 
-The standard error of a point has three parts that are treated as independent: the spread of z along
-the ray (`Surface.spread`), the depth ambiguity of partly transparent pixels, and the error of the
-depth source used in training (`DepthOrigin.relative_error`). The last part is largely common to the whole scene.
-Treating it as independent between two points overestimates the error. The camera is assumed exact.
+The standard error of a point has two independent parts: the depth ambiguity of pixels that show several surfaces, and
+the error of the model's depth (`DepthOrigin.relative_error`). Half of the variance of the second part is a scale error
+of the whole scene. The other half is independent between two points. The thickness of the splats and the opacity of a
+pixel do not predict its depth error, so they are not part of it. The camera is assumed exact.
 """
 
 from __future__ import annotations
@@ -24,6 +24,16 @@ from gsplat_core.transfers import HostCopy
 
 MOST_STEPS = 4096
 """Largest number of steps of a length along the surface."""
+STEP_PX = 2.0
+"""Length of such a step in pixels."""
+COMMON = 0.5
+"""Share of the variance of the depth source's error that is common to the whole scene."""
+SMOOTHED_SPLATS = 3.0
+"""Standard deviation of the filter of depths along a path, in distances between neighbouring splats. Neighbouring splats
+have independent depth errors, which lengthen a path.
+"""
+ROUGH_SHARE = 0.2
+"""Standard error of a length because of the filter, as a share of the length that the filter removed."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,8 @@ class SurfacePoint:
     """z in camera coordinates."""
     depth_error: float
     """Standard error of z. The point is exactly on the pixel's ray."""
+    source_error: float
+    """Part of `depth_error` that comes from the depth source."""
     opacity: float
     confidence: float
     along_ray: tuple[float, float, float]
@@ -70,6 +82,9 @@ class Measurement:
         self.metric = model.metric
         self.origin = None if model.depth_source is None else model.depth_source.origin
         self._surface = _on_host(model.surface(time_s, self.camera))
+        self._relative_error = UNKNOWN_ERROR if self.origin is None else self.origin.relative_error
+        pixels = self.camera.width_px * self.camera.height_px
+        self._splat_px = math.sqrt(pixels / max(model.gaussians.count, 1))
 
     @property
     def unit(self) -> str:
@@ -92,18 +107,13 @@ class Measurement:
                 f"nothing was observed at ({x:g}, {y:g}): the opacity there is {opacity:.2f}; measure where the model shows tissue"
             )
         start, step = rays_of(camera, np.array([column + 0.5, row + 0.5]))
-        spread = float(surface["spread"][row, column])
-        # In half-transparent pixels the median depth is as plausible as the mean, so their difference adds to the
-        # error.
-        median = float(surface["median_depth"][row, column])
-        split = abs(depth - median) if median > 0 else spread
-        relative_error = UNKNOWN_ERROR if self.origin is None else self.origin.relative_error
-        error = math.hypot(spread, (1 - opacity) * depth, split, relative_error * depth)
+        split, source = self._split(row, column), self._relative_error * depth
         return SurfacePoint(
             pixel=(column + 0.5, row + 0.5),
             position=_triple(in_world(start + step * depth, camera)),
             depth=depth,
-            depth_error=error,
+            depth_error=math.hypot(split, source),
+            source_error=source,
             opacity=opacity,
             confidence=float(surface["confidence"][row, column]),
             along_ray=_triple(step @ camera.world_to_camera[:3, :3]),
@@ -118,41 +128,59 @@ class Measurement:
     def length_along(self, first: SurfacePoint, second: SurfacePoint) -> Length:
         """Return the length along the surface under the straight line between two points in the picture.
 
-        Steps are two pixels long, about the detail of the splats, so that jitter of z does not lengthen the path. The
-        error combines the errors of both ends and the jitter.
+        Depths along the line are smoothed before the length is computed, so that jitter of z does not lengthen the
+        path. The error combines the error of the distance and a share of the length that smoothing removed.
 
         Raises:
             InvalidSetting: if any point of the path was not observed.
         """
-        (x0, y0), (x1, y1) = first.pixel, second.pixel
-        steps = min(MOST_STEPS, max(1, round(math.hypot(x1 - x0, y1 - y0) / 2)))
-        at = [self.point(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps) for k in range(steps + 1)]
-        places = np.array([each.position for each in at])
-        value = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        pixels = np.linspace(first.pixel, second.pixel, self._steps(first, second) + 1)
+        depths = np.array([self.point(x, y).depth for x, y in pixels])
+        apart_px = math.dist(first.pixel, second.pixel) / (len(pixels) - 1)
+        smooth = _smoothed(depths, SMOOTHED_SPLATS * self._splat_px / max(apart_px, 1e-9))
+        starts, steps = rays_of(self.camera, pixels)
+        value, rough = (_length(starts + steps * each[:, None]) for each in (smooth, depths))
         ends = self.distance(first, second)
-        jitter = _roughness(places)
-        return Length(value, math.hypot(ends.error, jitter))
+        detour = max(1.0, value / ends.value) if ends.value > 0 else 1.0
+        return Length(value, math.hypot(ends.error * detour, ROUGH_SHARE * max(0.0, rough - value)))
+
+    def _steps(self, first: SurfacePoint, second: SurfacePoint) -> int:
+        return min(MOST_STEPS, max(1, round(math.dist(first.pixel, second.pixel) / STEP_PX)))
+
+    def _split(self, row: int, column: int) -> float:
+        """Return the difference between the mean and the median depth of a pixel. It is large where a pixel shows several
+        surfaces. A pixel so transparent that it has no median depth gets its spread of depths.
+        """
+        mean, median = (float(self._surface[name][row, column]) for name in ("ray_depth", "median_depth"))
+        return abs(mean - median) if median > 0 else float(self._surface["spread"][row, column])
 
 
 def _error_of_distance(first: SurfacePoint, second: SurfacePoint, direction: NDArray[np.floating]) -> float:
     """Return the first-order error from both points' errors along their rays. Errors across the
     rays are of second order.
     """
-    parts = [point.depth_error * abs(float(np.dot(point.along_ray, direction))) for point in (first, second)]
-    # Both depths may share one scale error, which changes distances across the rays by the same
-    # factor.
-    across = 0.5 * (first.depth_error / first.depth + second.depth_error / second.depth)
+    along = [abs(float(np.dot(point.along_ray, direction))) for point in (first, second)]
     length = float(np.linalg.norm(np.subtract(second.position, first.position)))
-    return math.hypot(*parts, across * length)
+    scale = 0.5 * (first.source_error / first.depth + second.source_error / second.depth)
+    own = [math.sqrt(max(0.0, point.depth_error**2 - COMMON * point.source_error**2)) for point in (first, second)]
+    return math.hypot(own[0] * along[0], own[1] * along[1], math.sqrt(COMMON) * scale * length)
 
 
-def _roughness(places: NDArray[np.floating]) -> float:
-    """Return the difference in length between the path through all points and the path through every other point."""
-    if len(places) < 3:
-        return 0.0
-    fine = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    coarse = [*places[:-1:2], places[-1]]
-    return max(0.0, fine - float(np.linalg.norm(np.diff(np.array(coarse), axis=0), axis=1).sum()))
+def _smoothed(depths: NDArray[np.floating], sigma: float) -> NDArray[np.floating]:
+    """Smooth depths [N] along a path by a Gaussian of standard deviation `sigma` in steps. Constant slopes are kept, and
+    the path is continued beyond its ends by point reflection, which keeps the ends in place.
+    """
+    reach = min(math.ceil(3 * sigma), len(depths) - 1)
+    if reach < 1:
+        return depths
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    before, after = 2 * depths[0] - depths[reach:0:-1], 2 * depths[-1] - depths[-2 : -reach - 2 : -1]
+    return np.convolve(np.concatenate([before, depths, after]), taps / taps.sum(), "valid")
+
+
+def _length(places: NDArray[np.floating]) -> float:
+    """Return the length of the path through places [N, 3]."""
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 
 def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
