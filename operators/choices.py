@@ -43,7 +43,7 @@ A factory takes the fragment, the operator's name and `SinkOptions`. The input o
 
 Device = Literal["cpu", "cuda"]
 """Devices for training and rendering."""
-Poses = Literal["given", "estimated"]
-"""Camera poses: recorded with the frames, or estimated from the pictures."""
+Poses = Literal["given", "auto", "estimated"]
+"""Camera poses: recorded with the frames; as recorded or, while the scope moves, estimated; or estimated from the pictures."""
 Policy = Literal["withhold", "off"]
 """Pictures from outside of the body: replace them by black, or pass all frames without a check."""

@@ -6,12 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gsplat_core.depth.registry import may_be_metric
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.poses.camera_path import CERTAIN_SHARE, MotionTest
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.choices import Poses
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
@@ -67,19 +71,21 @@ class PoseOp(Operator):
         frame = op_input.receive("frame")
         op_output.emit(frame.with_fields(pose=self._odometry.place(frame)), "frame")
 
+    def _statistics(self) -> EstimatedPoses:
+        found = self._odometry
+        return EstimatedPoses(
+            found.frames, found.not_placed, found.begun, found.returned, found.explained, found.is_measured
+        )
+
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """Add the statistics of the pose estimation to the outcome of the run."""
-        found = self._odometry
-        outcome.add(
-            EstimatedPoses(
-                found.frames, found.not_placed, found.begun, found.returned, found.explained, found.is_measured
-            )
-        )
+        found = self._statistics()
+        outcome.add(found)
         if not found.frames:
             return
         unit = (
             "lengths have the unit of the depth that frames came with"
-            if found.is_measured
+            if found.measured
             else f"lengths have no scale: the first frame's tissue is taken to be {RELATIVE_DISTANCE:g} away"
         )
         outcome.note(
@@ -98,11 +104,72 @@ class PoseOp(Operator):
             )
 
 
+class AutoPoseOp(PoseOp):
+    """Estimates poses while a moving scope explains how the pictures move, for frames without a recorded pose.
+
+    Frames before the first such motion get no pose. While the pictures move otherwise, the last pose is held, so that
+    only the deformation of the tissue follows them. Afterwards the estimation begins anew at the held pose: the model has
+    followed the pictures, and a recovered pose would move it. Inputs, outputs and params are those of `PoseOp`.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+        self._begin()
+        super().__init__(fragment, *args, **kwargs)
+
+    def start(self) -> None:
+        super().start()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._test, self._is_moving = MotionTest(), False
+        self._pose: NDArray[np.float64] | None = None
+        self._earlier: list[EstimatedPoses] = []
+        """Statistics of earlier estimations."""
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        if frame.pose is None:
+            frame = frame.with_fields(pose=self._pose_of(frame))
+        op_output.emit(frame, "frame")
+
+    def _pose_of(self, frame: Frame) -> NDArray[np.float64] | None:
+        """Return the pose to use for a frame; None before the scope has moved."""
+        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+            share = self._test.share(frame)
+            if share is not None and not self._is_moving and share >= CERTAIN_SHARE:
+                if self._pose is not None:
+                    self._earlier.append(super()._statistics())
+                    self._odometry = LiveOdometry(self.camera.with_pose(self._pose), measured=self.measured)
+                self._is_moving = True
+            elif share is not None and share < MOSTLY:
+                self._is_moving = False
+        if self._is_moving:
+            self._pose = self._odometry.place(frame)
+        return self._pose
+
+    def _statistics(self) -> EstimatedPoses:
+        parts = [*self._earlier, super()._statistics()]
+        frames = sum(part.frames for part in parts)
+        return EstimatedPoses(
+            frames,
+            sum(part.not_placed for part in parts),
+            sum(part.begun for part in parts),
+            sum(part.returned for part in parts),
+            sum(part.frames * part.explained for part in parts) / max(frames, 1),
+            all(part.measured for part in parts if part.frames),
+        )
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """Add the statistics of the pose estimation to the outcome of the run, if the scope moved."""
+        if self._pose is not None:
+            super().contribute(outcome)
+
+
 def check_poses(choice: str, camera: Camera) -> None:
     """Raise InvalidSetting for an unknown choice, or for a camera that pose estimation does not support."""
     if choice not in get_args(Poses):
-        raise InvalidSetting(f"poses is {choice!r}; choose {' or '.join(get_args(Poses))}")
-    if choice == "estimated":
+        raise InvalidSetting(f"poses is {choice!r}; choose {', '.join(get_args(Poses))}")
+    if choice == "estimated" or (choice == "auto" and camera.model == "pinhole"):
         try:
             LiveOdometry(camera)
         except InvalidInput as error:
@@ -114,10 +181,11 @@ def pose_operators(fragment: Any, choice: Poses, camera: Camera, depth: str) -> 
 
     Args:
         fragment: the graph.
-        choice: `given` (recorded) or `estimated`.
+        choice: `given` (recorded), `auto` (estimated while the scope moves) or `estimated`.
         camera: camera of the frames.
         depth: the setting `depth`; for measured depth or stereo, the frames' depth sets the scale.
     """
-    if choice == "given":
+    if choice == "given" or (choice == "auto" and camera.model != "pinhole"):
         return ()
-    return (PoseOp(fragment, name="pose", camera=camera, measured=may_be_metric(depth)),)
+    kind = AutoPoseOp if choice == "auto" else PoseOp
+    return (kind(fragment, name="pose", camera=camera, measured=may_be_metric(depth)),)

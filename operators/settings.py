@@ -123,8 +123,9 @@ class DepthSection(Section):
     poses: Annotated[
         Poses,
         Option(
-            "Poses of the scope: given by the recording, or estimated from the pictures (relative; moving tissue looks like a"
-            " moving scope). With given, reconstruct estimates missing poses where that helps",
+            "Poses of the scope: given by the recording, estimated from the pictures (relative; moving tissue looks like a"
+            " moving scope), or auto, which estimates missing ones while a moving scope explains the pictures."
+            " reconstruct estimates missing poses where that helps, with given too",
             (*TRAINING_RUNS, *LIVE),
         ),
     ] = "given"

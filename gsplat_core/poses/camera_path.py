@@ -7,7 +7,8 @@ that their pictures are not used.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
@@ -28,6 +29,10 @@ PAIRS = 12
 """Number of pairs of frames that are compared, spread over the recording."""
 APART_S = 0.3
 """Time between the frames of a pair, at least one frame interval."""
+LONGEST_APART_S = 1.0
+"""Longest time between the frames of a pair in a stream. After a longer gap, the test starts anew."""
+RECENT_PAIRS, FEWEST_PAIRS = 5, 3
+"""Number of newest pairs of a stream, and the number from which there is a result."""
 LONGEST_PX = 320
 """Longer side of the compared pictures in pixels."""
 MOST_CORNERS, CORNERS_APART_PX, PATCH_PX, LEVELS = 300, 6, 21, 3
@@ -35,8 +40,10 @@ RETURN_PX = 0.7
 """Largest accepted forward-backward error in pixels."""
 LEAST_MOTION = 0.005
 """Median motion of the corners, as a share of the longer side, below which the scope counts as static."""
-MOVING_SHARE = 0.9
-"""Share of the image motion from which poses are estimated, see `rigid_share`."""
+MOVING_SHARE = 0.75
+"""Share of the image motion from which poses are worth an estimate, see `rigid_share`."""
+CERTAIN_SHARE = 0.97
+"""Share of the image motion from which poses are estimated without a comparison on validation frames."""
 
 
 def rigid_share(frames: Sequence[Frame]) -> float:
@@ -51,9 +58,38 @@ def rigid_share(frames: Sequence[Frame]) -> float:
     gap = min(max(1, round(APART_S / median(positive))), len(frames) - 1)
     starts = np.unique(np.linspace(0, len(frames) - 1 - gap, PAIRS).round().astype(int))
     found = [each for start in starts if (each := _compared(frames[start], frames[start + gap])) is not None]
-    if not found or median(motion for motion, _ in found) < LEAST_MOTION * LONGEST_PX:
-        return 0.0
-    return median(1 - (rest / max(motion, 1e-9)) ** 2 for motion, rest in found)
+    return _share(found) or 0.0
+
+
+class MotionTest:
+    """`rigid_share` of the newest frames of a stream."""
+
+    def __init__(self) -> None:
+        self._first: Frame | None = None
+        self._found: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
+
+    def share(self, frame: Frame) -> float | None:
+        """Take a frame and return the share; None if the frame completes no pair, too few pairs are known, or the pictures
+        hardly move.
+        """
+        first = self._first
+        if first is not None and first.image.shape == frame.image.shape and frame.time_s - first.time_s < APART_S:
+            return None
+        self._first = frame
+        if first is None or first.image.shape != frame.image.shape or frame.time_s - first.time_s > LONGEST_APART_S:
+            self._found.clear()
+            return None
+        if (pair := _compared(first, frame)) is None:
+            return None
+        self._found.append(pair)
+        return _share(self._found) if len(self._found) >= FEWEST_PAIRS else None
+
+
+def _share(pairs: Collection[tuple[float, float]]) -> float | None:
+    """Return the median share of pairs of median motion and rest; None if the pictures hardly move."""
+    if not pairs or median(motion for motion, _ in pairs) < LEAST_MOTION * LONGEST_PX:
+        return None
+    return median(1 - (rest / max(motion, 1e-9)) ** 2 for motion, rest in pairs)
 
 
 def _compared(first: Frame, second: Frame) -> tuple[float, float] | None:

@@ -127,7 +127,8 @@ def reconstruct(
         source = prepare(inside, notes, offline=True)
         start = Start.now()
         fitted = _Fitting(source, inside, progress, stop_requested, notes, clock).done(steps)
-        model, inside, source = fitted.model, fitted.settings, fitted.source
+        # Estimated poses come with the frames of the source.
+        model, inside, source = fitted.model, replace(fitted.settings, poses="given"), fitted.source
         graph = replay_graph(
             source,
             inside,

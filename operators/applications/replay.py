@@ -266,7 +266,7 @@ def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline:
 
 def lacking_depth(settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig) -> str | None:
     """Return a note if the source's frames have no usable recorded depth; None otherwise."""
-    poses = {"pose"} if settings.poses == "estimated" else set()
+    poses = {"pose"} if settings.poses != "given" else set()
     return without_depth(settings.depth, source.fields | poses, config)
 
 

@@ -12,7 +12,7 @@ from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from operators.outcome import OutcomeBuilder
-from operators.pose import EstimatedPoses, PoseOp, check_poses, pose_operators
+from operators.pose import AutoPoseOp, EstimatedPoses, PoseOp, check_poses, pose_operators
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
 
 COUNT = 8
@@ -112,7 +112,7 @@ def test_what_cannot_be_estimated_is_refused_before_the_run():
     check_poses("given", fisheye)
     with pytest.raises(InvalidSetting, match="this one is fisheye"):
         check_poses("estimated", fisheye)
-    with pytest.raises(InvalidSetting, match="poses is 'guessed'; choose given or estimated"):
+    with pytest.raises(InvalidSetting, match="poses is 'guessed'; choose given, auto, estimated"):
         check_poses("guessed", FIRST)
 
 
@@ -143,3 +143,32 @@ def test_what_a_reader_must_know_of_estimated_poses_is_said(fields, said):
         assert part in note
     if notes:
         assert "lengths have no scale" in notes[0]
+
+
+def test_auto_estimates_poses_once_the_scope_moves(frames, compute):
+    """Still pictures first, then a moving scope, then tissue that moves in stripes."""
+    columns = np.arange(WIDTH)
+    still = [frames[0]] * 12
+    striped = [
+        frames[-1].with_fields(image=frames[-1].image[:, (columns - 4 * n * (columns // 40 % 2)) % WIDTH])
+        for n in range(12)
+    ]
+    operator = AutoPoseOp(None, camera=FIRST, measured=False)
+    operator.start()
+    poses = []
+    for number, frame in enumerate([*still, *frames, *striped]):
+        (given,) = compute(operator, frame=frame.with_fields(seq=number, pts_ns=number * 300_000_000))
+        poses.append(given.pose)
+    assert all(pose is None for pose in poses[: len(still)])
+    moved = poses[len(still) + len(frames) - 1]
+    assert moved is not None and moved[0, 3] < -0.5
+    assert np.array_equal(poses[-1], poses[-2])
+    assert 0 < outcome_of(operator).find(EstimatedPoses).frames < len(frames) + len(striped)
+
+
+def test_auto_keeps_recorded_poses(frames, compute):
+    operator = AutoPoseOp(None, camera=FIRST)
+    operator.start()
+    recorded = np.eye(4)
+    (given,) = compute(operator, frame=frames[0].with_fields(pose=recorded))
+    assert given.pose is recorded and outcome_of(operator).find(EstimatedPoses) is None

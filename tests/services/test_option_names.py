@@ -27,7 +27,7 @@ NAMES = [
     *(("renderer", name) for name in RENDERERS),
     *(("depth", name) for name in ("auto", *DEPTHS)),
     *(("tool_mask", name) for name in TOOL_MASKS),
-    *(("poses", name) for name in ("given", "estimated")),
+    *(("poses", name) for name in ("given", "auto", "estimated")),
     *(("eyes", name) for name in ("left", "both")),
 ]
 KINDS = {"replay": ReplayOptions, "batch": JobOptions, "reconstruct": ReconstructOptions, "live": LiveOptions}

@@ -11,6 +11,7 @@ import pytest
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.training import validation
 from operators.applications import reconstruct as module
+from operators.pose import EstimatedPoses
 from services.reports.build import write_reports
 from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
 
@@ -37,25 +38,39 @@ def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypa
     assert run["eyes"] == ("left" if dropped else "both")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("gain_db", "kept"), [(2 * validation.INPUT_GAIN_DB, True), (0.5 * validation.INPUT_GAIN_DB, False)]
-)
-def test_poses_of_a_moving_scope_are_used_where_they_help(tmp_path, monkeypatch, gain_db, kept):
-    """The scores of the validation frames are the test's; estimated poses gain."""
+@pytest.fixture
+def moving(tmp_path):
+    """Folder with pictures of a moving scope, without poses."""
     folder = tmp_path / "take"
     folder.mkdir()
     for number, frame in enumerate(video(12, SIDEWAYS)[0]):
         cv2.imwrite(str(folder / f"{number:03}.png"), cv2.resize(frame.image[..., ::-1], (80, 64)))
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("gain_db", "kept"), [(2 * validation.INPUT_GAIN_DB, True), (0.5 * validation.INPUT_GAIN_DB, False)]
+)
+def test_poses_of_a_moving_scope_are_used_where_they_help(moving, tmp_path, monkeypatch, gain_db, kept):
+    """The scores of the validation frames are the test's; estimated poses gain."""
     monkeypatch.setattr(validation, "FIRST_STEPS", 1)
     monkeypatch.setattr(validation, "MOST_STEPS", 1)
     monkeypatch.setattr(
         module, "validation_psnr_db", lambda learned, frames: 30.0 + gain_db * (frames[0].pose is not None)
     )
-    settings = module.ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=())
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=())
     outcome = module.reconstruct(settings, clock=lambda: 0.0)
     assert any("the scope moves" in note for note in outcome.notes) == kept
     assert ("poses" in outcome.outputs) == kept
     if kept:
         places = np.load(outcome.outputs["poses"])[:, :3, 3]
         assert places.shape == (12, 3) and np.linalg.norm(places[-1]) > 5 * np.linalg.norm(places[1])
+
+
+@pytest.mark.slow
+def test_poses_that_are_asked_for_are_those_of_all_frames(moving, tmp_path):
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), poses="estimated")
+    outcome = module.reconstruct(settings, steps=1)
+    assert "poses" in outcome.outputs
+    assert outcome.find(EstimatedPoses) is None, "poses were estimated again, frame by frame"
